@@ -6,7 +6,7 @@ imports so that they say where the module then is (`from rig.camera import Camer
 `from eigenhead.rig.camera import Camera`). Nothing else in a file changes, neither a line number. What cannot be moved
 like that (a module named in a string, `import rig.camera`) ends the build with its file and line.
 
-With EIGENHEAD_WHEEL_LOOPS=1 the wheel also carries the loops of a job compiled, for `pipeline.compiled.PORTABLE_CPU`,
+With EIGENHEAD_WHEEL_LOOPS=1 the wheel also carries the loops of a job compiled, for `pipeline.compute.jit.PORTABLE_CPU`,
 and the Python and Numba of the environment that builds (`uv build --wheel --no-build-isolation`); with others they are
 not found, and compiled as from any other wheel.
 

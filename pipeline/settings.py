@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
-from pipeline.diagnostics import WARNING_CODES
+from pipeline.warnings import WARNING_CODES
 from rig.errors import InputError
 from rig.messages.message import Message, compose
 from rig.text import is_encodable, suggest
@@ -258,7 +258,7 @@ class Settings:
     front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
     unexplained_outlines: Literal["refuse", "warn"] = "refuse"  # of a head that explains hardly any of them
-    fail_on: tuple[str, ...] = ()  # codes of warnings (pipeline.diagnostics.WARNING_CODES) that are failures here
+    fail_on: tuple[str, ...] = ()  # codes of warnings (pipeline.warnings.WARNING_CODES) that are failures here
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
     faces: FaceSettings = field(default_factory=FaceSettings)
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)

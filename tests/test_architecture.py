@@ -97,8 +97,8 @@ MANY_FOR_A_REASON = {
     "server.cli.batch.batch": "each is an option of a command",
     "server.cli.experiments.experiments": "each is an option of a command",
     "server.cli.heads.simulate": "each is an option of a command",
-    "pipeline.dense.window_bias_kernels.windowed_heights": "a compiled loop over a thread's share of plain arrays",
-    "pipeline.experiments.soft_rasteriser.loss": "JAX compiles a function of plain arrays",
+    "pipeline.stereo.window_bias_kernels.windowed_heights": "a compiled loop over a thread's share of plain arrays",
+    "pipeline.research.peers.soft_rasteriser.loss": "JAX compiles a function of plain arrays",
 }
 
 
@@ -185,7 +185,7 @@ def test_what_everybody_uses_is_defined_once() -> None:
             elif isinstance(node, ast.Import | ast.ImportFrom):
                 names = [*(alias.name for alias in node.names), getattr(node, "module", None)]
                 homes["difflib"] |= {name} if "difflib" in names else set()
-    left = {name for name in product_modules() if name.startswith("pipeline.experiments.")} | PROGRESS_LEFT
+    left = {name for name in product_modules() if name.startswith("pipeline.research.")} | PROGRESS_LEFT
     assert {key: found - left for key, found in homes.items()} == {
         "Progress": {"rig.progress"},
         "ImageRgb": {"rig.image"},

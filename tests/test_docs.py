@@ -14,7 +14,7 @@ import jsonschema_rs
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.data_folder import models_folder
+from pipeline.head_model.data_folder import models_folder
 from pipeline.templates.names import templates_folder
 from rig.camera import Camera, Intrinsics
 from rig.errors import InputError

@@ -21,9 +21,9 @@ from calibration.scene.scale import HEAD_SHARE, Scale, find_scale
 from calibration.scene.structure import Structure, solve_structure, why_not
 from calibration.scene.upright import in_guessed_frame
 from calibration.silhouette_refinement.single import VIEWS_LEAST, refine_one
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
+from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
-from pipeline.silhouettes.segment import segment
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST

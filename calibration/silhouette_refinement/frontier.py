@@ -2,7 +2,7 @@
 
 Where the angle of a contour's rays about the line through both centres has a local extreme, the plane of that angle
 touches the subject there, and, unless something hides it, the other contour has an extreme of the same angle. The outer
-two of a pair are ``pipeline.multiview.camera_drift``'s; a head with hair and shoulders has several more. Only convex
+two of a pair are ``pipeline.view_checks.camera_drift``'s; a head with hair and shoulders has several more. Only convex
 ones count: where two parts of an outline cross (a T-junction) the contour has a concave corner that is no point of the
 subject. With no bound on their angles many could be paired, so this needs cameras good to about ``GATE_PX``.
 """

@@ -27,10 +27,10 @@ from calibration.silhouette_refinement.tangency_term import (
     per_camera,
     tangency_residuals,
 )
+from pipeline.contour_fit.problem import camera_information
 from pipeline.estimation.levenberg_marquardt import MIN_DAMPING, Limits, Solution, minimise
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import NormalEquations, Problem, Quadratic, Term
-from pipeline.fitting.problem import camera_information
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import Tangency, find_tangencies
 from rig.errors import EigenheadError

@@ -1,6 +1,6 @@
 """What the rims of a head say of the cameras: the model fitted to one capture, everything but the cameras taken out.
 
-With the cameras held, the contour solver (section 4.4, ``pipeline.fitting.contour``) finds shape and pose. The normal
+With the cameras held, the contour solver (section 4.4, ``pipeline.contour_fit.contour``) finds shape and pose. The normal
 equations there, over (shape, pose, cameras), are reduced to the cameras by the Schur complement, so that a head which
 could be another one says no more than it knows. Captures of several subjects add up: heads are their own, cameras the
 same.
@@ -13,10 +13,10 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.contour import solve_contour
-from pipeline.fitting.head_problem import head_problem
-from pipeline.fitting.problem import PER_CAMERA
+from pipeline.contour_fit.contour import solve_contour
+from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.problem import PER_CAMERA
+from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.alignment.procrustes import block_diagonal, generalised_procrustes, procrustes
-from pipeline.eigenheads.model import HeadModel
+from pipeline.contour_fit.landmark_term import observe_landmarks
+from pipeline.contour_fit.problem import LandmarkObservations, blended_basis
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import point_table
-from pipeline.fitting.landmark_term import observe_landmarks
-from pipeline.fitting.problem import LandmarkObservations, blended_basis
+from pipeline.geometry.procrustes import block_diagonal, generalised_procrustes, procrustes
+from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity
 from rig.rig import Rig
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
 from pipeline.alignment.landmarks import MIN_POINTS, MIN_TRIANGLE_MM, flatness
-from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS
+from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
 from rig.capture import Features
 from rig.messages.message import Message, compose
 from rig.rig import Rig

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
-from pipeline.alignment.procrustes import block_diagonal, generalised_procrustes, procrustes
-from pipeline.eigenheads.landmarks import mirrored
-from pipeline.eigenheads.model import HeadModel
+from pipeline.geometry.procrustes import block_diagonal, generalised_procrustes, procrustes
+from pipeline.head_model.landmarks import mirrored
+from pipeline.head_model.model import HeadModel
 from pipeline.multiview.triangulation import TriangulatedPoint
 from pipeline.settings import AlignmentSettings
 from rig.capture import Features

@@ -19,12 +19,12 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.contour import run_stage
-from pipeline.fitting.head_problem import head_problem
-from pipeline.fitting.photo.depth_search import pixels_per_mm
-from pipeline.fitting.problem import ContourProblem, Stage, State, first_evidence, make_problem, start_state
+from pipeline.contour_fit.contour import run_stage
+from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.problem import ContourProblem, Stage, State, first_evidence, make_problem, start_state
+from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.photometric_fit.depth_search import pixels_per_mm
 from pipeline.settings import Settings
 from rig.camera import Camera
 from rig.errors import EigenheadError

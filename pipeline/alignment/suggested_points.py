@@ -15,12 +15,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.alignment.procrustes import procrustes
-from pipeline.eigenheads.correspondence.warp import landmark_warp
-from pipeline.eigenheads.model import HeadModel
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.matching import MatchedFaces
-from pipeline.imaging.cpu_raster import camera_depths, depth_map
+from pipeline.geometry.procrustes import procrustes
+from pipeline.geometry.raster import camera_depths, depth_map
+from pipeline.geometry.warp import landmark_warp
+from pipeline.head_model.model import HeadModel
 from rig.camera import Camera
 from rig.geometry import Similarity
 from rig.rig import Rig

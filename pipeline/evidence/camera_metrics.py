@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.fit import Fit
-from pipeline.fitting.problem import level_topology
-from pipeline.fitting.rim import find_rim, pack_views
-from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.compute.threads import thread_count
+from pipeline.contour_fit.fit import Fit
+from pipeline.contour_fit.problem import level_topology
+from pipeline.contour_fit.rim import find_rim, pack_views
+from pipeline.geometry.raster import depth_maps
+from pipeline.head_model.model import HeadModel
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette, boundary_weighted_xor, boundary_weights
-from pipeline.parallel_for import thread_count
 from rig.camera import Camera
 from rig.geometry import Similarity
 from rig.mesh import Mesh

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.eigenheads.expressions import ARKIT, arkit_parts, closed_lids, words
-from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.fit import Fit
+from pipeline.contour_fit.fit import Fit
+from pipeline.head_model.expressions import ARKIT, arkit_parts, closed_lids, words
+from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.eigenheads.gaussian_process import SCALES
-from pipeline.eigenheads.model import HeadModel
-from pipeline.fitting.fit import Fit
+from pipeline.contour_fit.fit import Fit
+from pipeline.head_model.gaussian_process import SCALES
+from pipeline.head_model.model import HeadModel
 from rig.geometry import cross_matrix
 from rig.mesh import vertex_normals
 

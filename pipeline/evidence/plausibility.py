@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtrc
 
-from pipeline.diagnostics import ReportWarning
-from pipeline.eigenheads.model import HeadModel
+from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.camera_metrics import CameraFigures
-from pipeline.fitting.fit import Fit
+from pipeline.head_model.model import HeadModel
+from pipeline.warnings import ReportWarning
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 

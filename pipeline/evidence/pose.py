@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.alignment.silhouette_search import fan_strength
-from pipeline.diagnostics import ReportWarning
 from pipeline.faces.detection import CERTAIN_SCORE, FaceDetection
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.subject import SubjectFaces
+from pipeline.warnings import ReportWarning
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from rig.messages.message import compose

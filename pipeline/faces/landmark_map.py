@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.array_cache import cached_arrays
-from pipeline.eigenheads.correspondence.closest import SurfaceIndex
-from pipeline.eigenheads.correspondence.warp import landmark_warp
-from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.compute.array_cache import cached_arrays
+from pipeline.geometry.surface_index import SurfaceIndex
+from pipeline.geometry.warp import landmark_warp
+from pipeline.head_model.model import HeadModel, load_model
 from rig.errors import EigenheadError
 
 BUILT_IN = ("makehuman", "ict-facekit")

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.compute.threads import in_threads
 from pipeline.geometry.closest_point_kernels import closest_of_candidates
-from pipeline.parallel_for import in_threads
 
 
 def closest_candidates(

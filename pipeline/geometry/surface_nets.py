@@ -4,7 +4,7 @@ Gibson, *Constrained elastic surface nets*, 1998, the naive kind: a vertex in ev
 the places where the cell's edges cross the level; a quadrilateral over every edge with both. Enters: a field that is
 negative inside, at the nodes of a sparse grid or of a whole volume, positive on the outermost ones. Leaves: vertices in
 steps of the grid, triangles wound outwards. The mesh is closed; it is a manifold where the signs are well composed
-(``pipeline.dense.surface.net_kernels``).
+(``pipeline.fusion.net_kernels``).
 """
 
 import itertools

@@ -1,1 +1,1 @@
-"""Images as geometry: silhouettes and their distances, masks, projection in compiled loops, a rasteriser without GL."""
+"""Treats images as geometry: silhouettes and their distances, masks, colour charts, highlights."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compiled import njit
+from pipeline.compute.jit import njit
 
 
 @njit(cache=True, nogil=True)

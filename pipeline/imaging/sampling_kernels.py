@@ -5,7 +5,7 @@ Four neighbours are named ``a b`` above ``c d``; ``right`` and ``down`` are the 
 
 import numpy as np
 
-from pipeline.compiled import njit
+from pipeline.compute.jit import njit
 
 INSIDE = 1.001  # px before an image's far edge where places beyond are held: all four neighbours are then inside
 

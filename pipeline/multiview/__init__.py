@@ -1,4 +1,4 @@
-"""What several calibrated views say together: triangulated points (section 4.2), visual hull, epipolar tangencies,
-cameras
-that have moved.
+"""Measures what several calibrated views show together: points (section 4.2), visual hull, tangencies, the upright.
+
+Enters: rays or silhouettes and the rig. Leaves: points, volumes and distances in mm of the world frame.
 """

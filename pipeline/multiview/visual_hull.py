@@ -12,8 +12,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
+from pipeline.geometry.projection import packed_camera
 from pipeline.geometry.surface_nets import volume_net
-from pipeline.imaging.projection import packed_camera
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull_kernels import COARSE, carve_view, mark_occupied
 from rig.camera import Camera

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.compiled import njit
-from pipeline.imaging.projection_kernels import LENS, NEAREST_MM, distorted, placed
+from pipeline.compute.jit import njit
+from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, distorted, placed
 from pipeline.imaging.sampling_kernels import sample
 
 COARSE = 4  # fine cells along the side of a coarse one

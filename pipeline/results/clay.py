@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.imaging.cpu_raster import picture
+from pipeline.geometry.raster import picture
 from pipeline.results.overlays import PAPER, Resized
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at

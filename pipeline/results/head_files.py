@@ -16,8 +16,8 @@ from jaxtyping import UInt8
 from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.texture.normal_map import normal_mapped, png
-from pipeline.texture.uv_unwrap import Atlas
+from pipeline.texturing.layout.normal_map import normal_mapped, png
+from pipeline.texturing.layout.uv_unwrap import Atlas
 from rig.atomic_write import write_atomically
 from rig.formats.glb import Skin, glb_bytes
 from rig.formats.obj import mtl_bytes, obj_bytes, textured_obj_bytes

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from pipeline.compute.threads import thread_count
+from pipeline.geometry.raster import picture
 from pipeline.imaging.contour_distance import chamfer
-from pipeline.imaging.cpu_raster import picture
 from pipeline.imaging.masks import box_around
-from pipeline.parallel_for import thread_count
 from pipeline.results.overlay_kernels import tint
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.eigenheads.subdivision import boundary_loops, close_loop
+from pipeline.head_model.subdivision import boundary_loops, close_loop
 from rig.mesh import Mesh
 
 FAN_MM = 15.0  # a border that reaches so far to all sides is the neck's: it is closed by a fan about its middle

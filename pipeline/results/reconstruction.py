@@ -7,7 +7,6 @@ seconds that the stages took (those reach report.json only, never head.ply).
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pipeline.diagnostics import ReportWarning
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.settings import Settings
 from pipeline.stages.alignment import Alignment
@@ -19,6 +18,7 @@ from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
+from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh
 
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.dense.part_votes import PART_NAMES
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import BlendshapeRig, Found
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.subject import SubjectFaces
 from pipeline.imaging.silhouette import Silhouette, ViewQuality
+from pipeline.part_labels.votes import PART_NAMES
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report_types import (
     FORMAT,
@@ -35,8 +35,8 @@ from pipeline.stages.bust import Bust
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.texturing import Texturing
 from pipeline.templates.header import TemplateHeader
-from pipeline.texture.chart_colours import ChartColours
-from pipeline.texture.light import HARMONICS, Light
+from pipeline.texturing.chart_colours import ChartColours
+from pipeline.texturing.light import HARMONICS, Light
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges
 from rig.messages.message import documents_of, texts_of

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.eigenheads.model import HeadModel
+from pipeline.head_model.model import HeadModel
 from pipeline.results.clay import SKIN, clay
 from pipeline.results.overlays import contact_sheet
 from pipeline.templates.registration import Registration

@@ -14,7 +14,7 @@ from pipeline.results.head_files import ENCODINGS
 from pipeline.results.metadata import ply_comments
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.templates.template_file import Template
-from pipeline.texture.template_texture import Tile, corner_tiles, skin_polygons, template_textures
+from pipeline.texturing.template_texture import Tile, corner_tiles, skin_polygons, template_textures
 from rig.atomic_write import write_atomically
 from rig.formats.obj import MATERIAL
 from rig.formats.polygon_obj import PolygonMesh, polygon_obj_bytes

@@ -6,10 +6,10 @@ from typing import Literal
 from pipeline.alignment.face_alignment import align_to_face, frontmost_camera
 from pipeline.alignment.landmarks import feature_alignment
 from pipeline.alignment.silhouette_search import moved_to_hull, search_alignment
-from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.model_basis import model_basis
+from pipeline.contour_fit.problem import LandmarkObservations
 from pipeline.faces.landmark_map import landmark_map
-from pipeline.fitting.problem import LandmarkObservations
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.faces import Faces

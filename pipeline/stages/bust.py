@@ -5,16 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.dense.surface.fusion import BustSurface, fuse
-from pipeline.dense.surface.signed_distance import NoSurface
-from pipeline.dense.surface.skin import part_of
-from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.fusion.fusion import BustSurface, fuse
+from pipeline.fusion.signed_distance import NoSurface
+from pipeline.fusion.skin import part_of
+from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
-from pipeline.texture.vertex_colours import texture
+from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.messages.message import compose

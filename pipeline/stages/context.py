@@ -4,11 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from pipeline.eigenheads.model import HeadModel
 from pipeline.faces.networks import FaceNetworks, load_networks
+from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
-from pipeline.silhouettes.segment import segment
 from rig.capture import Capture
 from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer

@@ -6,20 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.dense.depth_map import DepthMap
-from pipeline.dense.estimate import estimate_depth
-from pipeline.dense.highlights import without_highlights
-from pipeline.dense.part_votes import PartVotes, vote_parts
-from pipeline.dense.window_bias import WindowBias
-from pipeline.fitting.fine.dense_points import dense_points
-from pipeline.fitting.fine.depth_bias import OnFace, measure_bias, points_on_face
-from pipeline.fitting.fine.surface_points import SurfacePoints
+from pipeline.detail.dense_points import dense_points
+from pipeline.detail.depth_bias import OnFace, measure_bias, points_on_face
+from pipeline.detail.surface_points import SurfacePoints
+from pipeline.imaging.highlights import without_highlights
+from pipeline.part_labels.votes import PartVotes, vote_parts
 from pipeline.settings import FINE_LEVELS, Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
+from pipeline.stereo.depth_map import DepthMap
+from pipeline.stereo.estimate import estimate_depth
+from pipeline.stereo.window_bias import WindowBias
 
 
 @dataclass(frozen=True, slots=True, eq=False)

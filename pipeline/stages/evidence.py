@@ -6,7 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.diagnostics import ReportWarning
+from pipeline.contour_fit.expression_evidence import makes_face
+from pipeline.contour_fit.fit import Fit
+from pipeline.detail.blink import blinks_of, with_lids
+from pipeline.detail.expression_reading import with_read_expression
+from pipeline.detail.eyelids import MAX_CLOSED_OPENING, MIN_HALF_OPENING
+from pipeline.detail.refine import DeformedSurface
 from pipeline.evidence.camera_metrics import CameraFigures, camera_figures, start_masks
 from pipeline.evidence.expression import (
     MIN_SIGMA,
@@ -20,12 +25,6 @@ from pipeline.evidence.expression import (
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
 from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines
 from pipeline.evidence.pose import PoseEvidence
-from pipeline.fitting.expression_evidence import makes_face
-from pipeline.fitting.fine.blink import blinks_of, with_lids
-from pipeline.fitting.fine.expression_reading import with_read_expression
-from pipeline.fitting.fine.eyelids import MAX_CLOSED_OPENING, MIN_HALF_OPENING
-from pipeline.fitting.fine.refine import DeformedSurface
-from pipeline.fitting.fit import Fit
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
@@ -35,6 +34,7 @@ from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
+from pipeline.warnings import ReportWarning
 from rig.messages.message import compose
 
 Masks = Mapping[str, Bool[np.ndarray, "h w"]]

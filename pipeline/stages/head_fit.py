@@ -5,23 +5,23 @@ Two stages, since what the pixels show is decided in between: ``fit_outlines``, 
 
 from dataclasses import dataclass
 
-from pipeline.dense.highlights import without_highlights
-from pipeline.diagnostics import Detail
-from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.model_basis import basis_of, model_basis
-from pipeline.fitting.contour import ContourSolution, finish, solve_contour
-from pipeline.fitting.expression_evidence import with_expression_evidence
-from pipeline.fitting.fit import Fit
-from pipeline.fitting.photo.refine import refine_with_photographs
-from pipeline.fitting.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
-from pipeline.fitting.simplex.hierarchy import fit_simplex
-from pipeline.fitting.span_misfit import with_span_misfit
+from pipeline.contour_fit.contour import ContourSolution, finish, solve_contour
+from pipeline.contour_fit.expression_evidence import with_expression_evidence
+from pipeline.contour_fit.fit import Fit
+from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
+from pipeline.contour_fit.span_misfit import with_span_misfit
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.model_basis import basis_of, model_basis
+from pipeline.imaging.highlights import without_highlights
+from pipeline.photometric_fit.refine import refine_with_photographs
 from pipeline.settings import PHOTO_LEVELS
+from pipeline.simplex.hierarchy import fit_simplex
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
+from pipeline.warnings import Detail
 from rig.mesh import Mesh
 from rig.messages.message import compose
 

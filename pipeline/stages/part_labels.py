@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from jaxtyping import Float32
 from numpy import ndarray
 
-from pipeline.dense.part_codes import Part
-from pipeline.dense.parts import PartMap, classify_parts
-from pipeline.eigenheads.model import HeadModel
+from pipeline.head_model.model import HeadModel
+from pipeline.part_labels.codes import Part
+from pipeline.part_labels.labelling import PartMap, classify_parts
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Staged, stage

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Concatenate, Generic, ParamSpec, TypeVar
 
-from pipeline.diagnostics import ReportWarning
 from pipeline.stages.context import ReconstructionContext
+from pipeline.warnings import ReportWarning
 from rig.progress import Progress
 
 T = TypeVar("T")

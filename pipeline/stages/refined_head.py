@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.diagnostics import Detail
-from pipeline.fitting.fine.depth_bias import without_window_bias
-from pipeline.fitting.fine.eyelids import measure_eye_appearance
-from pipeline.fitting.fine.patch_points import patch_search
-from pipeline.fitting.fine.refine import DeformedSurface, refine_to_surface
-from pipeline.fitting.posterior import vertex_deviation_mm
-from pipeline.fitting.untangling import untangled_head
+from pipeline.contour_fit.posterior import vertex_deviation_mm
+from pipeline.detail.depth_bias import without_window_bias
+from pipeline.detail.eyelids import measure_eye_appearance
+from pipeline.detail.patch_points import patch_search
+from pipeline.detail.refine import DeformedSurface, refine_to_surface
+from pipeline.detail.untangling import untangled_head
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth, is_refined
 from pipeline.stages.faces import Faces
@@ -19,6 +18,7 @@ from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
+from pipeline.warnings import Detail
 from rig.mesh import Mesh
 from rig.messages.message import compose
 

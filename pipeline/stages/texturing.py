@@ -6,18 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
-from pipeline.texture.albedo import DIM_SHARE, Albedo, estimate_albedo
-from pipeline.texture.chart_colours import ChartColours, chart_colours, with_true_colours
-from pipeline.texture.head_texture import find_layout, paint_head
-from pipeline.texture.reduced_layout import ReducedLayout, reduced_layout
-from pipeline.texture.uv_unwrap import Atlas
-from pipeline.texture.vertex_colours import Texture, texture
+from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo
+from pipeline.texturing.chart_colours import ChartColours, chart_colours, with_true_colours
+from pipeline.texturing.head_texture import find_layout, paint_head
+from pipeline.texturing.layout.reduced_layout import ReducedLayout, reduced_layout
+from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.vertex_colours import Texture, texture
 from rig.capture import Capture
 
 

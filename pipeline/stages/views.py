@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.silhouettes.usable_views import usable_views
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Staged, stage
+from pipeline.view_checks.usable_views import usable_views
 from rig.capture import Capture
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.alignment.procrustes import procrustes
-from pipeline.eigenheads.correspondence.closest import SurfaceIndex
-from pipeline.eigenheads.correspondence.warp import landmark_warp
-from pipeline.eigenheads.gaussian_process import spread_nodes
+from pipeline.geometry.procrustes import procrustes
+from pipeline.geometry.surface_index import SurfaceIndex
+from pipeline.geometry.warp import landmark_warp
+from pipeline.head_model.gaussian_process import spread_nodes
 
 CANDIDATES = 16  # triangles about a vertex that are looked at
 ANCHORS = 360  # vertices of the skin that lead what lies deeper: 3 mm apart along lids and lips

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.eigenheads.model_names import model_path, model_sha256
+from pipeline.head_model.model_names import model_path, model_sha256
 from pipeline.templates.names import template_path
 from rig.errors import EigenheadError
 from rig.messages.message import Message, compose

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from pipeline.eigenheads.correspondence.closest import SurfaceIndex
-from pipeline.eigenheads.gaussian_process import with_kernel
-from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.geometry.surface_index import SurfaceIndex
+from pipeline.head_model.gaussian_process import with_kernel
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.subdivision import vertex_areas
 from pipeline.templates.placement import Surface, samples
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import vertex_normals

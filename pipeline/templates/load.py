@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.eigenheads.model import HeadModel
+from pipeline.head_model.model import HeadModel
 from pipeline.templates.names import template_path
 from pipeline.templates.registration import Registration, register
 from pipeline.templates.template_file import Template, read_template

@@ -5,7 +5,7 @@ Templates lie in the data folder's ``templates``, each with its picture.
 
 from pathlib import Path
 
-from pipeline.eigenheads.data_folder import data_folder
+from pipeline.head_model.data_folder import data_folder
 from pipeline.settings import TEMPLATE_NAME
 from rig.errors import EigenheadError
 from rig.messages.message import compose

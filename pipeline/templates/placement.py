@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.alignment.procrustes import procrustes
-from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.regions import head_regions
+from pipeline.geometry.procrustes import procrustes
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.regions import head_regions
 from rig.errors import InputError
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals

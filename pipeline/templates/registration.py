@@ -13,12 +13,12 @@ import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.eigenheads.correspondence.closest import SurfaceIndex
-from pipeline.eigenheads.correspondence.correspondence import Search, Target, refined
-from pipeline.eigenheads.correspondence.warp import landmark_warp
-from pipeline.eigenheads.gaussian_process import spread_nodes
-from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.geometry.surface_index import SurfaceIndex
+from pipeline.geometry.warp import landmark_warp
+from pipeline.head_model.gaussian_process import spread_nodes
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.subdivision import vertex_areas
+from pipeline.model_building.correspondence.correspondence import Search, Target, refined
 from pipeline.templates.carrying import Attachment, SurfaceBinding, bind_vertices, surface_binding
 from pipeline.templates.likeness import CANDIDATES, Likeness, fit_model_to_mesh
 from pipeline.templates.placement import Surface, find_place, outward, place_by_landmarks

@@ -16,8 +16,8 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from pipeline.eigenheads.correspondence.closest import Hits
-from pipeline.eigenheads.landmarks import stacked
+from pipeline.geometry.surface_index import Hits
+from pipeline.head_model.landmarks import stacked
 from pipeline.verification.measured import Measured
 from pipeline.verification.reference import Reference
 from rig.errors import InputError

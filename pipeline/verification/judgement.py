@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.eigenheads.regions import REGIONS
 from pipeline.evidence.measurements import DISTANCES
+from pipeline.head_model.regions import REGIONS
 from pipeline.verification.best_fit import BestFit, best_fit, counted
 from pipeline.verification.limits import Check, Limits, checks
 from pipeline.verification.measured import Measured

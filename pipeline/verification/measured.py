@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.eigenheads.model import HeadModel
-from pipeline.eigenheads.regions import head_regions
-from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.regions import head_regions
+from pipeline.head_model.subdivision import vertex_areas
 from pipeline.results.report_types import Report as ReportDocument
 from rig.errors import InputError
 from rig.formats.ply import read_head_ply

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.eigenheads.correspondence.closest import Hits, SurfaceIndex
-from pipeline.eigenheads.correspondence.scans import landmark_file, read_landmarks, welded
+from pipeline.geometry.surface_index import Hits, SurfaceIndex
+from pipeline.model_building.correspondence.scans import landmark_file, read_landmarks, welded
 from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh, boundary_edges

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.eigenheads.model_file import expression_names
-from pipeline.eigenheads.model_names import model_path
+from pipeline.head_model.model_file import expression_names
+from pipeline.head_model.model_names import model_path
 from rig.atomic_write import write_atomically
 from rig.messages.message import MessageDocument, documents_of
 from server.batch.folder import BatchFolder, FailureRecord, Origin

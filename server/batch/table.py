@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.eigenheads.landmarks import NAMES
 from pipeline.evidence.measurements import DISTANCES
+from pipeline.head_model.landmarks import NAMES
 from rig.digest import document_sha256
 from server.batch.captures import BatchCapture
 from server.batch.folder import FailureRecord, Origin

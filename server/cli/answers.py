@@ -13,7 +13,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from pipeline.eigenheads.data_folder import DATA
+from pipeline.head_model.data_folder import DATA
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import texts_of
 from rig.progress import Progress
@@ -122,7 +122,7 @@ def number(help_text: str, **limits: Any) -> Any:
 
 def model_names() -> tuple[str, ...]:
     """Of the head models at hand."""
-    from pipeline.eigenheads.model_names import list_models
+    from pipeline.head_model.model_names import list_models
 
     return tuple(list_models())
 

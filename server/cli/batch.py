@@ -157,7 +157,7 @@ def _given_threads() -> dict[str, str]:
     """EIGENHEAD_THREADS as somebody set it, who knows better."""
     import os
 
-    from pipeline.parallel_for import THREADS
+    from pipeline.compute.threads import THREADS
 
     return {THREADS: os.environ[THREADS]} if os.environ.get(THREADS) else {}
 

@@ -2,7 +2,7 @@
 
 Files, cameras, plates and feature points are judged as at the service's door (``server.tasks.ingest``), but for
 pictures of no camera, which a reconstruction passes over; where they are in order, outlines are asked what they say of
-pictures and cameras (``pipeline.silhouettes.usable_views``). What is wrong with this machine is no fault of the capture
+pictures and cameras (``pipeline.view_checks.usable_views``). What is wrong with this machine is no fault of the capture
 and is raised."""
 
 from dataclasses import replace
@@ -129,10 +129,10 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
 
 
 def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
+    from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
-    from pipeline.silhouettes.segment import segment
-    from pipeline.silhouettes.usable_views import usable_views
-    from pipeline.texture.chart_colours import chart_colours
+    from pipeline.texturing.chart_colours import chart_colours
+    from pipeline.view_checks.usable_views import usable_views
 
     shot, rig = read_scaled_capture(folder)
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops

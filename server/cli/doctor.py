@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, Protocol, TypedDict
 from urllib.parse import quote
 
-from pipeline.eigenheads.data_folder import MODELS, models_folder
-from pipeline.eigenheads.model_names import model_path
-from pipeline.parallel_for import THREADS, thread_count
+from pipeline.compute.threads import THREADS, thread_count
+from pipeline.head_model.data_folder import MODELS, models_folder
+from pipeline.head_model.model_names import model_path
 from rig.cache_folder import CACHE, cache_folder
 from rig.errors import EigenheadError
 from rig.text import suggest
@@ -92,7 +92,7 @@ def _egl(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _model(settings: ServiceSettings) -> tuple[bool, str]:
-    from pipeline.eigenheads.model_file import read_parts
+    from pipeline.head_model.model_file import read_parts
 
     parts, sha256 = read_parts(model_path("default"))
     return True, f"{parts.name}, {len(parts.modes)} modes, sha256 {sha256[:12]}"

@@ -65,7 +65,7 @@ def experiments(
         raise typer.BadParameter("only real, people and relief take folders", param_hint="FOLDERS")
     if (only or detail) and name != "people":
         raise typer.BadParameter("only people takes it", param_hint="--only" if only else "--detail")
-    from pipeline.experiments.runner import Options, run_experiment
+    from pipeline.research.runner import Options, run_experiment
 
     options = Options(simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail)
     with progress_bar() as report:

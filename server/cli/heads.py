@@ -284,8 +284,8 @@ def _check_planted(faults: list[str], expression: list[str]) -> None:
         for text in faults:
             fault_from_text(text)
     if expression:
-        from pipeline.eigenheads.expressions import weights_from_text
-        from pipeline.eigenheads.model import load_model
+        from pipeline.head_model.expressions import weights_from_text
+        from pipeline.head_model.model import load_model
 
         with wrong_usage("--expression"):
             weights_from_text(expression, load_model().expressions.names)

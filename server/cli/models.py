@@ -13,7 +13,7 @@ model_app = typer.Typer(help="Head models.", no_args_is_help=True, rich_markup_m
 @model_app.command("list", epilog="Example: eigenhead model list")
 def model_list(data: Data = None, json_out: Json = False) -> None:
     """List the head models at hand."""
-    from pipeline.eigenheads.model_names import list_models
+    from pipeline.head_model.model_names import list_models
 
     found = {name: str(path) for name, path in list_models().items()}
     answer({"models": found}, json_out, [f"{name}  {path}" for name, path in found.items()])
@@ -26,8 +26,8 @@ def model_info(
     json_out: Json = False,
 ) -> None:
     """Say what a head model is made of."""
-    from pipeline.eigenheads.info import model_info as describe
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.info import model_info as describe
+    from pipeline.head_model.model import load_model
 
     document = describe(load_model(name))
     answer(document, json_out, [f"{key:<18} {_as_text(value)}" for key, value in document.items() if key != "figures"])
@@ -48,9 +48,9 @@ def model_import(
     json_out: Json = False,
 ) -> None:
     """Make a foreign head model one of ours."""
-    from pipeline.eigenheads.data_folder import models_folder
-    from pipeline.eigenheads.model_file import save_model
-    from pipeline.eigenheads.sources.imports import import_model
+    from pipeline.head_model.data_folder import models_folder
+    from pipeline.head_model.model_file import save_model
+    from pipeline.model_building.sources.imports import import_model
 
     with progress_bar() as report:
         parts = import_model(source, name=name, report=report)
@@ -70,7 +70,7 @@ def model_build(
 ) -> None:
     """Build a head model from raw scans (section 3.2)."""
     prepare_file(out)
-    from pipeline.eigenheads.training.build import build_model
+    from pipeline.model_building.training.build import build_model
 
     with progress_bar() as report:
         built = build_model(scans, out, name=name or out.stem, on_bad="skip" if skip_bad else "stop", report=report)
@@ -95,7 +95,7 @@ def model_fetch(
     """Fetch a published head model.
 
     Its licence is shown, and it becomes one of ours."""
-    from pipeline.eigenheads.sources.fetch import fetch_model
+    from pipeline.model_building.sources.fetch import fetch_model
 
     with progress_bar() as report:
         fetched = fetch_model(name, source=source, report=report)
@@ -114,8 +114,8 @@ def model_show(
     """Draw a model's modes and a correspondence (figures 2 and 3).
 
     And how compact, general and specific it is."""
-    from pipeline.eigenheads.model import load_model
-    from pipeline.eigenheads.training.figures import show_model
+    from pipeline.head_model.model import load_model
+    from pipeline.model_building.training.figures import show_model
 
     with progress_bar() as report:
         drawn = [str(path) for path in show_model(load_model(name), out, modes=modes, report=report)]
@@ -131,7 +131,7 @@ def model_remove(
     """Remove a head model.
 
     One that was imported, built or fetched; the shipped one stays."""
-    from pipeline.eigenheads.model_names import remove_model
+    from pipeline.head_model.model_names import remove_model
 
     path = remove_model(name)
     answer({"name": name, "file": str(path)}, json_out, [f"removed {path}"])

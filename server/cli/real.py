@@ -13,8 +13,8 @@ from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels
 
 if TYPE_CHECKING:
-    from pipeline.experiments.outcome import Outcome
-    from pipeline.experiments.real import RealCapture
+    from pipeline.research.faults.real import RealCapture
+    from pipeline.research.outcome import Outcome
 
 OUTLINES = "outlines.json"
 
@@ -32,9 +32,9 @@ def judge_folders(
     where cameras that had to be found stay. Raises InputError."""
     if outlines is not None and len(folders) > 1:
         raise InputError("--outlines", ["belongs to one folder; put outlines.json into each of several"])
-    from pipeline.eigenheads.model import load_model
-    from pipeline.experiments.markdown import of_figures
-    from pipeline.experiments.real import real
+    from pipeline.head_model.model import load_model
+    from pipeline.research.faults.real import real
+    from pipeline.research.markdown import of_figures
     from pipeline.settings import Settings
     from rig.atomic_write import write_atomically
     from rig.render.renderer import Renderer
@@ -54,7 +54,7 @@ def read_real_capture(
     folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Progress
 ) -> "RealCapture":
     """A folder as ``real`` takes it: masks and outlines that it has judge, and feature points are left out."""
-    from pipeline.experiments.real import RealCapture
+    from pipeline.research.faults.real import RealCapture
 
     prepared = read_or_calibrate(folder, kept, front=front, report=report)
     default = capture_root(folder) / OUTLINES

@@ -8,13 +8,13 @@ import numpy as np
 from calibration.silhouette_refinement.refine import TooFewCaptures, refine
 from calibration.silhouette_refinement.report import RefinementRun
 from calibration.silhouette_refinement.rims import Heads
-from pipeline.eigenheads.model import load_model, with_modes
+from pipeline.head_model.model import load_model, with_modes
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
-from pipeline.silhouettes.segment import segment
-from pipeline.silhouettes.usable_views import without_moved_cameras
 from pipeline.stages.alignment import align_to_views
 from pipeline.stages.views import Views
+from pipeline.view_checks.usable_views import without_moved_cameras
 from rig.errors import InputError
 from rig.formats.cameras_json import read_rig
 from rig.geometry import RigidTransform, Similarity

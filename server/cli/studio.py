@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from rig.acquisition.commands import take_plates
 from rig.capture import Capture
 from rig.errors import InputError

@@ -42,8 +42,8 @@ def template_add(
     if path.exists() and not overwrite:
         raise Overwrites(path)
     prepare_file(path)
-    from pipeline.eigenheads.correspondence.scans import landmark_file, read_landmarks
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.model import load_model
+    from pipeline.model_building.correspondence.scans import landmark_file, read_landmarks
     from pipeline.results.template_picture import template_picture
     from pipeline.templates.load import make_template
     from pipeline.templates.template_file import save_template

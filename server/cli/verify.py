@@ -41,7 +41,7 @@ def verify_captures(
     """Writes report.json and certificate.pdf into ``out``, and the results of captures into ``out/results``.
 
     What can be wrong with the reference is found before anything is reconstructed. Raises InputError."""
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.model import load_model
     from pipeline.verification.judgement import judge
     from pipeline.verification.measured import identity_of, is_result, read_measured
     from pipeline.verification.reference import read_reference

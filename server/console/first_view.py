@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.imaging.cpu_raster import picture
+from pipeline.geometry.raster import picture
 from rig.camera import Camera, Intrinsics
 from rig.formats.ply import read_head_ply
 from rig.geometry import look_at

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.alignment.feature_points import locate_features
-from pipeline.alignment.procrustes import procrustes
+from pipeline.geometry.procrustes import procrustes
 from pipeline.multiview.triangulation import NoPoint, triangulate
 from pipeline.settings import CLICK_NOISE_PX
 from rig.camera import Camera
@@ -167,7 +167,7 @@ def nearest_views(rig: Rig, front: str, count: int) -> list[str]:
 
 def mean_landmarks(context: WorkerContext, report: Progress, *, model: str, names: list[str]) -> dict[str, list[float]]:
     """Landmarks of a model's mean head (head frame, mm); runs in a child, because a model is large."""
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.model import load_model
 
     loaded = load_model(model)
     vertices = loaded.vertices(np.zeros(0))

@@ -9,7 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from rig.acquisition.image_checks import blur_px, exposure
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout

@@ -8,8 +8,8 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from pydantic import TypeAdapter
 
-from pipeline.diagnostics import WARNING_CODES
 from pipeline.settings import SPACING_RANGE_MM, Settings
+from pipeline.warnings import WARNING_CODES
 from server.storage.records import JsonObject
 from server.wire import problems
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pipeline.eigenheads.model_names import list_models, model_path, model_sha256
+from pipeline.head_model.model_names import list_models, model_path, model_sha256
 from pipeline.templates.header import BadTemplate, TemplateHeader, read_header
 from pipeline.templates.names import list_templates
 

@@ -34,7 +34,7 @@ class ReconstructionRequest:
             raise InputError("model" if model else "settings", model or settings)
 
     def _model_faults(self) -> list[Message]:
-        from pipeline.eigenheads.model_names import list_models
+        from pipeline.head_model.model_names import list_models
 
         known = ["default", *list_models()]
         if self.model is None or self.model in known:
@@ -55,7 +55,7 @@ class ReconstructionRequest:
 
 
 def _template_faults(name: str, model: str) -> list[Message]:
-    from pipeline.eigenheads.model_names import UnknownModel
+    from pipeline.head_model.model_names import UnknownModel
     from pipeline.templates.header import check_template
     from pipeline.templates.names import template_path
 

@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from pipeline.imaging.silhouette import Silhouette, ViewQuality
+from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
-from pipeline.silhouettes.segment import segment
 from rig.atomic_write import write_atomically
 from rig.capture import Capture
 from rig.messages.message import documents_of, read_message

@@ -89,9 +89,9 @@ def _face_of(face: "FaceDetection", camera: Camera, recorded: Camera, best: "Fac
 def _suggested(context: WorkerContext, face: "MatchedFaces", rig: Rig, recorded: Rig) -> PixelsOfPoints:
     """The seven points by the default model's landmarks; none where nobody knows the finder's points on it."""
     from pipeline.alignment.suggested_points import suggest_points
-    from pipeline.eigenheads.landmarks import SEVEN_POINTS
-    from pipeline.eigenheads.model import load_model
     from pipeline.faces.landmark_map import NoLandmarkMap, landmark_map
+    from pipeline.head_model.landmarks import SEVEN_POINTS
+    from pipeline.head_model.model import load_model
 
     model = context.keep("model default", load_model)
     try:

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
-from pipeline.diagnostics import ReportWarning
 from pipeline.faces.matching import EYE_DISTANCE_MM
 from pipeline.faces.networks import DamagedNetwork, FaceNetworks, load_networks
 from pipeline.faces.sighting import GLANCE_PX, SMALLEST_PX, reduce_picture, sight_face
+from pipeline.warnings import ReportWarning
 from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera

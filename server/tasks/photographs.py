@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.spread_views import spread_views
 from pipeline.settings import SegmentationSettings
+from pipeline.warnings import ReportWarning
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture
@@ -158,7 +158,7 @@ def keep_masks(
 ) -> dict[str, Silhouette]:
     """Silhouettes; where the photographs alone told them, masks/ in ``kept`` shows them, and a second run takes what
     it finds there."""
-    from pipeline.silhouettes.segment import segment
+    from pipeline.segmentation.segment import segment
     from server.storage.silhouette_cache import SUFFIX, segment_once
 
     if capture.masks or capture.backgrounds:

@@ -1,4 +1,4 @@
-"""What a first job would wait for, made ahead: the compiled loops of ``pipeline.kernel_list``, in processes over all
+"""What a first job would wait for, made ahead: the compiled loops of ``pipeline.compute.kernel_list``, in processes over all
 cores. Set-up does it (``eigenhead prepare``), and a command that finds something missing does it before its work."""
 
 import errno
@@ -17,7 +17,7 @@ from rig.progress import Progress
 from server.tasks.child import Child, WorkerContext
 
 if TYPE_CHECKING:
-    from pipeline.kernel_list import Kernel
+    from pipeline.compute.kernel_list import Kernel
     from pipeline.settings import Settings
 
 log = logging.getLogger("eigenhead")
@@ -35,7 +35,7 @@ class Prepared(NamedTuple):
 
 def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bool:
     """Compiles a line of the list, in a child. Returns False where it could not be kept, which the log has said."""
-    from pipeline.kernel_list import Kernel
+    from pipeline.compute.kernel_list import Kernel
 
     kernel = Kernel.from_line(line)
     kernel.compile()
@@ -55,7 +55,7 @@ def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Pre
     Returns:
         How many loops there are, and what became of them.
     """
-    from pipeline.kernel_list import by_module, listed_kernels
+    from pipeline.compute.kernel_list import by_module, listed_kernels
     from pipeline.settings import FINE_LEVELS
 
     dense = settings is None or settings.detail in FINE_LEVELS or settings.outputs.surface != "head"
@@ -107,7 +107,7 @@ class _Work:
 
 def _can_keep() -> bool:
     """Whether the cache folder can be written; where not, a line in the log says so."""
-    from pipeline.compiled import say_not_kept
+    from pipeline.compute.jit import say_not_kept
 
     try:
         folder = cache_folder() / "kernels"

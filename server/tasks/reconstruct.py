@@ -48,7 +48,7 @@ def reconstruct_capture(
     """
     report("read", 0.0)  # a fresh child loads for seconds what this takes
     share_one_heap()
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
     from pipeline.settings import settings_from_document

@@ -51,7 +51,7 @@ def reconstruct_folder(
     prepared = read_or_calibrate(folder, kept, front=chosen.front, report=preparation)
     kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
     context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
     from pipeline.stages.context import ReconstructionContext

@@ -32,7 +32,7 @@ def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: in
 
     Without a seed the subject is another one each time. The operator's clicks are left out: they are made later.
     """
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.model import load_model
     from rig.formats.capture_folder import write_capture
     from rig.render.renderer import Renderer
     from rig.studio.devices.folder import write_truth
@@ -59,7 +59,7 @@ def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
 
 def look(context: WorkerContext, report: Progress, *, cameras: list[str]) -> dict[str, np.ndarray]:
     """Returns what cameras of the studio show (RGB): a subject that sits there, drawn once and kept."""
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.model import load_model
     from rig.render.renderer import Renderer
     from rig.studio.scene.layout import default_layout
     from rig.studio.scene.simulate import build_scene, view_light

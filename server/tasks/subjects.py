@@ -6,9 +6,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pipeline.eigenheads.correspondence.scans import landmark_file, read_landmarks
-from pipeline.eigenheads.expressions import closed_lids, weights_from_text
-from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.head_model.expressions import closed_lids, weights_from_text
+from pipeline.head_model.model import HeadModel, load_model
+from pipeline.model_building.correspondence.scans import landmark_file, read_landmarks
 from rig.errors import InputError
 from rig.formats.mesh_file import read_mesh
 from rig.mesh import Mesh

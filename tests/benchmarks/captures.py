@@ -12,9 +12,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from pipeline.eigenheads.model import load_model
-from pipeline.experiments.detail import read_known, surface_error
+from pipeline.head_model.model import load_model
 from pipeline.reconstruct import reconstruct
+from pipeline.research.paper.detail import read_known, surface_error
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.render.renderer import Renderer

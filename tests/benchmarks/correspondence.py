@@ -16,13 +16,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.eigenheads.correspondence.closest import SurfaceIndex
-from pipeline.eigenheads.correspondence.correspondence import Correspondence, Matching, correspond
-from pipeline.eigenheads.correspondence.synthetic_scanner import Scanner, scan_head
-from pipeline.eigenheads.model import HeadModel, assemble, load_model
-from pipeline.eigenheads.model_file import read_parts
-from pipeline.eigenheads.model_names import model_path
-from pipeline.eigenheads.pca import principal_components
+from pipeline.geometry.surface_index import SurfaceIndex
+from pipeline.head_model.model import HeadModel, assemble, load_model
+from pipeline.head_model.model_file import read_parts
+from pipeline.head_model.model_names import model_path
+from pipeline.head_model.pca import principal_components
+from pipeline.model_building.correspondence.correspondence import Correspondence, Matching, correspond
+from pipeline.model_building.correspondence.synthetic_scanner import Scanner, scan_head
 
 
 def without(subjects: list[int]) -> HeadModel:

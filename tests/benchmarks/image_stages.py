@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel, load_model
 from pipeline.reconstruct import reconstruct
 from pipeline.results.write import write_result
 from pipeline.settings import Settings

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from rig.formats.cameras_json import write_rig
 from rig.formats.images import write_image
 from rig.image import ImageRgb

@@ -21,13 +21,13 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from pipeline.eigenheads.correspondence.scans import Scan, write_landmarks
-from pipeline.eigenheads.correspondence.synthetic_scanner import Scanner, scan_head
-from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.eigenheads.model_file import read_parts
-from pipeline.eigenheads.model_names import model_path
-from pipeline.eigenheads.training.build import build_model, corresponded_cages
-from pipeline.eigenheads.training.training import Training, train
+from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model_file import read_parts
+from pipeline.head_model.model_names import model_path
+from pipeline.model_building.correspondence.scans import Scan, write_landmarks
+from pipeline.model_building.correspondence.synthetic_scanner import Scanner, scan_head
+from pipeline.model_building.training.build import build_model, corresponded_cages
+from pipeline.model_building.training.training import Training, train
 from tests.benchmarks.correspondence import without
 
 SPACING_MM = 1.12  # 100,000 points

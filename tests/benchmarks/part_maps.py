@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.dense.parts import classify_parts
-from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.imaging.cpu_raster import camera_depths
+from pipeline.geometry.raster import camera_depths
+from pipeline.head_model.model import HeadModel, load_model
+from pipeline.part_labels.labelling import classify_parts
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import PartSettings, Settings
 from pipeline.stages.context import ReconstructionContext

@@ -18,9 +18,9 @@ from calibration.adjustment.gauge import image_distance
 from calibration.result import CalibrationRefused
 from calibration.scene.result import SceneCalibration
 from calibration.scene.scene import calibrate_scene
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
+from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
-from pipeline.silhouettes.segment import segment
 from rig.capture import Capture
 from rig.formats.capture_folder import write_capture
 from rig.formats.images import read_image, write_image

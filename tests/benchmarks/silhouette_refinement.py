@@ -27,8 +27,8 @@ from jaxtyping import Float
 from calibration.adjustment.gauge import image_distance, image_metric, subject_points
 from calibration.silhouette_refinement.refine import PRIOR_PX, minimise_tangencies, refine
 from calibration.silhouette_refinement.rims import Heads
-from pipeline.eigenheads.model import HeadModel, load_model, with_modes
-from pipeline.fitting.contour import fit_contour
+from pipeline.contour_fit.contour import fit_contour
+from pipeline.head_model.model import HeadModel, load_model, with_modes
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity, rotation_from_vector

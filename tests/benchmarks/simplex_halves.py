@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.alignment.landmarks import align_to_features
-from pipeline.eigenheads.landmarks import SEVEN_POINTS
-from pipeline.eigenheads.model import HeadModel, load_model, with_modes
-from pipeline.fitting.contour import fit_contour
-from pipeline.fitting.simplex.hierarchy import fit_simplex
+from pipeline.contour_fit.contour import fit_contour
+from pipeline.head_model.landmarks import SEVEN_POINTS
+from pipeline.head_model.model import HeadModel, load_model, with_modes
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import Settings
+from pipeline.simplex.hierarchy import fit_simplex
 from rig.camera import Camera, Intrinsics
 from rig.capture import Features
 from rig.geometry import Similarity, look_at, rotation_from_vector

@@ -10,7 +10,7 @@ With faults every capture is taken anew with each of them, and a view may be wro
 of another program (``RENDERED``), whose masks are known.
 
 Coverage of the subject is the truth: the contour is judged where it is one half at the resolution that a mask has, the
-overlap at the lens's own (see tests/pipeline/silhouettes/test_segment_studio.py).
+overlap at the lens's own (see tests/pipeline/segmentation/test_segment_studio.py).
 """
 
 import argparse
@@ -19,15 +19,15 @@ import sys
 
 import numpy as np
 
+from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
-from pipeline.silhouettes.segment import segment
 from rig.capture import Capture
 from rig.formats.capture_folder import read_capture
 from rig.render.renderer import Renderer
 from rig.studio.sensor.faults import fault_from_text
 from rig.studio.sensor.preset import PRESET
-from tests.pipeline.silhouettes.test_segment import true_mask
-from tests.pipeline.silhouettes.test_segment_studio import RESOLUTION_PX, coverage, iou, rms, take
+from tests.pipeline.segmentation.test_segment import true_mask
+from tests.pipeline.segmentation.test_segment_studio import RESOLUTION_PX, coverage, iou, rms, take
 from tests.support.shared_data import shared
 
 WORST_PX, LEAST_IOU = 0.8, 0.995

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from pipeline.eigenheads.model import load_model
-from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.geometry.raster import depth_maps
+from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import hull_extent, visual_hull
+from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings, TextureSettings
-from pipeline.silhouettes.segment import segment
-from pipeline.texture.vertex_colours import texture
+from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
 from rig.formats.capture_folder import read_capture
 from rig.mesh import Mesh

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout

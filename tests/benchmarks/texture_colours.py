@@ -21,14 +21,14 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.eigenheads.correspondence.closest import SurfaceIndex
-from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.imaging.cpu_raster import depth_maps
+from pipeline.geometry.raster import depth_maps
+from pipeline.geometry.surface_index import SurfaceIndex
+from pipeline.head_model.model import HeadModel, load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import Settings, TextureSettings
 from pipeline.stages.context import ReconstructionContext
-from pipeline.texture.vertex_colours import texture
+from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.mesh import Mesh

@@ -16,7 +16,7 @@ import nicegui
 import numpy as np
 import pytest
 
-from pipeline.imaging.cpu_raster import picture
+from pipeline.geometry.raster import picture
 from rig.camera import Camera, Intrinsics
 from rig.formats.images import read_image
 from rig.formats.mesh_file import read_mesh

@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # pytest may load this file before it checks what is imported
 @pytest.fixture(scope="session")
 def half_size_shot(renderer: "Renderer") -> "SimulatedCapture":
     """A subject with hair before eleven uneven backdrops, with noise and light drift, at 512 x 384 pixels."""
-    from pipeline.eigenheads.model import load_model
+    from pipeline.head_model.model import load_model
     from rig.studio.scene.layout import default_layout
     from rig.studio.scene.simulate import simulate
     from rig.studio.sensor.preset import PRESET

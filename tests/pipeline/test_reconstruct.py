@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.eigenheads.model import load_model
 from pipeline.evidence.plausibility import ImplausibleResult
+from pipeline.head_model.model import load_model
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext

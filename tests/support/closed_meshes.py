@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from pipeline.dense.surface.crossings import crossing_faces
+from pipeline.fusion.crossings import crossing_faces
 from rig.mesh import Mesh
 
 

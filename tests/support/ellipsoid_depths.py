@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.dense.depth_map import DepthMap
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.stereo.depth_map import DepthMap
 from rig.camera import Camera, Distortion
 from rig.rig import Rig
 from tests.support.scenes import fan, pixel_grid

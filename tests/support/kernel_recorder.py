@@ -1,6 +1,6 @@
 """Which compiled loops jobs call, and with which types.
 
-python -m tests.support.kernel_recorder pipeline/kernels.txt CAPTURE... writes the list from jobs on captures: first
+python -m tests.support.kernel_recorder pipeline/compute/kernels.txt CAPTURE... writes the list from jobs on captures: first
 without the dense stage, then as by default.
 """
 
@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.compiled import KeptFunction
-from pipeline.kernel_list import Kernel, text_from_type
+from pipeline.compute.jit import KeptFunction
+from pipeline.compute.kernel_list import Kernel, text_from_type
 
 
 @contextmanager

@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.eigenheads.correspondence.closest import SurfaceIndex
 from pipeline.faces.landmark_map import LandmarkMap, built_in_map
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import find_subject
+from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.multiview.triangulation import triangulate_many
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import read_capture

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.eigenheads.expressions import closed_lids
-from pipeline.eigenheads.model import HeadModel
-from pipeline.experiments.expressions import drawn_weights
 from pipeline.faces.crops import make_pyramid
 from pipeline.faces.detection import FaceDetection, crop_around, find_face_at
 from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.points import point_table
+from pipeline.head_model.expressions import closed_lids
+from pipeline.head_model.model import HeadModel
+from pipeline.research.people.expressions import drawn_weights
 from rig.capture import ImageRgb
 from rig.formats.cameras_json import document_from_rig, rig_from_document
 from rig.geometry import Similarity, rigid_fit, rotation_from_vector

@@ -5,12 +5,11 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from pipeline.diagnostics import Detail, ReportWarning
-from pipeline.eigenheads.model import load_model
+from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.measurements import Landmark, Measurement
 from pipeline.evidence.pose import PoseEvidence
-from pipeline.fitting.fit import Fit
+from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import Settings
@@ -23,8 +22,9 @@ from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
-from pipeline.texture.uv_unwrap import Atlas
-from pipeline.texture.vertex_colours import Texture
+from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.vertex_colours import Texture
+from pipeline.warnings import Detail, ReportWarning
 from rig.capture import Capture
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh

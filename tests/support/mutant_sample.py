@@ -25,20 +25,20 @@ from pathlib import Path
 from tests.support.mutants import KILLED_LEAST, ROOT
 
 LEAST_S = 60.0  # a busy machine is no reason to call a mutant noticed
-IMAGING, TEXTURE = "tests/pipeline/imaging", "tests/pipeline/texture"
+IMAGING, TEXTURE = "tests/pipeline/imaging", "tests/pipeline/texturing"
 # The loops of geometry, silhouette cost and texture weights, and the tests that speak of them.
 LOOPS = {
-    "pipeline/imaging/projection_kernels.py": [f"{IMAGING}/test_projection.py"],
+    "pipeline/geometry/projection_kernels.py": [f"{IMAGING}/test_projection.py"],
     "pipeline/imaging/sampling_kernels.py": [f"{IMAGING}/test_sampling.py"],
     "pipeline/imaging/contour_distance_kernels.py": [f"{IMAGING}/test_contour_distance.py"],
-    "pipeline/imaging/cpu_raster_kernels.py": [f"{IMAGING}/test_cpu_raster.py"],
-    "pipeline/fitting/rim_kernels.py": [
-        "tests/pipeline/fitting/test_rim.py",
+    "pipeline/geometry/raster_kernels.py": [f"{IMAGING}/test_cpu_raster.py"],
+    "pipeline/contour_fit/rim_kernels.py": [
+        "tests/pipeline/contour_fit/test_rim.py",
         "tests/pipeline/estimation/test_jacobians.py",
     ],
-    "pipeline/fitting/rim_jacobian_kernels.py": ["tests/pipeline/estimation/test_jacobians.py"],
-    "pipeline/texture/visibility_kernels.py": [f"{TEXTURE}/test_visibility_kernels.py"],
-    "pipeline/texture/vertex_colours_kernels.py": [f"{TEXTURE}/test_vertex_colours_kernels.py"],
+    "pipeline/contour_fit/rim_jacobian_kernels.py": ["tests/pipeline/estimation/test_jacobians.py"],
+    "pipeline/texturing/visibility_kernels.py": [f"{TEXTURE}/test_visibility_kernels.py"],
+    "pipeline/texturing/vertex_colours_kernels.py": [f"{TEXTURE}/test_vertex_colours_kernels.py"],
 }
 SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     **{ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq},

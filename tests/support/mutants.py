@@ -18,8 +18,8 @@ HOURS_MOST = 6
 PACKAGES = ("rig", "pipeline", "calibration", "server")
 # What speaks of the module beside its namesake, or in its place.
 TESTS = {
-    "pipeline/alignment/procrustes.py": ["tests/pipeline/alignment/test_landmarks.py"],
-    "pipeline/fitting/simplex/xor_objective.py": ["tests/pipeline/fitting/simplex/test_xor_objective.py"],
+    "pipeline/geometry/procrustes.py": ["tests/pipeline/alignment/test_landmarks.py"],
+    "pipeline/simplex/xor_objective.py": ["tests/pipeline/simplex/test_xor_objective.py"],
     "rig/formats/archive.py": ["tests/rig/formats/test_archive.py", "tests/rig/formats/test_archive_rules.py"],
     "rig/geometry.py": ["tests/rig/test_geometry.py"],
     "server/http/auth.py": ["tests/server/http/test_callers.py"],

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipeline.eigenheads.gaussian_process import with_kernel
-from pipeline.eigenheads.model import HeadModel, assemble
-from pipeline.eigenheads.model_file import ModelParts
-from pipeline.fitting.contour import ContourSolution
-from pipeline.fitting.problem import Stage, State, first_evidence, make_problem
-from pipeline.imaging.cpu_raster import camera_depths
-from pipeline.imaging.cpu_raster_kernels import interpolate, rasterise
+from pipeline.contour_fit.contour import ContourSolution
+from pipeline.contour_fit.problem import Stage, State, first_evidence, make_problem
+from pipeline.geometry.raster import camera_depths
+from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.head_model.gaussian_process import with_kernel
+from pipeline.head_model.model import HeadModel, assemble
+from pipeline.head_model.model_file import ModelParts
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity

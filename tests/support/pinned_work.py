@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.eigenheads.landmarks import NAMES
+from pipeline.head_model.landmarks import NAMES
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.messages.message import compose

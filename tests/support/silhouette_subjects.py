@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Int
 
 from calibration.adjustment.gauge import align_world, image_distance, moved
-from pipeline.eigenheads.model import HeadModel, load_model
-from pipeline.fitting.problem import camera_information
+from pipeline.contour_fit.problem import camera_information
+from pipeline.head_model.model import HeadModel, load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from rig.geometry import Similarity
 from rig.mesh import Mesh

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from rig.formats.capture_folder import write_capture
 from rig.formats.work_size import work_rig
 from rig.render.renderer import Renderer

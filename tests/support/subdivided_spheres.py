@@ -6,10 +6,10 @@ import numpy as np
 import scipy.sparse as sparse
 import trimesh
 
-from pipeline.dense.part_codes import Part
-from pipeline.eigenheads.subdivision import row_count, subdivision
-from pipeline.fitting.fine.nodes import Nodes, node_mesh
-from pipeline.fitting.fine.surface_points import SurfacePoints
+from pipeline.detail.nodes import Nodes, node_mesh
+from pipeline.detail.surface_points import SurfacePoints
+from pipeline.head_model.subdivision import row_count, subdivision
+from pipeline.part_labels.codes import Part
 
 RADIUS_MM = 80.0
 

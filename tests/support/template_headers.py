@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.eigenheads.model_names import model_path, model_sha256
+from pipeline.head_model.model_names import model_path, model_sha256
 from pipeline.templates.header import FORMAT
 
 FIGURES = {

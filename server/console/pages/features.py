@@ -12,7 +12,7 @@ import numpy as np
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
-from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS
+from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
 from rig.formats.cameras_file import find_rig_file, read_rig_file
 from rig.messages.message import Message, MessageDocument, compose
 from rig.rig import Rig

@@ -8,7 +8,7 @@ from typing import NotRequired, TypedDict, cast, get_args
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
-from pipeline.eigenheads.model_names import list_models
+from pipeline.head_model.model_names import list_models
 from pipeline.results.report_types import CameraReport
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose

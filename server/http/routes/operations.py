@@ -78,7 +78,7 @@ def info(service: ServiceOf, caller: Reader) -> InfoOut:
 @router.get("/v1/models", tags=["models"], responses=documented())
 def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
     """The head models that a job may name."""
-    from pipeline.eigenheads.model_names import list_models, model_path
+    from pipeline.head_model.model_names import list_models, model_path
 
     default = model_path("default").resolve()
     models = [

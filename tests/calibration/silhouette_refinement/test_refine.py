@@ -15,7 +15,7 @@ from calibration.silhouette_refinement.tangency_term import (
     tangency_residuals,
     zoomed,
 )
-from pipeline.eigenheads.model import load_model, with_modes
+from pipeline.head_model.model import load_model, with_modes
 from rig.geometry import RigidTransform
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

@@ -8,7 +8,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from pipeline.eigenheads.landmarks import SEVEN_POINTS
+from pipeline.head_model.landmarks import SEVEN_POINTS
 from tests.support.browser import keep_screenshots, keep_widths, visit
 from tests.support.services import RunningService, await_state, packed, running_service, upload
 from tests.support.shared_data import shared

@@ -183,7 +183,7 @@ def pick_features(page: Page, studio: RunningService, screenshots: Path) -> None
 
 
 def landmark_pixels(studio: RunningService, capture: str, truth: dict) -> dict[str, dict[str, np.ndarray]]:
-    from pipeline.eigenheads.landmarks import SEVEN_POINTS
+    from pipeline.head_model.landmarks import SEVEN_POINTS
     from rig.formats.cameras_json import read_rig
 
     rig = read_rig(studio.data / "captures" / capture / "files" / "cameras.json")

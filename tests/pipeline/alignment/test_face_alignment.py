@@ -5,9 +5,9 @@ import pytest
 
 from pipeline.alignment.face_alignment import POINTS, align_to_face, frontmost_camera, spread_points
 from pipeline.alignment.silhouette_search import turn_between_deg
-from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.faces.landmark_map import LandmarkMap, landmark_map
 from pipeline.faces.matching import MatchedFaces
+from pipeline.head_model.model import HeadModel, load_model
 from rig.geometry import Similarity, rotation_from_vector
 from rig.studio.scene.layout import default_layout
 

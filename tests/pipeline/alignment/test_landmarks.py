@@ -17,9 +17,9 @@ from pipeline.alignment.landmarks import (
     feature_alignment,
     landmark_statistics,
 )
-from pipeline.alignment.procrustes import generalised_procrustes, procrustes
-from pipeline.eigenheads.landmarks import NAMES, SEVEN_POINTS, mirrored
-from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.geometry.procrustes import generalised_procrustes, procrustes
+from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS, mirrored
+from pipeline.head_model.model import HeadModel, load_model
 from pipeline.settings import AlignmentSettings
 from rig.camera import Camera, Intrinsics
 from rig.capture import Features

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from pipeline.alignment.suggested_points import locate_landmarks, suggest_points
-from pipeline.eigenheads.landmarks import SEVEN_POINTS
-from pipeline.eigenheads.model import HeadModel, load_model
 from pipeline.faces.landmark_map import LandmarkMap, landmark_map
 from pipeline.faces.matching import MatchedFaces, complete_match
 from pipeline.faces.triangulated_face import triangulate_face
+from pipeline.head_model.landmarks import SEVEN_POINTS
+from pipeline.head_model.model import HeadModel, load_model
 from rig.geometry import Similarity, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

@@ -24,12 +24,11 @@ from calibration.adjustment.state import (
     observations,
 )
 from calibration.silhouette_refinement.tangency_term import PackedTangencies, TangencyTerm
-from pipeline.estimation.terms import NormalEquations, Residuals
-from pipeline.fitting.feature_term import FeatureTerm
-from pipeline.fitting.head_problem import apply_step
-from pipeline.fitting.landmark_term import LandmarkTerm, observe_landmarks
-from pipeline.fitting.prior_term import PriorTerm
-from pipeline.fitting.problem import (
+from pipeline.contour_fit.feature_term import FeatureTerm
+from pipeline.contour_fit.head_problem import apply_step
+from pipeline.contour_fit.landmark_term import LandmarkTerm, observe_landmarks
+from pipeline.contour_fit.prior_term import PriorTerm
+from pipeline.contour_fit.problem import (
     PER_CAMERA,
     POSE,
     ContourProblem,
@@ -40,13 +39,14 @@ from pipeline.fitting.problem import (
     make_problem,
     moved_views,
 )
-from pipeline.fitting.rim import project_with_slopes
-from pipeline.fitting.rim_term import observed_rim, rim_rows
-from pipeline.fitting.surface_term import SurfaceTerm, surface_rows
+from pipeline.contour_fit.rim import project_with_slopes
+from pipeline.contour_fit.rim_term import observed_rim, rim_rows
+from pipeline.contour_fit.surface_term import SurfaceTerm, surface_rows
+from pipeline.estimation.terms import NormalEquations, Residuals
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.camera_drift import ShiftEquations, ShiftTerm
 from pipeline.multiview.triangulation import ReprojectionTerm
 from pipeline.settings import FittingSettings
+from pipeline.view_checks.camera_drift import ShiftEquations, ShiftTerm
 from rig.camera import CameraStack
 from rig.geometry import Similarity, rotation_from_vector
 from tests.support.board_sessions import session

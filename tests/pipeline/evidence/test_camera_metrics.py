@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.model import load_model
+from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.camera_metrics import camera_figures, start_masks
-from pipeline.fitting.fit import Fit
+from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
 from rig.geometry import Similarity
 from rig.rig import Rig

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.model import HeadModel, load_model, with_expressions, with_modes
+from pipeline.contour_fit.fit import Fit
+from pipeline.detail.blink import with_lids
 from pipeline.evidence.expression import READ_SIGMA, build_blendshape_rig, found_expressions, neutral_mesh, shut_eyes
-from pipeline.fitting.fine.blink import with_lids
-from pipeline.fitting.fit import Fit
+from pipeline.head_model.model import HeadModel, load_model, with_expressions, with_modes
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 

@@ -3,10 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.gaussian_process import SCALES
-from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.measurements import DISTANCES, landmarks, measurements
-from pipeline.fitting.fit import Fit
+from pipeline.head_model.gaussian_process import SCALES
+from pipeline.head_model.model import HeadModel, load_model
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 

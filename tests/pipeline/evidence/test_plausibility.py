@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.model import load_model
+from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.plausibility import (
     ImplausibleResult,
@@ -14,7 +14,7 @@ from pipeline.evidence.plausibility import (
     size_of,
     unexplained_outlines,
 )
-from pipeline.fitting.fit import Fit
+from pipeline.head_model.model import load_model
 from pipeline.settings import Settings, settings_from_document
 from rig.errors import InputError
 from rig.geometry import Similarity

@@ -5,10 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.model import HeadModel, assemble, load_model
-from pipeline.eigenheads.model_file import read_parts
-from pipeline.eigenheads.model_names import model_path
-from pipeline.eigenheads.sources.imports import import_model
 from pipeline.faces.landmark_map import (
     CARRIED_MM,
     LandmarkMap,
@@ -18,6 +14,10 @@ from pipeline.faces.landmark_map import (
     landmark_map,
 )
 from pipeline.faces.points import point_table
+from pipeline.head_model.model import HeadModel, assemble, load_model
+from pipeline.head_model.model_file import read_parts
+from pipeline.head_model.model_names import model_path
+from pipeline.model_building.sources.imports import import_model
 from tests.support.shared_data import shared
 
 NAMED = {  # points that lie on a landmark of the model, or a few millimetres from it

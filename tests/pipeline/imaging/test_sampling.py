@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from pipeline.compiled import njit
+from pipeline.compute.jit import njit
 from pipeline.imaging.sampling_kernels import INSIDE, bilinear_slopes, cell, held, sample, sample_row
 
 HEIGHT, WIDTH = 23, 31

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from pipeline.imaging.cpu_raster import depth_map
+from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.multiview.visual_hull import NoHull, hull_extent, visual_hull
+from pipeline.segmentation.view_consistency import judge_agreement
 from pipeline.settings import SegmentationSettings
-from pipeline.silhouettes.view_consistency import judge_agreement
 from rig.formats.capture_folder import read_capture
 from rig.formats.images import read_image
 from rig.mesh import boundary_edges

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.dense.window_bias import WindowBias
-from pipeline.diagnostics import Detail
-from pipeline.eigenheads.model import load_model
-from pipeline.fitting.fine.depth_bias import points_on_face
-from pipeline.fitting.fine.surface_points import SurfacePoints
-from pipeline.fitting.fit import Fit
+from pipeline.contour_fit.fit import Fit
+from pipeline.detail.depth_bias import points_on_face
+from pipeline.detail.surface_points import SurfacePoints
+from pipeline.head_model.model import load_model
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import BustSettings, OutputSettings, Settings, settings_from_document
@@ -22,6 +20,8 @@ from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
+from pipeline.stereo.window_bias import WindowBias
+from pipeline.warnings import Detail
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.errors import InputError

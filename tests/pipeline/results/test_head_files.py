@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.eigenheads.model import load_model
 from pipeline.evidence.expression import build_blendshape_rig
+from pipeline.head_model.model import load_model
 from pipeline.results.head_files import write_head
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
@@ -21,11 +21,11 @@ from pipeline.results.report import report_document
 from pipeline.results.write import head_mesh
 from pipeline.results.write_expression import write_expression
 from pipeline.settings import OutputSettings, Settings, settings_from_document
-from pipeline.texture.albedo import Albedo
-from pipeline.texture.light import Light
-from pipeline.texture.model_layout import model_layout
-from pipeline.texture.reduced_layout import reduced_layout
-from pipeline.texture.uv_unwrap import Atlas
+from pipeline.texturing.albedo import Albedo
+from pipeline.texturing.layout.model_layout import model_layout
+from pipeline.texturing.layout.reduced_layout import reduced_layout
+from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.light import Light
 from rig.errors import InputError
 from rig.formats.ply import read_head_ply
 from rig.mesh import Mesh

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.measurements import Landmark, Measurement
-from pipeline.fitting.fit import Fit
-from pipeline.imaging.cpu_raster import depth_map
+from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, PART_COLOURS, TINT, overlay
 from pipeline.results.reconstruction import Reconstruction

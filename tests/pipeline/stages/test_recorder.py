@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Recorder, Staged, stage

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.data_folder import DATA
-from pipeline.eigenheads.model_names import UnknownModel, model_path
+from pipeline.head_model.data_folder import DATA
+from pipeline.head_model.model_names import UnknownModel, model_path
 from pipeline.templates.header import BadTemplate, OtherModel, check_template, read_header
 from pipeline.templates.names import UnknownTemplate
 from tests.support.template_headers import FIGURES, header_file

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from pipeline.templates.placement import Surface, find_place, outward, place_by_landmarks
 from pipeline.templates.registration import (
     NotRegistered,

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.data_folder import DATA
-from pipeline.eigenheads.model import HeadModel, load_model
+from pipeline.head_model.data_folder import DATA
+from pipeline.head_model.model import HeadModel, load_model
 from pipeline.results.write_template import write_template
 from pipeline.settings import Settings, settings_from_document
 from pipeline.templates.carrying import bind_vertices, surface_binding
@@ -16,8 +16,8 @@ from pipeline.templates.header import BadTemplate, OtherModel
 from pipeline.templates.load import load_template
 from pipeline.templates.names import UnknownTemplate, WrongName, list_templates, new_path, remove_template
 from pipeline.templates.template_file import Template, read_template, save_template
-from pipeline.texture.model_layout import model_layout
-from pipeline.texture.uv_unwrap import Atlas
+from pipeline.texturing.layout.model_layout import model_layout
+from pipeline.texturing.layout.uv_unwrap import Atlas
 from rig.errors import InputError
 from rig.formats.polygon_obj import PolygonMesh, read_polygons
 from rig.mesh import Mesh

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.correspondence.scans import write_landmarks
+from pipeline.model_building.correspondence.scans import write_landmarks
 from pipeline.verification.reference import Reference, read_reference
 from rig.errors import InputError
 from rig.formats.obj import obj_bytes

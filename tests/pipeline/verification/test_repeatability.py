@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.subdivision import vertex_areas
+from pipeline.head_model.subdivision import vertex_areas
 from pipeline.verification.repeatability import by_region, scatter
 from rig.geometry import RigidTransform, rotation_from_vector
 from tests.support.scenes import ellipsoid

@@ -4,36 +4,36 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.diagnostics import WARNING_CODES
+from pipeline.warnings import WARNING_CODES
 from rig.messages.catalogue import CATALOGUE
 from rig.messages.templates import fields_of
 from tests.support.sentences import ROOT, composed, modules, raw_sentences
 
 # Sentences that are no messages yet, by module. The numbers fall; a module without any has no line.
 RAW = {
-    "pipeline/eigenheads/correspondence/scan_checks.py": 11,
-    "pipeline/eigenheads/correspondence/scans.py": 6,
-    "pipeline/eigenheads/expressions.py": 4,
-    "pipeline/eigenheads/model_file.py": 5,
-    "pipeline/eigenheads/model_names.py": 2,
-    "pipeline/eigenheads/sources/fetch.py": 9,
-    "pipeline/eigenheads/sources/foreign.py": 1,
-    "pipeline/eigenheads/sources/imports.py": 14,
-    "pipeline/eigenheads/sources/makehuman.py": 1,
-    "pipeline/eigenheads/subdivision.py": 4,
-    "pipeline/eigenheads/training/build.py": 2,
-    "pipeline/experiments/eye_states.py": 1,
-    "pipeline/experiments/light.py": 2,
-    "pipeline/experiments/openmvs.py": 5,
-    "pipeline/experiments/people.py": 1,
-    "pipeline/experiments/people_subjects.py": 1,
-    "pipeline/experiments/real.py": 1,
-    "pipeline/experiments/relief.py": 2,
-    "pipeline/experiments/runner.py": 5,
-    "pipeline/experiments/span.py": 1,
-    "pipeline/experiments/surfaces.py": 1,
-    "pipeline/experiments/texture.py": 1,
-    "pipeline/experiments/visible.py": 1,
+    "pipeline/model_building/correspondence/scan_checks.py": 11,
+    "pipeline/model_building/correspondence/scans.py": 6,
+    "pipeline/head_model/expressions.py": 4,
+    "pipeline/head_model/model_file.py": 5,
+    "pipeline/head_model/model_names.py": 2,
+    "pipeline/model_building/sources/fetch.py": 9,
+    "pipeline/model_building/sources/foreign.py": 1,
+    "pipeline/model_building/sources/imports.py": 14,
+    "pipeline/model_building/sources/makehuman.py": 1,
+    "pipeline/head_model/subdivision.py": 4,
+    "pipeline/model_building/training/build.py": 2,
+    "pipeline/research/people/eye_states.py": 1,
+    "pipeline/research/surface/light.py": 2,
+    "pipeline/research/peers/openmvs.py": 5,
+    "pipeline/research/people/people.py": 1,
+    "pipeline/research/people/people_subjects.py": 1,
+    "pipeline/research/faults/real.py": 1,
+    "pipeline/research/surface/relief.py": 2,
+    "pipeline/research/runner.py": 5,
+    "pipeline/research/paper/span.py": 1,
+    "pipeline/research/surface/surfaces.py": 1,
+    "pipeline/research/surface/texture.py": 1,
+    "pipeline/research/surface/visible.py": 1,
     "pipeline/faces/landmark_map.py": 1,
     "pipeline/faces/networks.py": 3,
     "pipeline/verification/best_fit.py": 1,

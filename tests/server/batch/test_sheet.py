@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.diagnostics import WARNING_CODES
 from pipeline.results.overlays import AZIMUTHS_DEG
+from pipeline.warnings import WARNING_CODES
 from rig.messages.message import MessageDocument
 from server.batch.sheet import PANEL_PX, REMARKS, SEVERE, Card, card_class, figures_of, severity, sheet_html, views_of
 from tests.support.services import ROOT

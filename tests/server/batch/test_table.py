@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.eigenheads.landmarks import NAMES
-from pipeline.eigenheads.model_file import expression_names
-from pipeline.eigenheads.model_names import model_path
+from pipeline.head_model.landmarks import NAMES
+from pipeline.head_model.model_file import expression_names
+from pipeline.head_model.model_names import model_path
 from rig.digest import document_sha256
 from rig.messages.message import compose
 from server.batch.captures import BatchCapture

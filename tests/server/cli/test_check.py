@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from rig.capture import Capture, reassign_images
 from rig.errors import WrongVariable
 from rig.formats.archive import pack_folder

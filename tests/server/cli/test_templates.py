@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from rig.errors import EigenheadError, InputError
 from rig.formats.ply import read_head_ply
 from rig.formats.polygon_obj import read_polygons

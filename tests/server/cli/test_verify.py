@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.correspondence.scans import write_landmarks
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
+from pipeline.model_building.correspondence.scans import write_landmarks
 from pipeline.verification.limits import Limits
 from rig.errors import InputError
 from rig.formats.obj import obj_bytes

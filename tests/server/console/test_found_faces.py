@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.eigenheads.landmarks import SEVEN_POINTS
+from pipeline.head_model.landmarks import SEVEN_POINTS
 from rig.progress import Progress
 from server.console import found_faces as module
 from server.console import media

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.alignment.feature_points import locate_features
-from pipeline.eigenheads.landmarks import NAMES
+from pipeline.head_model.landmarks import NAMES
 from pipeline.settings import CLICK_NOISE_PX
 from rig.messages.message import compose, texts_of
 from rig.rig import Rig

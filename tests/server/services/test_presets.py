@@ -2,9 +2,9 @@
 
 import pytest
 
-from pipeline.eigenheads.model import load_model
+from pipeline.head_model.model import load_model
 from pipeline.settings import settings_from_document
-from pipeline.texture.head_texture import find_layout
+from pipeline.texturing.head_texture import find_layout
 from server.services.presets import PRESETS, Preset, settings_of
 
 

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import compiled, kernel_list
-from pipeline.kernel_list import Kernel
+from pipeline.compute import jit as compiled
+from pipeline.compute import kernel_list
+from pipeline.compute.kernel_list import Kernel
 from server.processes import python_environment
 from server.tasks.prepare import prepare_kernels
 from tests.support.disks import small_disk
@@ -85,9 +86,9 @@ PREPARE_AND_USE = """
 import sys
 import numpy as np
 from pipeline import kernel_list
-from pipeline.dense.surface.grid_kernels import grown
-from pipeline.array_cache import cached_arrays
-from pipeline.kernel_list import Kernel
+from pipeline.fusion.grid_kernels import grown
+from pipeline.compute.array_cache import cached_arrays
+from pipeline.compute.kernel_list import Kernel
 from server.tasks.prepare import prepare_kernels
 
 kernel_list.listed_kernels = lambda dense: [Kernel.from_line(line) for line in sys.argv[1:]]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from pipeline.eigenheads.model import load_model
-from pipeline.silhouettes.usable_views import TooFewViews
+from pipeline.head_model.model import load_model
+from pipeline.view_checks.usable_views import TooFewViews
 from rig.formats.capture_folder import write_capture
 from rig.formats.mesh_file import read_mesh
 from rig.render.renderer import Renderer

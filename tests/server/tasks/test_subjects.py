@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.eigenheads.correspondence.scans import write_landmarks
+from pipeline.model_building.correspondence.scans import write_landmarks
 from rig.formats.obj import obj_bytes
 from server.tasks.subjects import subject_of
 from tests.support.measured_heads import mannequin, marks, model

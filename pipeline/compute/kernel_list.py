@@ -1,0 +1,145 @@
+"""The compiled loops that a default job calls, with the types that it calls them with: what can be compiled ahead.
+
+``kernels.txt`` beside this file has a line for each: module and function, then the types of the arguments. First come
+those of a job without the dense stage (``--detail photo --surface head``), after an empty line those that it adds.
+``float32[2C]`` is a two-dimensional array in C order (A: any strides), with ``r`` behind it one that is not written to;
+``4*float64`` is a tuple, ``dense.matching_kernels:Sight{float64[2C];int64}`` a named one. The list is recorded, not
+thought out: ``python -m tests.support.kernel_recorder`` writes it from jobs that it runs, and a test runs a job and
+fails where the list lacks a loop.
+
+Signatures in the decorators would say the same in 105 places, most of them loops that only other loops call, and a type
+that is wrong there is an error in a job. To run the whole pipeline in set-up takes as long as a job, in one process.
+"""
+
+import importlib
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numba import types
+from numba.core.dispatcher import Dispatcher
+
+from pipeline.compute.jit import KeptFunction, code_size
+
+LIST = Path(__file__).with_name("kernels.txt")
+PACKAGE = __package__ or "pipeline"  # "eigenhead.pipeline" in the wheel
+_ARRAY = re.compile(r"(\w+)\[(\d)([CFA])\](r?)")
+_TUPLE = re.compile(r"(\d+)\*(\w+)")
+_NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """Holds one compiled loop for one set of argument types."""
+
+    place: str  # "fitting.rim_kernels:see", relative to this package
+    arguments: tuple[str, ...]
+
+    @classmethod
+    def from_line(cls, line: str) -> "Kernel":
+        place, *arguments = line.split()
+        return cls(place, tuple(arguments))
+
+    @property
+    def line(self) -> str:
+        """Returns it as the list has it."""
+        return " ".join((self.place, *self.arguments))
+
+    @property
+    def module(self) -> str:
+        return self.place.partition(":")[0]
+
+    def dispatcher(self) -> Dispatcher | None:
+        """Returns the function, or None where loops are not compiled (NUMBA_DISABLE_JIT)."""
+        module, _, name = self.place.partition(":")
+        function = getattr(importlib.import_module(f"{PACKAGE}.{module}"), name)
+        return function if isinstance(function, Dispatcher) else None
+
+    def signature(self) -> tuple[types.Type, ...]:
+        return tuple(type_from_text(text) for text in self.arguments)
+
+    def is_kept(self) -> bool:
+        """Tells whether the wheel brought it, or an earlier process left it in the cache folder."""
+        dispatcher = self.dispatcher()
+        kept = None if dispatcher is None else getattr(dispatcher, "_cache", None)
+        return not isinstance(kept, KeptFunction) or kept.is_kept(self.signature())
+
+    def size(self) -> int:
+        """Returns the size of the code that is compiled, the loops that it calls included, in bytes of the
+        interpreter's: what takes longest is begun first."""
+        dispatcher = self.dispatcher()
+        return 0 if dispatcher is None else code_size(dispatcher)
+
+    def compile(self) -> None:
+        """Compiles it, or finds it, in this process; what was compiled is kept."""
+        dispatcher = self.dispatcher()
+        if dispatcher is not None:
+            dispatcher.compile(self.signature())
+
+
+def listed_kernels(*, dense: bool = True) -> list[Kernel]:
+    """Returns all of the list, or without those that only the dense stage calls."""
+    plain, _, added = LIST.read_text(encoding="utf-8").partition("\n\n")
+    return [Kernel.from_line(line) for line in (*plain.splitlines(), *(added.splitlines() if dense else ()))]
+
+
+def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:
+    """Kernels of one module together: they call the same inner loops, which two processes would both compile."""
+    groups: dict[str, list[Kernel]] = {}
+    for kernel in kernels:
+        groups.setdefault(kernel.module, []).append(kernel)
+    yield from groups.values()
+
+
+def type_from_text(text: str) -> types.Type:
+    """Raises ValueError for what is no type of the list's notation."""
+    if array := _ARRAY.fullmatch(text):
+        dtype, dimensions, layout, readonly = array.groups()
+        return types.Array(_scalar(dtype), int(dimensions), layout, readonly=bool(readonly))
+    if several := _TUPLE.fullmatch(text):
+        return types.UniTuple(_scalar(several[2]), int(several[1]))
+    if named := _NAMED.fullmatch(text):
+        module, name, inside = named.groups()
+        kind = getattr(importlib.import_module(f"{PACKAGE}.{module}"), name)
+        found = types.BaseTuple.from_types([type_from_text(each) for each in _members(inside)], kind)
+        if found is None:
+            raise ValueError(f"{text} is no tuple of a kernel's arguments")
+        return found
+    return _scalar(text)
+
+
+def _members(text: str) -> Iterator[str]:
+    """The parts between semicolons that no inner braces hold."""
+    depth = start = 0
+    for at, sign in enumerate(text):
+        depth += (sign == "{") - (sign == "}")
+        if sign == ";" and not depth:
+            yield text[start:at]
+            start = at + 1
+    yield text[start:]
+
+
+def text_from_type(kind: Any) -> str:
+    """Returns the list's notation. Raises ValueError where it has none."""
+    if isinstance(kind, types.Array):
+        text = f"{kind.dtype}[{kind.ndim}{kind.layout}]" + "r" * (not kind.mutable)
+    elif isinstance(kind, types.NamedTuple | types.NamedUniTuple):
+        module = kind.instance_class.__module__.removeprefix(PACKAGE + ".")
+        inside = ";".join(text_from_type(each) for each in kind.types)
+        text = f"{module}:{kind.instance_class.__name__}{{{inside}}}"
+    elif isinstance(kind, types.UniTuple):
+        text = f"{kind.count}*{kind.dtype}"
+    else:
+        text = str(kind)
+    if type_from_text(text) != kind:
+        raise ValueError(f"the list of kernels has no notation for {kind!r}")
+    return text
+
+
+def _scalar(name: str) -> types.Type:
+    kind = types.boolean if name == "bool" else getattr(types, name, None)
+    if not isinstance(kind, types.Number | types.Boolean):
+        raise ValueError(f"{name} is no type of a kernel's argument")
+    return kind

@@ -1,0 +1,77 @@
+"""The landmark term: where places of the face were found in the world, against where the head has them.
+
+With the places ``X(theta)`` of the head, stacked, their found positions ``x`` and the covariance ``S`` of the
+difference (of the triangulation, and of a network's idea of a face, in which all places err together),
+
+    r = W (X(theta) - x),    W^T W = S^-1
+    dr / d(coefficients) = W s R B,    dr / d(rotation, translation, log s) = W [-[X - t]x, I, X - t]
+
+as one residual under Geman and McClure's loss: a face that is another's loses its weight as a whole. Places that
+contradict the others have a larger variance in ``S`` already (``pipeline.alignment.face_alignment``).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.contour_fit.problem import PER_CAMERA, POSE, LandmarkObservations, Stage, State, blended_basis
+from pipeline.estimation.robust import GemanMcClure
+from pipeline.estimation.terms import Residuals
+from pipeline.head_model.model import HeadModel
+from rig.geometry import cross_matrix
+
+FORGIVEN_SIGMAS = 3.0  # RMS of all coordinates, beyond which the landmarks are another face's
+
+
+def observe_landmarks(
+    model: HeadModel,
+    corner: Int[np.ndarray, "n 3"],
+    blend: Float[np.ndarray, "n 3"],
+    position_world: Float[np.ndarray, "n 3"],
+    covariance_world: Float[np.ndarray, "p p"],
+) -> LandmarkObservations:
+    """Returns landmarks as the solver reads them.
+
+    Args:
+        model: with the modes of the fit.
+        corner: vertices of the full level about each place.
+        blend: their weights, which sum to 1.
+        position_world: where the place was found, mm.
+        covariance_world: of all coordinates of the difference, x y z of the first place, then of the second, mm^2.
+    """
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance_world))
+    mean, basis = blended_basis(model, corner, blend)
+    return LandmarkObservations(corner, blend, position_world, whiten, mean, basis)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkTerm:
+    """Is a term over (coefficients, pose, cameras, which it does not depend on)."""
+
+    observed: LandmarkObservations
+    stage: Stage
+    cameras: int  # in the problem
+
+    def at(self, state: State) -> Residuals:
+        points = landmark_points(self.observed, state)
+        residual = self.observed.whiten @ (points - self.observed.position_world).ravel()
+        loss = GemanMcClure(FORGIVEN_SIGMAS * np.sqrt(len(residual)))
+        return Residuals(residual[None], lambda: self._rows(state, points)[None], loss)
+
+    def _rows(self, state: State, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "p u"]:
+        observed, stage, pose = self.observed, self.stage, state.world_from_head
+        cameras = PER_CAMERA * self.cameras if stage.cameras else 0
+        rows = np.zeros((len(points), 3, stage.modes + POSE + cameras))
+        turned = pose.scale * (observed.basis[: stage.modes] @ pose.rotation.T)
+        rows[:, :, : stage.modes] = turned.transpose(1, 2, 0)
+        arm = points - pose.translation
+        by_pose = [np.stack([-cross_matrix(x) for x in arm]), np.tile(np.eye(3), (len(arm), 1, 1)), arm[:, :, None]]
+        rows[:, :, stage.modes : stage.modes + POSE] = np.concatenate(by_pose, axis=2)
+        return observed.whiten @ rows.reshape(3 * len(points), -1)
+
+
+def landmark_points(observed: LandmarkObservations, state: State) -> Float[np.ndarray, "n 3"]:
+    """Returns where the head has the landmarks, world, mm."""
+    moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
+    return state.world_from_head.apply(observed.mean + moved)

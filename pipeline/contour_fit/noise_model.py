@@ -1,0 +1,98 @@
+"""What the residuals of a stage say of the model's misfit: how far an outline may be believed, where it is clutter, and
+whether the head is bare."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Int
+
+from pipeline.contour_fit.clutter import CLUTTER_PX, CLUTTER_SIGMAS, find_clutter
+from pipeline.contour_fit.problem import FIRST_NOISE_PX, ContourProblem, RimNoise, Stage, StageEvidence, State
+from pipeline.contour_fit.rim import Rim
+from pipeline.contour_fit.rim_term import observed_rim
+
+START_CLUTTER_MM = 12.0
+BLOCK_PX = 20.0
+BARE_SLACK_PX = 0.1  # noise of a contour's RMS
+FLOOR_SIGMAS, MAX_FLOOR_PX = 3.0, 6.0
+UNIT_RANGE = (1.0, 40.0)  # px^3: noise of 0.5 px over 4 px; misfit of 2 px over 10 px
+
+
+def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
+    """Returns the evidence with what the residuals say of the model's misfit: unit, robust floor and, once, where
+    clutter is.
+
+    Clutter is found while the eigenheads alone still hold the shape: a wider basis would rather bulge into the hair
+    than pay for it as an outlier, since every px of outline pays alone.
+    """
+    rim = observed_rim(problem, evidence, state, stage)
+    near = rim.residual[(np.abs(rim.residual) < 10.0) & (rim.length > 0)]
+    deviation = 1.4826 * float(np.median(np.abs(near))) if len(near) > 10 else FIRST_NOISE_PX
+    floor = min(FLOOR_SIGMAS * deviation, MAX_FLOOR_PX)
+    clutter, settled = evidence.noise.clutter, evidence.noise.is_settled
+    if not settled and not stage.whole_head:  # a bare head has none
+        clutter, settled = find_clutter(problem, rim, max(CLUTTER_PX, CLUTTER_SIGMAS * deviation)), True
+    unit = estimated_unit(problem, rim, 2.0 * floor) or evidence.noise.unit
+    return StageEvidence(RimNoise(unit, floor, clutter, settled), evidence.photographs)
+
+
+def with_clutter_of_start(
+    problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage
+) -> StageEvidence:
+    """Returns the evidence with what no head makes of the outlines, where found landmarks say how the head lies.
+
+    Long hair before a face is wider than any face, and pulls the first modes to it before residuals could tell.
+    """
+    rim = observed_rim(problem, evidence, state, stage)
+    depths = [camera.camera_from_world.apply(state.world_from_head.translation)[2] for camera in problem.rig]
+    px_per_mm = float(np.median([c.intrinsics.fx / z for c, z in zip(problem.rig, depths, strict=True)]))
+    clutter = find_clutter(problem, rim, START_CLUTTER_MM * px_per_mm)
+    return replace(evidence, noise=replace(evidence.noise, clutter=clutter))
+
+
+def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:
+    """Returns l sigma^2 (px^3) of what the contours still miss, the model's misfit included; None where the settings
+    state both.
+
+    Means over blocks of B px of outline have the variance l sigma^2 / B where B is well above l, whatever l is.
+    """
+    stated = problem.settings
+    if stated.contour_noise_px is not None and stated.contour_correlation_px is not None:
+        return None
+    means = []
+    for k in range(len(problem.views.names)):
+        here = np.flatnonzero((rim.view == k) & (np.abs(rim.residual) < most_px) & (rim.length > 0))
+        if not len(here):
+            continue
+        spoke = rim.pixel[here] - rim.pixel[here].mean(axis=0)
+        order = here[np.argsort(np.arctan2(spoke[:, 1], spoke[:, 0]))]
+        length = rim.length[order]
+        block = (np.cumsum(length) / BLOCK_PX).astype(int)
+        total = np.bincount(block, length)
+        means.append((np.bincount(block, length * rim.residual[order]) / np.maximum(total, 1e-9))[total > BLOCK_PX / 2])
+    found = np.concatenate(means) if means else np.zeros(0)
+    variance = (1.4826 * float(np.median(np.abs(found)))) ** 2 if len(found) > 10 else FIRST_NOISE_PX**2
+    return float(np.clip(BLOCK_PX * variance, *UNIT_RANGE))
+
+
+def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
+    """Tells whether a fit to the whole head explains cranium and ears, and the face as well as ``from_face``, the fit
+    to the face alone. An outline of hair is mostly no head's; where it is, that head has another face."""
+    rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
+    region = problem.model.levels[stage.level].face_region
+    other = np.flatnonzero(~region[rim.corner].all(axis=1))
+    face = np.flatnonzero(region[rim.corner].all(axis=1))
+    agrees = np.abs(rim.residual) < problem.settings.bare_px
+    if (rim.length * agrees)[other].sum() <= problem.settings.bare_share * rim.length[other].sum():
+        return False
+    alone = observed_rim(problem, evidence, from_face, replace(stage, whole_head=False))
+    face_alone = np.flatnonzero(region[alone.corner].all(axis=1))
+    return (
+        _robust_deviation_px(rim, face)
+        < problem.settings.bare_loss * _robust_deviation_px(alone, face_alone) + BARE_SLACK_PX
+    )
+
+
+def _robust_deviation_px(rim: Rim, chosen: Int[np.ndarray, " s"]) -> float:
+    """Robust standard deviation (px) of the residuals: hair on the forehead must not hide what the rest loses."""
+    return 1.4826 * float(np.median(np.abs(rim.residual[chosen]))) if len(chosen) else 0.0

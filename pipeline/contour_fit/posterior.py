@@ -1,0 +1,113 @@
+"""The Laplace posterior of a fit: what its covariance says of every vertex.
+
+Where the photographs are silent, under hair above all, the prior speaks alone, and it is only as good as its scale: a
+head of the model's own population deviates there by half of what the kernel allows, one of another population by twice
+as much. How far a head strays is seen where it is seen: ``with_estimated_prior`` estimates the prior's variance from
+the coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
+https://doi.org/10.1162/neco.1992.4.3.415).
+
+Two things follow that no coefficient shows. The kernel moves the surface along its normals, and a head that strays from
+the eigenheads strays along the surface as well: a landmark's place there is as unsure as the kernel allows
+(``Fit.sliding_mm``). And what modes are too coarse for, the relief that only photographs resolve, is there where they
+are silent, too. A fit to the eigenheads alone says nothing of either (``span_misfit``).
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.contour_fit.fit import Fit
+from pipeline.head_model.gaussian_process import SCALES
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.regions import head_regions
+from rig.mesh import vertex_normals
+
+# Measured on heads of the model's population and of another, with ears and forehead under hair (experiments hidden).
+MIN_DETERMINED = 5.0  # coefficients; of fewer the prior's scale is not estimated
+VARIANCE_RANGE = (0.1, 4.0)
+KERNEL_VARIANCE_UNSEEN = 4.0  # hidden skin strays more than seen skin: no landmark holds it in its place
+KERNEL_MM = math.hypot(*(scale.amplitude_mm for scale in SCALES))
+RELIEF_OF_OUTLINES = 2.0  # times what photographs add to a head: outlines show no hollow, beside the nose or of an eye
+EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance ratio
+
+
+def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
+    """Returns the fit with the covariance that follows from a prior whose variance is estimated from the fit itself.
+
+    What the photographs determine keeps its variance. With ``C`` the covariance under unit priors, group by group of
+    modes ``s^2 = sum z^2 / sum (1 - C_ii)``, and the new covariance is ``(C^-1 + 1 / s^2 - 1)^-1``.
+
+    Args:
+        model: with the modes that the fit has.
+        fit: with its covariance under unit priors; one without is returned as it is.
+        eigenheads: how many of the modes are a population's; the rest are the kernel's.
+        relief_mm: standard deviation of what only photographs show, on a head that strays as the kernel says.
+    """
+    if fit.covariance is None or len(fit.coefficients) <= eigenheads:
+        return fit
+    count = len(fit.coefficients)
+    population = _variance_ratio(fit, np.arange(eigenheads))
+    smooth = np.setdiff1d(np.arange(eigenheads, count), model.posed)
+    kernel = _variance_ratio(fit, smooth)
+    ratio = np.ones(len(fit.covariance))
+    ratio[:eigenheads], ratio[smooth] = population, KERNEL_VARIANCE_UNSEEN * kernel
+    information = np.linalg.inv(fit.covariance) + np.diag(1.0 / ratio - 1.0)
+    relief = relief_mm * math.sqrt(kernel)
+    misfit = np.maximum(0.0 if fit.misfit_mm is None else fit.misfit_mm, np.full(len(model.mean), relief))
+    ears = head_regions(model)["ears"][: len(model.mean)]  # the cage's vertices come first
+    misfit = np.where(ears, np.maximum(misfit, EAR_MISFIT_MM * min(kernel, 1.0 + 0.25 * kernel)), misfit)
+    covariance = np.linalg.inv(0.5 * (information + information.T))
+    return replace(fit, covariance=covariance, misfit_mm=misfit, sliding_mm=KERNEL_MM * math.sqrt(kernel))
+
+
+def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
+    """Estimated prior variance of a group of modes, by the unit prior's."""
+    assert fit.covariance is not None
+    determined = float(np.clip(1.0 - np.diag(fit.covariance)[modes], 0.0, 1.0).sum())
+    if determined < MIN_DETERMINED:
+        return 1.0
+    return float(np.clip((fit.coefficients[modes] ** 2).sum() / determined, *VARIANCE_RANGE))
+
+
+def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
+    """Returns the standard deviation (mm) of every full-level vertex along its normal; zero where the fit has no
+    covariance.
+
+    Taken on the cage and carried to the full level by its operator, whose rows are convex combinations: a posterior is
+    smooth there, and the cage has a twentieth of the vertices. Along the normal, since sliding along the surface
+    neither moves the surface nor shows in a silhouette. Relief that no mode follows stands beside what the modes leave
+    open.
+    """
+    operator = model.levels["full"].operator
+    if fit.covariance is None:
+        return np.zeros(model.levels["full"].count)
+    return np.sqrt(np.maximum(operator @ cage_variance(model, fit), 0.0))
+
+
+def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
+    """Returns the variance (mm^2) of the cage's vertices along their normals, of a fit with a covariance."""
+    assert fit.covariance is not None
+    rows = normal_rows(model, fit)
+    # One triangular factor instead of rows @ covariance twice; the jitter keeps rounding from making it indefinite.
+    covariance = 0.5 * (fit.covariance + fit.covariance.T)
+    scale = np.sqrt(np.diag(covariance))
+    factor = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))) * scale[:, None]
+    variance = ((rows @ factor.astype(np.float32)) ** 2).sum(axis=1)
+    misfit = 0.0 if fit.misfit_mm is None else fit.misfit_mm
+    return variance.astype(float) + misfit**2
+
+
+def normal_rows(model: HeadModel, fit: Fit) -> Float[np.ndarray, "v0 p"]:
+    """Returns d(position along the normal) / d(parameters of the covariance) at every cage vertex."""
+    pose, count = fit.world_from_head, len(fit.coefficients)
+    cage = model.cage(fit.coefficients)
+    normals_head = vertex_normals(cage, model.levels["cage"].faces)
+    by_shape = np.einsum(
+        "vc,mvc->vm", (pose.scale * normals_head).astype(np.float32), model.modes[:count], optimize=True
+    )
+    arms = pose.apply(cage) - pose.translation
+    normals = normals_head @ pose.rotation.T
+    pose_rows = [np.cross(arms, normals), normals, (arms * normals).sum(axis=1, keepdims=True)]
+    return np.concatenate([by_shape, *pose_rows], axis=1).astype(np.float32)

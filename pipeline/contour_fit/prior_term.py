@@ -1,0 +1,78 @@
+"""What is known of a head before it is seen: z ~ N(0, I), few expressions, a metric scale, the cameras' covariance.
+
+Most faces are neutral, and those that are not make few expressions at a time: the weight of one has a heavy tail,
+
+    p(w) ~ (1 + w / t)^-2 N(w; 0, 1),    0 <= w <= 1
+
+(Lomax 1954, of shape 1, whose median is t). A small weight must explain more than it costs; one that shows is hardly
+held back, which a Gaussian or an exponential would do. Its part of the equations is the tangent of the logarithm,
+which lies above it, so that a step that lowers the one lowers the other (Candes, Wakin and Boyd 2008, *Enhancing
+sparsity by reweighted l1 minimization*). The bounds are ``head_problem``'s.
+
+The Gaussian priors of the coefficients, of log scale (rigs are metric) and of each camera's correction, as one term.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.contour_fit.problem import PER_CAMERA, POSE, ContourProblem, Stage, State
+from pipeline.estimation.terms import NormalEquations
+
+LOG_SCALE = 6  # its place in the pose
+TAIL = 2.0  # exponent of the weights' prior
+
+
+def weights_of(problem: ContourProblem, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, " e"]:
+    """Returns the weights of expressions among coefficients; none while a stage has none."""
+    return np.maximum(coefficients[problem.model.posed.start : problem.model.posed.stop], 0.0)
+
+
+def weight_slope(weights: Float[np.ndarray, " e"], median: float) -> Float[np.ndarray, " e"]:
+    """Returns half the slope of ``2 TAIL log(1 + w / t)``, their part of the cost beside the Gaussian's."""
+    return TAIL / (median + weights)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PriorTerm:
+    """Is a term over (coefficients, pose, cameras where they are solved for)."""
+
+    problem: ContourProblem
+    stage: Stage
+
+    def at(self, state: State) -> "LinearisedPriorTerm":
+        return LinearisedPriorTerm(self, state)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearisedPriorTerm:
+    """Holds the priors at one state."""
+
+    term: PriorTerm
+    state: State
+
+    @property
+    def cost(self) -> float:
+        state, problem = self.state, self.term.problem
+        shape = float(state.coefficients @ state.coefficients)
+        weights = weights_of(problem, state.coefficients)
+        shape += 2.0 * TAIL * float(np.log1p(weights / problem.settings.expression_median).sum())
+        cameras = float(np.einsum("ki,kij,kj->", state.camera_shift, problem.camera_information, state.camera_shift))
+        return shape + cameras + (np.log(state.world_from_head.scale) / problem.settings.scale_spread) ** 2
+
+    def add_to(self, equations: NormalEquations) -> None:
+        state, problem, m = self.state, self.term.problem, self.term.stage.modes
+        equations.matrix[np.arange(m), np.arange(m)] += 1.0
+        equations.gradient[:m] += state.coefficients
+        weights, first = weights_of(problem, state.coefficients), problem.model.posed.start
+        slope = weight_slope(weights, problem.settings.expression_median)
+        equations.gradient[first : first + len(weights)] += slope
+        information = problem.settings.scale_spread**-2
+        equations.matrix[m + LOG_SCALE, m + LOG_SCALE] += information
+        equations.gradient[m + LOG_SCALE] += np.log(state.world_from_head.scale) * information
+        if self.term.stage.cameras:
+            for k, known in enumerate(problem.camera_information):
+                block = slice(m + POSE + PER_CAMERA * k, m + POSE + PER_CAMERA * (k + 1))
+                equations.matrix[block, block] += known
+                equations.gradient[block] += known @ state.camera_shift[k]

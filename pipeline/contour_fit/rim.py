@@ -1,0 +1,183 @@
+"""The rim of a head as every camera sees it, without drawing a single image.
+
+For X on the surface with normal N seen from C_k the rim is ``N . (X - C_k) = 0``: the zero crossing of vertex normals,
+linearly interpolated along mesh edges. A rim point is on the *outer* outline if a step outwards leaves the model's
+mask. That is decided exactly: the faces that look towards the camera all keep their orientation in the image, and those
+that look away all lose it, so that the number of faces over a pixel is the winding number of the image of the edges
+where the two sets meet (they count twice) or end (once). That chain is about a thousand edges a view, sorted into image
+rows, and a query is one walk along a row: no mask, no distance transform of the model, and no loose visibility test
+(one of |D_model| < 0.6 px lets inner facets through, and the fit stalls).
+
+With P = d(pixel)/dX the image normal of the outline is ``n = l / |l|, l = N^T P^+``, since the tangent plane at the rim
+holds the viewing ray; so ``n^T P = N^T / |l|``, and the sliding of the rim along the surface drops out at first order.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int32
+
+from pipeline.compute.threads import in_threads
+from pipeline.contour_fit.rim_kernels import (
+    BLEND,
+    COLUMNS,
+    LENGTH,
+    NX,
+    RESIDUAL,
+    SLOPE,
+    Pictures,
+    Surface,
+    U,
+    X,
+    find_rim_samples,
+    normals_and_planes,
+    projected_with_slopes,
+    sweep_views,
+)
+from pipeline.geometry.projection import packed_lens
+from rig.rig import Rig
+
+MAX_SAMPLES = 6000  # rim samples of one view; a full head has about 1,000
+VIEWS_A_WORD = 64  # views that are swept together, a bit each
+STEPS_OUT_PX = (0.3, 2.5)  # both must leave the mask: the second drops samples at the edge of T-junctions and grooves
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topology:
+    """Holds what the rim needs to know of a mesh level; computed once."""
+
+    faces: Int32[np.ndarray, "f 3"]
+    edges: Int32[np.ndarray, "e 4"]  # from, to (as in face one), face one, face two or -1
+    face: Int32[np.ndarray, " s"]  # triangles of the face region, whose rim may always speak
+    head: Int32[np.ndarray, " t"]  # those and cranium and ears, whose rim speaks where there is no hair
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """Holds the cameras and their signed distances, packed for compiled loops."""
+
+    names: tuple[str, ...]
+    rotation: Float[np.ndarray, "k 3 3"]
+    translation: Float[np.ndarray, "k 3"]
+    lens: Float[np.ndarray, "k 10"]  # packed_lens of each
+    size: Int32[np.ndarray, "k 2"]  # width, height
+    distance: Float32[np.ndarray, " pixels"]  # all views, one after the other, row by row
+    offset: Int[np.ndarray, " k"]
+
+    def packed(self) -> Float[np.ndarray, "k 22"]:
+        """Returns the cameras as ``packed_camera`` has them."""
+        return np.concatenate([self.rotation.reshape(-1, 9), self.translation, self.lens], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rim:
+    """Holds samples of the outer outline, all views together."""
+
+    view: Int32[np.ndarray, " s"]
+    corner: Int32[np.ndarray, "s 2"]  # the edge's two vertices
+    blend: Float[np.ndarray, " s"]  # weight of the second one
+    point: Float[np.ndarray, "s 3"]  # world, mm
+    gradient: Float[np.ndarray, "s 3"]  # n^T P: change of the outline's position along n (px) per mm of the point
+    pixel: Float[np.ndarray, "s 2"]
+    normal: Float[np.ndarray, "s 2"]  # outward, unit, in the image
+    length: Float[np.ndarray, " s"]  # px of outline that the sample stands for
+    residual: Float[np.ndarray, " s"]  # D_obs, px; negative: the model lies inside the input
+
+
+def make_topology(
+    faces: Int[np.ndarray, "f 3"],
+    face_region: Bool[np.ndarray, " v"],
+    head_region: Bool[np.ndarray, " v"] | None = None,
+) -> Topology:
+    """Returns edges with their two faces; ``head_region`` is the whole mesh by default. Raises ValueError where more
+    than two faces share an edge."""
+    faces = np.ascontiguousarray(faces, np.int32)
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    owner = np.tile(np.arange(len(faces), dtype=np.int32), 3)
+    low, high = directed.min(axis=1).astype(np.int64), directed.max(axis=1).astype(np.int64)
+    order = np.argsort(low * (faces.max() + 1) + high, kind="stable")
+    key = (low * (faces.max() + 1) + high)[order]
+    first = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
+    count = np.diff(np.r_[first, len(key)])
+    if count.max() > 2:
+        raise ValueError(f"{(count > 2).sum()} edges have more than two faces")
+    edges = np.full((len(first), 4), -1, np.int32)
+    edges[:, :2], edges[:, 2] = directed[order[first]], owner[order[first]]
+    edges[count == 2, 3] = owner[order[first[count == 2] + 1]]
+    everything = np.ones(len(faces), bool)
+    head = everything if head_region is None else (face_region | head_region)[faces].all(axis=1)
+    regions = (np.flatnonzero(of).astype(np.int32) for of in (face_region[faces].all(axis=1), head))
+    return Topology(faces, edges, *regions)
+
+
+def pack_views(rig: Rig, distances: dict[str, Float32[np.ndarray, "h w"]]) -> Views:
+    """Returns the cameras of ``rig`` that have a signed distance."""
+    cameras = [camera for camera in rig if camera.name in distances]
+    maps = [np.ascontiguousarray(distances[camera.name], np.float32) for camera in cameras]
+    return Views(
+        names=tuple(camera.name for camera in cameras),
+        rotation=np.stack([camera.camera_from_world.rotation for camera in cameras]),
+        translation=np.stack([camera.camera_from_world.translation for camera in cameras]),
+        lens=np.stack([packed_lens(camera) for camera in cameras]),
+        size=np.array([m.shape[::-1] for m in maps], np.int32),
+        distance=np.concatenate([m.ravel() for m in maps]),
+        offset=np.cumsum([0] + [m.size for m in maps])[:-1].astype(np.int64),
+    )
+
+
+def find_rim(
+    topology: Topology,
+    vertices_world: Float[np.ndarray, "v 3"],
+    views: Views,
+    *,
+    whole_head: bool = False,
+    averaged: bool = False,
+) -> Rim:
+    """Returns the outer outline of a mesh in every view, and the input's signed distance there; ``averaged``: its mean
+    half way to the neighbours along the outline, for a mesh as fine as the outline (2 to 6 px)."""
+    faces = topology.head if whole_head else topology.face
+    vertices = np.ascontiguousarray(vertices_world)
+    normals, planes = normals_and_planes(vertices, topology.faces)
+    surface = Surface(vertices, normals, topology.faces, topology.edges)
+    words = [slice(k, k + VIEWS_A_WORD) for k in range(0, len(views.names), VIEWS_A_WORD)]
+    found = [part for some in words for part in _outlines(surface, planes, faces, views, some, averaged)]
+    view = np.repeat(np.arange(len(found), dtype=np.int32), [len(corner) for corner, _ in found])
+    corner, values = (np.concatenate([part[i] for part in found]) for i in (0, 1))
+    return Rim(
+        view, corner, values[:, BLEND], values[:, X : X + 3], values[:, SLOPE : SLOPE + 3], values[:, U : U + 2],
+        values[:, NX : NX + 2], values[:, LENGTH], values[:, RESIDUAL],
+    )  # fmt: skip
+
+
+def _outlines(
+    surface: Surface,
+    planes: Float[np.ndarray, "4 f"],
+    active: Int32[np.ndarray, " s"],
+    views: Views,
+    some: slice,
+    averaged: bool,
+) -> list[tuple[Int32[np.ndarray, "_ 2"], Float[np.ndarray, "_ 14"]]]:
+    """Of each view, at most VIEWS_A_WORD: corners, and samples as ``rim_kernels`` names their columns.
+
+    Faces and vertices are swept once for all views, a bit for each; a view then only touches what lies on its rim.
+    """
+    centres = -np.einsum("kji,kj->ki", views.rotation[some], views.translation[some])
+    pictures = Pictures(views.packed()[some], centres, views.size[some], views.distance, views.offset[some])
+    sweep = sweep_views(surface, planes, active, centres)
+    counts = np.zeros(len(centres), np.int64)
+    corners = np.empty((len(centres), MAX_SAMPLES, 2), np.int32)
+    samples = np.empty((len(centres), MAX_SAMPLES, COLUMNS))
+    steps = np.array(STEPS_OUT_PX)
+
+    def fill(first: int, last: int) -> None:
+        find_rim_samples(first, last, surface, sweep, pictures, steps, averaged, counts, corners, samples)
+
+    in_threads(len(centres), fill)
+    return [(corners[k, :count], samples[k, :count]) for k, count in enumerate(counts.tolist())]
+
+
+def project_with_slopes(
+    points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
+    """Returns the pixel of every point in the view named beside it, and d(pixel) / d(point)."""
+    return projected_with_slopes(points_world, view, views.packed())

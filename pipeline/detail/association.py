@@ -1,0 +1,106 @@
+"""Which place of the head each point of the dense surface shows: the closest one whose side agrees.
+
+From the points to the head, and not the other way: a place of the head that no point shows stays silent by itself, at
+the rim of a hole as well as in its middle.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.compute.threads import in_threads, thread_count
+from pipeline.geometry.closest_point_kernels import FannedMesh, closest_at_vertices
+
+CANDIDATES = 4  # vertices whose triangles are tried
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Associated:
+    """Holds n points and their places on the head."""
+
+    row: Int[np.ndarray, " n"]  # of the points asked for
+    triangle: Int[np.ndarray, " n"]
+    blend: Float[np.ndarray, "n 3"]  # barycentric weights of its corners
+    distance_mm: Float[np.ndarray, " n"]
+
+
+def faces_at_vertices(
+    faces: Int[np.ndarray, "f 3"], count: int
+) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
+    """Returns where each vertex's faces begin, and the faces, vertex by vertex."""
+    corner = np.argsort(faces.ravel(), kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
+    return start.astype(np.int64), (corner // 3).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """Holds a head that points are asked for a place on, with what finds it."""
+
+    head: FannedMesh
+    tree: KDTree
+    corner_mm: float  # from no place of a triangle is its nearest corner farther
+
+    @classmethod
+    def of(
+        cls, vertices: Float[np.ndarray, "v 3"], vertex_normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+    ) -> "Target":
+        """Builds it of a mesh (mm) with its unit vertex normals."""
+        sides = [np.linalg.norm(vertices[faces[:, j]] - vertices[faces[:, j - 1]], axis=1) for j in range(3)]
+        head = FannedMesh(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
+        return cls(head, KDTree(vertices), float(np.max(sides, initial=0.0)))
+
+    def closest(
+        self,
+        points: Float[np.ndarray, "p 3"],
+        normals: Float[np.ndarray, "p 3"],
+        *,
+        reach_mm: float,
+        least_agreement: float,
+    ) -> Associated:
+        """Returns the closest place on the head of every point that has one within reach.
+
+        Args:
+            points: of the dense surface, mm, in the head's frame.
+            normals: unit, outwards.
+            reach_mm: farther points have no place on it, and cost next to nothing.
+            least_agreement: cosine between a point's normal and the head's.
+
+        Returns:
+            The points that have a place, in their order.
+        """
+        count = min(CANDIDATES, len(self.head.vertices))
+        within = reach_mm + self.corner_mm
+        _, near = self.tree.query(points, k=count, distance_upper_bound=within, workers=thread_count())
+        near = near.reshape(len(points), count)
+        triangle = np.empty(len(points), np.int64)
+        blend, square = np.zeros((len(points), 3)), np.empty(len(points))
+
+        def fill(first: int, last: int) -> None:
+            closest_at_vertices(first, last, points, normals, near, self.head, least_agreement, triangle, blend, square)
+
+        in_threads(len(points), fill)
+        row = np.flatnonzero((triangle >= 0) & (square <= reach_mm**2))
+        return Associated(row, triangle[row], blend[row], np.sqrt(square[row]))
+
+
+def associate(
+    points: Float[np.ndarray, "p 3"],
+    normals: Float[np.ndarray, "p 3"],
+    vertices: Float[np.ndarray, "v 3"],
+    vertex_normals: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    *,
+    reach_mm: float,
+    least_agreement: float,
+) -> Associated:
+    """Returns ``Target.closest`` of a head that is asked once; all in one frame, mm."""
+    target = Target.of(vertices, vertex_normals, faces)
+    return target.closest(points, normals, reach_mm=reach_mm, least_agreement=least_agreement)
+
+
+def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Returns values at n places of triangles, from those at their corners."""
+    return np.einsum("nk,nkc->nc", blend, corners)

@@ -1,0 +1,153 @@
+"""How far lids are closed, as the dense surface tells it.
+
+Patches of a few millimetres do not follow a lid, so that the photographs' own fit leaves lids open; and what shows
+between them (``eyelids``) misjudges eyes without a white. So each eye's blink is tried at a few weights, and the lids
+whose surface lies nearest to the points about the eye, robustly, are the ones that are there.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.contour_fit.fit import Fit
+from pipeline.detail.association import associate
+from pipeline.detail.eyelids import EyeEvidence, Fissure, eye_fissure
+from pipeline.detail.surface_points import SurfacePoints
+from pipeline.head_model.expressions import BLINKS, plain_name
+from pipeline.head_model.model import HeadModel
+from pipeline.part_labels.codes import Part
+from rig.mesh import vertex_normals
+
+HALF, OTHERS = 0.5, (0.25, 0.75, 1.0)
+NEAR = 0.6  # of the fissure's length: points about the eye
+REACH_MM, AGREEMENT, ROBUST_MM = 6.0, 0.3, 0.3
+MIN_POINTS = 200
+GAIN = 0.97  # of the misfit of open lids that half closed ones must stay under: 0.89 and 0.94 of closed ones, 1.03 and
+# more of open ones
+SHUT = 0.5  # lids that far down over an eye that shows nothing are closed ...
+OPEN = (
+    1.25  # ... and so are others, unless half closed ones fit that much worse: 1.03 and 1.16 on a real scan, whose lids
+)
+# are closed another way than the model's; 1.32 to 1.86 on open eyes of the studio
+
+
+def blinks_of(model: HeadModel) -> dict[str, int]:
+    """Returns the coefficient that closes each eye (``right``, ``left``), where the model's modes have one."""
+    found: dict[str, int] = {}
+    for name, place in zip(model.expressions.names, model.posed, strict=False):
+        if plain_name(name) in BLINKS:
+            found.setdefault(BLINKS[plain_name(name)], place)
+    return found
+
+
+def estimate_eyelid_closure(
+    fit: Fit,
+    model: HeadModel,
+    base: Float[np.ndarray, "v 3"],
+    surface: SurfacePoints,
+    eyes: Mapping[str, EyeEvidence],
+) -> tuple[dict[str, float], frozenset[str]]:
+    """Tells how far each eye is closed, 0 to 1, of those that the model can close, and the eyes that show nothing
+    though no blink of the model's lies nearer to the points: their lids are to be bridged.
+
+    Args:
+        fit: of the photographs.
+        model: with the modes that the fit has.
+        base: the fit's head with plain lids (``with_plain_lids``), full level, world.
+        surface: the dense points, world frame.
+        eyes: what shows between the lids; an eye that shows none is closed unless the points say that it is open.
+    """
+    found, unexplained = {}, set[str]()
+    for side, place in blinks_of(model).items():
+        fitted, moved = float(fit.coefficients[place]), _moved(fit, model, place)
+        share, half = _nearest_closure(base - fitted * moved, moved, fitted, model, surface, eye_fissure(model, side))
+        shown = eyes.get(side)
+        shut = shown is not None and shown.closed
+        found[side] = 1.0 if shut and share >= SHUT else share
+        if shown is not None and shown.is_surely_open:
+            found[side] = min(share, HALF)
+        if shown is not None and shut and share < SHUT and (half < OPEN or shown.is_surely_closed):
+            unexplained.add(side)
+    return found, frozenset(unexplained)
+
+
+def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
+    """Returns what closes the fit's eyes that far, full level, world, mm."""
+    shift, places = np.zeros((model.levels["full"].count, 3)), blinks_of(model)
+    for side, share in lids.items():
+        if (more := share - float(fit.coefficients[places[side]])) != 0.0:
+            shift += more * _moved(fit, model, places[side])
+    return shift
+
+
+def _moved(fit: Fit, model: HeadModel, place: int) -> Float[np.ndarray, "v 3"]:
+    """An expression at weight 1, full level, world."""
+    moved = model.levels["full"].operator @ model.modes[place].astype(float)
+    return fit.world_from_head.scale * moved @ fit.world_from_head.rotation.T
+
+
+def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
+    """Returns the fit with its eyes that far closed."""
+    coefficients, places = fit.coefficients.copy(), blinks_of(model)
+    for side, share in lids.items():
+        coefficients[places[side]] = share
+    return replace(fit, coefficients=coefficients)
+
+
+def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray, "v 3"]:
+    """Returns the fitted head (full level, world) as eigenheads and expressions alone have it."""
+    plain = fit.coefficients.copy()
+    plain[np.setdiff1d(np.arange(eigenheads, len(plain)), model.posed)] = 0.0
+    return fit.world_from_head.apply(model.vertices(plain))
+
+
+def _nearest_closure(
+    open_lids: Float[np.ndarray, "v 3"],
+    moved: Float[np.ndarray, "v 3"],
+    fitted: float,
+    model: HeadModel,
+    surface: SurfacePoints,
+    slit: Fissure,
+) -> tuple[float, float]:
+    """Returns the weight whose lids lie nearest, ``fitted`` where too few points tell or none is nearer; and the misfit
+    of half closed lids divided by that of open ones, 1 where too few points tell.
+
+    ``moved`` is what closes open lids."""
+    middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
+    off = np.linalg.norm(surface.points - middle, axis=1)
+    about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != Part.UNSEEN))
+    if len(about.points) < MIN_POINTS:
+        return fitted, 1.0
+    near, faces = _patch(open_lids, model, middle, NEAR * slit.length_mm + REACH_MM)
+    still = _misfit(open_lids[near], faces, about)
+    misfits = {HALF: _misfit((open_lids + HALF * moved)[near], faces, about)}
+    half = misfits[HALF] / max(still, 1e-9)
+    if half >= GAIN:  # lids that are down at all are nearer half way
+        return fitted, half
+    misfits |= {weight: _misfit((open_lids + weight * moved)[near], faces, about) for weight in OTHERS}
+    return min(misfits, key=lambda weight: misfits[weight]), half
+
+
+def _patch(
+    vertices: Float[np.ndarray, "v 3"], model: HeadModel, middle: Float[np.ndarray, " 3"], radius_mm: float
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "f 3"]]:
+    """The head about an eye: its vertices, and its triangles between them."""
+    inside = np.linalg.norm(vertices - middle, axis=1) < radius_mm
+    faces = model.levels["full"].faces
+    places = np.cumsum(inside, dtype=np.int32) - np.int32(1)
+    found = places[faces[inside[faces].all(axis=1)]]
+    found.setflags(write=False)  # as the head's own faces are: loops are compiled for those
+    return np.flatnonzero(inside), found
+
+
+def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
+    """Mean of Geman and McClure's loss of the points' distances; a point without a place counts whole."""
+    normals = vertex_normals(vertices, faces)
+    found = associate(
+        points.points, points.normals, vertices, normals, faces, reach_mm=REACH_MM, least_agreement=AGREEMENT
+    )
+    loss = np.ones(len(points.points))
+    loss[found.row] = found.distance_mm**2 / (found.distance_mm**2 + ROBUST_MM**2)
+    return float(loss.mean())

@@ -1,0 +1,90 @@
+"""The dense stage's depth maps as one cloud of oriented points, each with what it shows."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from pipeline.compute.threads import thread_count
+from pipeline.detail.surface_points import SurfacePoints, thinned
+from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE
+from pipeline.part_labels.codes import Part, codes_from_channels
+from pipeline.part_labels.votes import PartVotes, part_shares
+from pipeline.settings import FineSettings
+from pipeline.stereo.depth_map import DepthMap, points_world
+from rig.camera import Camera
+from rig.mesh import Mesh, vertex_normals
+
+INSIDE_MM = 4.0  # farther behind the fitted head a point shows something that neither pulls nor bounds it
+EVERY = 4  # vertices of the head stand for the others
+TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage compares no others (angle_widest_deg)
+
+
+def dense_points(
+    depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh, settings: FineSettings
+) -> SurfacePoints:
+    """Returns every place that enough views agree on, as a point with its part; at most one for each side of a small
+    cell.
+
+    Args:
+        depth_maps: one a view.
+        votes: what the places show.
+        head_world: the fitted head.
+        settings: how many views must agree, and how frontally.
+
+    Returns:
+        The points, in the order of their cells; none where there are no maps or no votes.
+    """
+    views_needed = count_views_needed([each.camera for each in depth_maps], head_world.vertices.mean(axis=0), settings)
+    clouds = [_cloud(each, views_needed, settings) for each in depth_maps]
+    if not clouds or votes is None:
+        return SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
+    points, normals, deviation = (np.concatenate(column) for column in zip(*clouds, strict=True))
+    # A million pixels, a tenth of that in cells.
+    cells = thinned(SurfacePoints(points, normals, deviation, np.zeros(len(points), np.uint8)), settings.cell_mm)
+    share = part_shares(votes, cells.points)
+    part = codes_from_channels(share.argmax(axis=1))
+    # What may be hair may lie where hair does: the deviation of both together.
+    skin = share[:, Part.SKIN.channel]
+    doubt = np.where(part == Part.SKIN, 1.0 - skin / np.maximum(share.sum(axis=1), 1e-9), 0.0)
+    deviation = np.sqrt(cells.deviation_mm**2 + doubt * settings.hair_off_mm**2)
+    part[_behind(cells.points, head_world)] = Part.HAIR  # it bounds nothing there and pulls nothing
+    return replace(cells, deviation_mm=deviation, part=part)
+
+
+def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"], settings: FineSettings) -> int:
+    """Returns how many views must agree on a point: half of those that can, where most can, but two at least and
+    ``settings.views_least`` at most.
+
+    Args:
+        cameras: of the depth maps.
+        at_world: about the middle of the head, mm.
+        settings: for the number that suffices.
+    """
+    towards = np.array([camera.centre_world for camera in cameras]).reshape(-1, 3) - at_world
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
+    together = (towards @ towards.T > np.cos(np.radians(TOGETHER_DEG))).sum(axis=1)
+    return min(max(int(together.max(initial=0)) // 2, 2), settings.views_least)
+
+
+def _behind(points: Float[np.ndarray, "n 3"], head_world: Mesh) -> np.ndarray:
+    vertices = head_world.vertices[::EVERY]
+    normals = vertex_normals(head_world.vertices, head_world.faces)[::EVERY]
+    _, near = KDTree(vertices, balanced_tree=False, compact_nodes=False).query(points, workers=thread_count())
+    return ((points - vertices[near]) * normals[near]).sum(axis=1) < -INSIDE_MM
+
+
+def _cloud(
+    depth_map: DepthMap, views_needed: int, settings: FineSettings
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    known, camera = depth_map.known, depth_map.camera
+    points, normals = points_world(depth_map), depth_map.normal[known].astype(float)
+    towards = camera.centre_world - points
+    facing = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    views = depth_map.views[known]
+    kept = (views >= views_needed) & (facing >= settings.facing_least)
+    deviation = depth_map.deviation_mm[known][kept] * facing[kept]  # along the ray, to along the normal
+    deviation *= np.where(views[kept] < VIEWS_SURE, ALONE_FACTOR, 1.0)
+    return points[kept], normals[kept], deviation

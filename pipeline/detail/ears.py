@@ -1,0 +1,149 @@
+"""Ears brought in place as a whole, before anything bends.
+
+An ear may sit a centimetre off where the face says it should, with a shell of folds: the closest point of another fold
+is no help. So each ear first moves as a similarity, from several starts, to where the dense points about it agree with
+it best (iterated closest points along the normals; Chen and Medioni 1992), and its surroundings follow smoothly.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.detail.association import Target, interpolated
+from pipeline.detail.surface_points import SurfacePoints
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.regions import head_regions
+from pipeline.part_labels.codes import Part
+from rig.geometry import rotation_from_vector
+from rig.mesh import vertex_normals
+
+ABOUT_MM = 25.0  # points that far from the ear may be its own
+BLEND_MM = 10.0  # over which the head follows
+STARTS_MM = (0.0, -9.0, 9.0)  # up and down the head, and to and fro
+REACHES_MM = (14.0, 10.0, 7.0, 5.0, 4.0, 3.0, 3.0, 3.0)
+ROBUST_SHARE = 0.4  # of the reach
+MIN_POINTS, MIN_SHOWN = 80, 80  # about the ear, and on it
+TURN_SD, SCALE_SD, SHIFT_SD_MM = 0.2, 0.08, 8.0  # of the motion, against points worth ...
+POINT_SD_MM = 3.0  # ... that each: they are many, and the shape is another's
+AGREEMENT = 0.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Holds a similarity about the middle of an ear, with its robust cost (per point) and how many points it puts on
+    it."""
+
+    cost: float
+    scale: float
+    turn: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, " 3"]  # mm
+    shown: int
+
+
+def with_ears_in_place(
+    vertices: Float[np.ndarray, "v 3"], model: HeadModel, surface: SurfacePoints
+) -> Float[np.ndarray, "v 3"]:
+    """Returns the head with each ear where the skin's points say, if enough of them do.
+
+    Args:
+        vertices: full level, world frame, mm.
+        model: the topology.
+        surface: what the dense stage knows; thin, 1.5 to 3 mm apart.
+    """
+    faces, ears = model.levels["full"].faces, head_regions(model)["ears"]
+    middle = model.vertices(np.zeros(0))[:, 0] < 0
+    skin = surface.chosen(surface.part == Part.SKIN)
+    moved = np.zeros_like(vertices)
+    for side in (ears & middle, ears & ~middle):
+        rows = np.flatnonzero(side)
+        if not len(rows) or not len(skin.points):
+            continue
+        distance, _ = KDTree(vertices[rows]).query(skin.points, distance_upper_bound=ABOUT_MM)
+        near = skin.chosen(np.isfinite(distance))
+        if len(near.points) < MIN_POINTS:
+            continue
+        turned = _registered(vertices, faces, side, near, model)
+        off, _ = KDTree(vertices[rows]).query(vertices, distance_upper_bound=4.0 * BLEND_MM)
+        share = np.exp(-0.5 * (np.where(np.isfinite(off), off, 1e3) / BLEND_MM) ** 2)
+        moved += share[:, None] * (turned - vertices)
+    return vertices + moved
+
+
+def _registered(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    ear: Bool[np.ndarray, " v"],
+    points: SurfacePoints,
+    model: HeadModel,
+) -> Float[np.ndarray, "v 3"]:
+    """All vertices under the motion that explains the points about the ear best; as they were where hardly a point
+    shows the ear itself: under hair the cheek before it would drag it along."""
+    centre = vertices[ear].mean(axis=0)
+    local = np.flatnonzero(np.linalg.norm(vertices - centre, axis=1) < np.linalg.norm(
+        vertices[ear] - centre, axis=1).max() + BLEND_MM)  # fmt: skip
+    place = np.full(len(vertices), -1)
+    place[local] = np.arange(len(local))
+    part = place[faces[(place[faces] >= 0).all(axis=1)]]
+    local_vertices = vertices[local] - centre
+    target = Target.of(local_vertices, vertex_normals(local_vertices, part), part)
+    up, ahead = _axes(vertices, model)
+    found = []
+    for rise in STARTS_MM:
+        for forth in STARTS_MM:
+            shift = rise * up + forth * ahead
+            if abs(rise) + abs(forth) <= max(STARTS_MM):  # up, down, to or fro
+                found.append(_descend(target, ear[local], points, centre, shift))
+    best = min(found, key=lambda each: each.cost)
+    if best.shown < MIN_SHOWN:
+        return vertices
+    return best.scale * (vertices - centre) @ best.turn.T + centre + best.shift
+
+
+def _axes(
+    vertices: Float[np.ndarray, "v 3"], model: HeadModel
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Up and ahead of the head, unit, world frame."""
+    at = {name: vertices[row] for name, row in model.landmarks.items()}
+    up = at["nasion"] - at["gnathion"]
+    ahead = at["nasion"] - 0.5 * (at["tragion_left"] + at["tragion_right"])
+    up = up / np.linalg.norm(up)
+    ahead = ahead - (ahead @ up) * up
+    return up, ahead / np.linalg.norm(ahead)
+
+
+def _descend(
+    target: Target,
+    ear: Bool[np.ndarray, " v"],
+    points: SurfacePoints,
+    centre: Float[np.ndarray, " 3"],
+    shift: Float[np.ndarray, " 3"],
+) -> Motion:
+    """The best motion about ``centre`` from one start; ``target`` is the ear and its surroundings from there.
+
+    The points are brought to the ear as it was, so that what finds places on it is made once.
+    """
+    scale, turn, cost, shown = 1.0, np.eye(3), np.inf, 0
+    prior = np.diag([TURN_SD**-2] * 3 + [SHIFT_SD_MM**-2] * 3 + [SCALE_SD**-2])
+    for reach in REACHES_MM:
+        back = (points.points - centre - shift) @ turn / scale
+        found = target.closest(back, points.normals @ turn, reach_mm=reach / scale, least_agreement=AGREEMENT)
+        distance_mm = scale * found.distance_mm
+        corner = target.head.faces[found.triangle]
+        arm = scale * interpolated(target.head.vertices[corner], found.blend) @ turn.T
+        ahead = points.normals[found.row]
+        off = ((points.points[found.row] - centre - shift - arm) * ahead).sum(axis=1)
+        robust = ROBUST_SHARE * reach
+        weight = 1.0 / (1.0 + (distance_mm / robust) ** 2) ** 2
+        shown = int(np.count_nonzero(ear[corner].all(axis=1)))
+        missing = len(points.points) - len(found.row)
+        square = distance_mm**2 / (distance_mm**2 + robust**2)
+        cost = float((square.sum() + missing) / len(points.points))
+        rows = np.concatenate([np.cross(arm, ahead), ahead, (arm * ahead).sum(axis=1, keepdims=True)], axis=1)
+        weighted = rows * weight[:, None] / POINT_SD_MM**2
+        state = np.concatenate([np.zeros(3), shift, [np.log(scale)]])
+        step = np.linalg.solve(weighted.T @ rows + prior, weighted.T @ off - prior @ state)
+        turn = rotation_from_vector(step[:3]) @ turn
+        shift, scale = shift + step[3:6], scale * float(np.exp(step[6]))
+    return Motion(cost, scale, turn, shift, shown)

@@ -1,0 +1,181 @@
+"""What face a head makes, read from the surface that it was drawn to.
+
+Enters: the displaced head (``refine``). Leaves: the weights of its expressions with their deviations. The fit decides
+them where the surface is still known to half a millimetre, and with the eigenheads that it uses alone: what a head has
+of the others looks like an expression, a brow or the wing of a nose above all. So here they are estimated once more,
+from the final surface and with the whole population. With X a place of the head, Y its place on the displaced one and n
+the normal there, n . (X - Y) is noise, robustly:
+
+    n . (mean + sum_m z_m modes_m + sum_e w_e shapes_e + pose - Y) = noise,
+
+z ~ N(0, 1); the kernel's modes have a variance that is estimated here, since all eigenheads leave little to them; the
+weights have the prior and the bounds that they have in the fit (``prior_term``). Sliding along the surface is free: the
+places are found again on the displaced head. The head stays what it is, and where it is none of its population, whose
+eigenheads would then ask for expressions to explain it, its weights do, too.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from pipeline.compute.array_cache import cached_arrays
+from pipeline.contour_fit.fit import Fit
+from pipeline.contour_fit.prior_term import weight_slope
+from pipeline.detail.association import associate, interpolated
+from pipeline.estimation.bounded import least_within
+from pipeline.head_model.model import HeadModel
+from pipeline.photometric_fit.patches import thinned
+from rig.mesh import vertex_normals
+
+SPACING_MM = 2.5  # of the places that are asked
+EVIDENCE = 4  # rounds in which the kernel's variance is estimated
+VARIANCE_RANGE = (0.02, 4.0)
+STRAYS = 1.0  # variance of a head that its population does not explain: heads of it have 0.02 to 0.4, others 4
+SIGMA_MM, CORRELATED = 0.2, 2.0  # error of the displaced head, and how many neighbours share it
+UNSEEN = 0.02  # information of a place that no point showed, by that of one that was
+ROBUST_MM = 0.3
+ROUNDS, REWEIGHTED = 2, 6  # of finding places; of the weights' prior
+REACH_MM, AGREEMENT = 3.0, 0.5
+HELD = 1e6  # information that holds a weight at its bound
+POSE_INFORMATION = 1e-3
+FIRST = 0.1  # weight at which the prior's tangent is taken first
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadingBasis:
+    """Holds what may move the places: E expressions behind the other modes, mm, head frame."""
+
+    vertex: Int[np.ndarray, " n"]  # of the full level
+    mean: Float[np.ndarray, "n 3"]
+    modes: Float32[np.ndarray, "m n 3"]
+    eigenheads: int  # the first of them; the kernel's follow
+    faces: Int[np.ndarray, "f 3"]  # about the face
+
+
+@lru_cache(maxsize=1)  # 10 MB; studios work with one model
+def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> ReadingBasis:
+    """Returns all eigenheads of ``population``, the smooth modes of ``model`` (of the fit) and the expressions."""
+    full = population.levels["full"]
+    inputs = (population.sha256, population.modes, model.modes, model.posed, eigenheads, SPACING_MM)
+
+    def make() -> dict[str, np.ndarray]:
+        mean = population.vertices(np.zeros(0))
+        vertex = thinned(mean, np.flatnonzero(full.face_region), SPACING_MM)
+        population_modes = population.basis("full", len(population.modes), vertex)
+        fitted = model.basis("full", model.posed.stop, vertex)[eigenheads:]
+        return {"vertex": vertex, "mean": mean[vertex], "modes": np.concatenate([population_modes, fitted])}
+
+    kept = cached_arrays("expression-places", inputs, make, made_by=(thinned, HeadModel))
+    faces = full.faces[full.face_region[full.faces].any(axis=1)]
+    faces.setflags(write=False)  # as the head's own faces are: loops are compiled for those
+    return ReadingBasis(kept["vertex"], kept["mean"], kept["modes"], len(population.modes), faces)
+
+
+def with_read_expression(
+    fit: Fit,
+    model: HeadModel,
+    population: HeadModel,
+    vertices_world: Float[np.ndarray, "v 3"],
+    observed: Bool[np.ndarray, " v"],
+    *,
+    eigenheads: int,
+    median: float,
+) -> Fit:
+    """Returns the fit with the weights that the displaced head tells, and their deviations; all else as it was.
+
+    Args:
+        fit: of the photographs.
+        model: with the modes that the fit has.
+        population: the model with all its eigenheads.
+        vertices_world: the displaced head, full level, mm.
+        observed: which of its vertices a point of skin showed.
+        eigenheads: how many of the fit's modes are a population's.
+        median: of the prior of a weight.
+    """
+    if not len(model.posed):
+        return fit
+    basis, pose = reading_basis(population, model, eigenheads), fit.world_from_head
+    head = (vertices_world - pose.translation) @ pose.rotation / pose.scale
+    normals = vertex_normals(head, population.levels["full"].faces)
+    trust = np.where(observed[basis.vertex], 1.0, UNSEEN) / (SIGMA_MM**2 * CORRELATED)
+    place, normal = head[basis.vertex], normals[basis.vertex]
+    here, there, deviation = place, np.ones(len(place)), np.zeros(0)
+    weights = np.zeros(len(model.posed))
+    for k in range(ROUNDS):
+        off = ((here - place) * normal).sum(axis=1)
+        information = there * trust / (1.0 + (off / ROBUST_MM) ** 2) ** 2
+        weights, deviation, here, strays = _solved(basis, place, normal, information, len(weights), median)
+        if strays > STRAYS:
+            return fit
+        if k < ROUNDS - 1:
+            found = associate(here, normal, head, normals, basis.faces, reach_mm=REACH_MM, least_agreement=AGREEMENT)
+            corner, there = basis.faces[found.triangle], np.zeros(len(place))
+            place, normal = place.copy(), normal.copy()
+            place[found.row] = interpolated(head[corner], found.blend)
+            normal[found.row] = interpolated(normals[corner], found.blend)
+            there[found.row] = 1.0
+    return _with_weights(fit, model, weights, deviation)
+
+
+def _solved(
+    basis: ReadingBasis,
+    place: Float[np.ndarray, "n 3"],
+    normal: Float[np.ndarray, "n 3"],
+    information: Float[np.ndarray, " n"],
+    expressions: int,
+    median: float,
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"], Float[np.ndarray, "n 3"], float]:
+    """Weights, their deviations, where the modelled places are then, and the variance of the kernel's modes (MacKay
+    1992, as in ``posterior``)."""
+    count = len(basis.modes)
+    arm = place - place.mean(axis=0)
+    by_mode = np.einsum("mnc,nc->nm", basis.modes, normal.astype(np.float32), optimize=True)
+    pose = [np.cross(arm, normal), normal, (arm * normal).sum(axis=1, keepdims=True)]
+    rows = np.concatenate([by_mode, *pose], axis=1, dtype=np.float32)
+    root = np.sqrt(information)
+    rows *= root.astype(np.float32)[:, None]
+    matrix = (rows.T @ rows).astype(float)
+    right = (root * ((place - basis.mean) * normal).sum(axis=1)) @ rows
+    diagonal, first = np.arange(len(matrix)), count - expressions
+    weights, smooth = slice(first, count), diagonal[basis.eigenheads : first]
+    matrix[diagonal[:first], diagonal[:first]] += 1.0
+    matrix[diagonal[first:count], diagonal[first:count]] += 1.0
+    matrix[diagonal[count:], diagonal[count:]] += POSE_INFORMATION
+    least, most = np.full(len(matrix), -np.inf), np.full(len(matrix), np.inf)
+    least[weights], most[weights] = 0.0, 1.0
+    found, now, variance = np.zeros(len(matrix)), np.full(expressions, FIRST), 1.0 if len(smooth) else 0.0
+    covariance = matrix
+    for k in range(REWEIGHTED):
+        slope = -right
+        slope[weights] += weight_slope(now, median)
+        found = least_within(matrix, slope, least, most)
+        now = np.maximum(found[weights], 0.0)
+        if k < EVIDENCE or k == REWEIGHTED - 1:
+            held = matrix.copy()
+            bound = diagonal[first:count][now <= 0.0]
+            held[bound, bound] += HELD  # what stays at its bound explains nothing of the others
+            covariance = np.linalg.inv(held)
+        if k < EVIDENCE and len(smooth):
+            determined = np.clip(1.0 - np.diag(covariance)[smooth] / variance, 0.0, 1.0).sum()
+            new = float(np.clip((found[smooth] ** 2).sum() / max(float(determined), 1e-9), *VARIANCE_RANGE))
+            matrix[smooth, smooth] += 1.0 / new - 1.0 / variance
+            variance = new
+    deviation = np.sqrt(np.diag(covariance)[weights])
+    moved = (found[:count].astype(np.float32) @ basis.modes.reshape(count, -1)).reshape(-1, 3)
+    turn, shift, grown = found[count : count + 3], found[count + 3 : count + 6], found[count + 6]
+    return now, deviation, basis.mean + moved + np.cross(turn, arm) + shift + grown * arm, variance
+
+
+def _with_weights(
+    fit: Fit, model: HeadModel, weights: Float[np.ndarray, " e"], deviation: Float[np.ndarray, " e"]
+) -> Fit:
+    """The fit with other weights; its covariance scaled to their deviations."""
+    coefficients, posed = fit.coefficients.copy(), np.asarray(model.posed)
+    coefficients[posed] = weights
+    if fit.covariance is None:
+        return replace(fit, coefficients=coefficients)
+    factor = np.ones(len(fit.covariance))
+    factor[posed] = deviation / np.sqrt(np.diag(fit.covariance)[posed])
+    return replace(fit, coefficients=coefficients, covariance=fit.covariance * np.outer(factor, factor))

@@ -1,0 +1,243 @@
+"""Eyes that are open in the model and closed in the photographs.
+
+Both are told apart by what shows between the lids: the white of an eye has no colour of its own, iris and pupil are
+darker than skin; a closed lid is skin with a thin line of lashes. Where the model blinks, that closes the lids; where
+it has no such expression, they bridge the opening: what lies between them, and the margins that stand about it, become
+the smoothest surface that continues the skin around (biharmonic, Botsch and Kobbelt 2004, *An intuitive framework for
+real-time freeform modeling*), which the dense surface then draws to the lids themselves. The eyeball's part of a model
+lies behind and stays unseen.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy.sparse.linalg import splu
+
+from pipeline.detail.smooth_field import smooth_field
+from pipeline.head_model.model import HeadModel
+from rig.mesh import vertex_normals
+from rig.rig import Rig
+
+SIDES = ("right", "left")
+MARGIN_MM = 2.0  # beyond the corners of the eye
+BRIDGE_HEIGHT, BRIDGE_RAISED = (
+    0.36,
+    0.05,
+)  # half height and middle of the bridge, by the fissure's length: up to the fold
+SHOWN_LENGTH, SHOWN_HEIGHT = 0.5, 0.3  # where an open eye is looked for, by its length: a fit may be 4 mm off; no brow
+SKIN_BELOW, SKIN_SIZE = 0.75, 0.25  # where skin is looked at, by the fissure's length
+VIEWS, MIN_FACING = 5, 0.6  # the most frontal cameras
+WHITE_CHROMA, WHITE_LIGHT, DARK_LIGHT = 0.5, 0.6, 0.35  # by the skin's
+WHITE_SHARE, DARK_SHARE = 0.05, 0.1  # of what is looked at; lashes of a closed eye are a line
+MIN_VERTICES = 12
+MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.07, 0.1  # of lids that are half closed, and of lids that meet
+
+
+@dataclass(frozen=True, slots=True)
+class EyeEvidence:
+    """Holds what the photographs show between the lids: shares of the opening, 0 to 1; and how far the lids stand apart
+    where a face was found (``faces.eyes.eye_openings``)."""
+
+    white: float
+    dark: float
+    views: int
+    opening: float | None = None
+
+    @property
+    def is_surely_closed(self) -> bool:
+        """Tells whether the lids lie nearer to each other than any half closed ones."""
+        return self.opening is not None and self.opening < MIN_HALF_OPENING
+
+    @property
+    def is_surely_open(self) -> bool:
+        """Tells whether the lids stand farther apart than any closed ones."""
+        return self.opening is not None and self.opening > MAX_CLOSED_OPENING
+
+    @property
+    def closed(self) -> bool:
+        """Tells whether there is skin, and nothing else, between lids that do not surely stand apart; or lids that
+        surely meet."""
+        nothing = self.views > 0 and self.white < WHITE_SHARE and self.dark < DARK_SHARE
+        return self.is_surely_closed or (nothing and not self.is_surely_open)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fissure:
+    """Holds the slit between the lids on the mean head: its middle, its length, and every vertex's place about it."""
+
+    length_mm: float
+    along: Float[np.ndarray, " v"]  # mm from the middle, towards the corners
+    above: Float[np.ndarray, " v"]
+    front: Bool[np.ndarray, " v"]
+
+    def ellipse(self, half_length: float, half_height: float, below: float = 0.0) -> Bool[np.ndarray, " v"]:
+        """Returns vertices inside an ellipse about the middle, or ``below`` it (mm)."""
+        inside = (self.along / half_length) ** 2 + ((self.above + below) / half_height) ** 2 < 1.0
+        return self.front & inside
+
+
+def eye_fissure(model: HeadModel, side: str) -> Fissure:
+    """Returns the fissure of the ``right`` or ``left`` eye."""
+    mean = model.vertices(np.zeros(0))
+    outer, inner = (mean[model.landmarks[f"{corner}canthion_{side}"]] for corner in ("exo", "endo"))
+    chord = inner - outer
+    along = chord * (1.0, 1.0, 0.0) / np.linalg.norm(chord[:2])
+    above = np.array([-along[1], along[0], 0.0]) * np.sign(along[0])
+    off = mean - 0.5 * (outer + inner)
+    front = (np.abs(off[:, 2]) < np.linalg.norm(chord)) & (np.abs(off[:, 0]) < np.linalg.norm(chord))
+    return Fissure(float(np.linalg.norm(chord)), off @ along, off @ above, front)
+
+
+def measure_eye_appearance(
+    model: HeadModel,
+    vertices: Float[np.ndarray, "v 3"],
+    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+    rig: Rig,
+    openings: Mapping[str, float],
+) -> dict[str, EyeEvidence]:
+    """Returns what shows between the lids of each eye (``right``, ``left``).
+
+    Args:
+        model: the topology.
+        vertices: the fitted head, full level, world frame, mm.
+        images: photographs by camera, sRGB.
+        rig: the cameras.
+        openings: of the lids of the found face, by side, where there is one.
+    """
+    normals = vertex_normals(vertices, model.levels["full"].faces)
+    found = {}
+    for side in SIDES:
+        slit = eye_fissure(model, side)
+        shown = np.flatnonzero(slit.ellipse(SHOWN_LENGTH * slit.length_mm, SHOWN_HEIGHT * slit.length_mm))
+        size = SKIN_SIZE * slit.length_mm
+        skin = np.flatnonzero(slit.ellipse(1.5 * size, size, SKIN_BELOW * slit.length_mm))
+        shares = [
+            _shares(images[name], rig[name].project(vertices[shown]), rig[name].project(vertices[skin]))
+            for name in _facing(vertices[shown], normals[skin], images, rig)
+        ]
+        shares = [each for each in shares if each is not None]
+        white, dark = np.median(shares, axis=0) if shares else (0.0, 0.0)
+        found[side] = EyeEvidence(float(white), float(dark), len(shares), openings.get(side))
+    return found
+
+
+def _facing(
+    places: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "m 3"],
+    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+    rig: Rig,
+) -> list[str]:
+    """The cameras that look at the eye most frontally."""
+    if not len(places) or not len(normals):
+        return []
+    middle, outward = places.mean(axis=0), normals.mean(axis=0)
+    outward /= max(float(np.linalg.norm(outward)), 1e-9)
+    names = [name for name in rig.names if name in images]
+    towards = np.array([rig[name].centre_world - middle for name in names])
+    cosine = towards @ outward / np.linalg.norm(towards, axis=1)
+    order = np.argsort(-cosine, kind="stable")[:VIEWS]
+    return [names[k] for k in order if cosine[k] > MIN_FACING]
+
+
+def _shares(
+    image: UInt8[np.ndarray, "h w 3"], opening: Float[np.ndarray, "n 2"], skin: Float[np.ndarray, "m 2"]
+) -> tuple[float, float] | None:
+    """Shares of the opening that are white, and dark; None where the photograph does not show it."""
+    eye, about = _colours(image, opening), _colours(image, skin)
+    if len(eye) < MIN_VERTICES or len(about) < MIN_VERTICES:
+        return None
+    light, chroma = _light_and_chroma(eye)
+    skin_light, skin_chroma = (float(np.median(values)) for values in _light_and_chroma(about))
+    white = (chroma < WHITE_CHROMA * skin_chroma) & (light > WHITE_LIGHT * skin_light)
+    return float(white.mean()), float((light < DARK_LIGHT * skin_light).mean())
+
+
+def _colours(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 3"]:
+    at = np.rint(pixels)
+    inside = (at >= 0).all(axis=1) & (at < image.shape[1::-1]).all(axis=1)
+    column, row = at[inside].astype(int).T
+    return (image[row, column] / 255.0) ** 2.2
+
+
+def _light_and_chroma(colours: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Linear light, and how far red stands off blue by it: nothing in a white, whatever its shade."""
+    light = colours.mean(axis=1)
+    return light, (colours[:, 0] - colours[:, 2]) / np.maximum(light, 1e-3)
+
+
+def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
+    """Both lids and what lies between them."""
+    half_length, half_height = 0.5 * slit.length_mm + MARGIN_MM, BRIDGE_HEIGHT * slit.length_mm
+    return np.flatnonzero(slit.ellipse(half_length, half_height, -BRIDGE_RAISED * slit.length_mm))
+
+
+def with_plain_lids(
+    vertices: Float[np.ndarray, "v 3"], shape: Float[np.ndarray, "v 3"], model: HeadModel
+) -> Float[np.ndarray, "v 3"]:
+    """Returns the head with the lids that ``shape`` has, moved as smoothly as their surroundings are.
+
+    Displacements along the normals tear lids apart: their margins' normals point at each other.
+
+    Args:
+        vertices: full level, mm.
+        shape: the same head as its eigenheads alone have it.
+        model: the topology.
+    """
+    moved, faces = vertices - shape, model.levels["full"].faces
+    for side in SIDES:
+        rows = _lids(eye_fissure(model, side))
+        moved[rows] = _smoothest(moved, vertices, faces, rows)
+    return shape + moved
+
+
+def bridge_eyelids(
+    vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozenset[str]
+) -> Float[np.ndarray, "v 3"]:
+    """Returns the head with the lids of the named eyes closed.
+
+    Args:
+        vertices: full level, any frame, mm.
+        model: the topology.
+        closed: of ``right`` and ``left``.
+    """
+    out, faces = vertices.copy(), model.levels["full"].faces
+    for side in sorted(closed):
+        rows = _lids(eye_fissure(model, side))
+        out[rows] = _smoothest(out, vertices, faces, rows)
+    return out
+
+
+def _smoothest(
+    values: Float[np.ndarray, "v 3"],
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    rows: Int[np.ndarray, " r"],
+) -> Float[np.ndarray, "r 3"]:
+    """Values of ``rows`` that minimise the squared Laplacian, the others held."""
+    inside = np.zeros(len(vertices), bool)
+    inside[rows] = True
+    for _ in range(2):  # the Laplacian's own reach, squared
+        inside[faces[inside[faces].any(axis=1)]] = True
+    part = np.flatnonzero(inside)
+    place = np.full(len(vertices), -1)
+    place[part] = np.arange(len(part))
+    local = place[faces[inside[faces].all(axis=1)]]
+    field = smooth_field(vertices[part], local, 1e3)  # a length beyond the patch: stiffness alone
+    free = np.zeros(len(part), bool)
+    free[place[rows]] = True
+    # Rows of the Laplacian at the patch's own border lack neighbours, and are left out.
+    complete = np.ones(len(part), bool)
+    edge = ~inside[faces].all(axis=1) & inside[faces].any(axis=1)
+    rim = np.unique(faces[edge])
+    complete[place[rim[inside[rim]]]] = False
+    laplacian = sparse.csr_array(field.operator)[complete]
+    weight = sparse.diags_array(1.0 / field.mass[complete])
+    matrix = sparse.csr_array(laplacian.T @ weight @ laplacian)
+    right = -(matrix[free][:, ~free] @ values[part][~free])
+    solved = splu(sparse.csc_array(matrix[free][:, free]), permc_spec="MMD_AT_PLUS_A").solve(right)
+    order = np.empty(len(part), int)
+    order[free] = np.arange(free.sum())
+    return solved[order[place[rows]]]

@@ -1,0 +1,70 @@
+"""The meshes that a displacement is solved on: fine enough for what photographs resolve, and no finer.
+
+A model that refines its cage by subdivision gives both: its cage, and one step before its full level (edges of 1.7 mm
+in the face, where the windows of dense matching are 2.6 mm wide). Their vertices are control points, and the full level
+follows them smoothly. A model with no subdivision is solved on its own vertices, with a decimated level before it.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Int
+from scipy.spatial import KDTree
+
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.subdivision import row_count, subdivision
+
+MAX_COARSE = 5000  # nodes in three dimensions: 0.2 s to solve exactly
+NEIGHBOURS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NodeMesh:
+    """Holds control points of a displacement: ``full = operator @ nodes``."""
+
+    faces: Int[np.ndarray, "f 3"]
+    operator: sparse.csr_array  # (v, n)
+    shape: sparse.csr_array  # (n, v): a vertex of the full level for each node, to lay the mesh out by
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nodes:
+    """Holds the two meshes."""
+
+    coarse: NodeMesh
+    fine: NodeMesh
+
+
+@lru_cache(maxsize=2)  # models are few, jobs are many
+def solving_nodes(model: HeadModel) -> Nodes:
+    """Returns both meshes of a model."""
+    full, cage = model.levels["full"], model.levels["cage"]
+    if full.count == cage.count:
+        full_nodes = node_mesh(full.faces, sparse.csr_array(sparse.identity(full.count, format="csr")))
+        return Nodes(_decimated(model) if full.count > MAX_COARSE else full_nodes, full_nodes)
+    faces, to_nodes = cage.faces, sparse.csr_array(sparse.identity(cage.count, format="csr"))
+    while 4 * len(faces) < len(full.faces):
+        step, faces = subdivision(faces, row_count(to_nodes))
+        to_nodes = sparse.csr_array(step @ to_nodes)
+    last, _ = subdivision(faces, row_count(to_nodes))
+    return Nodes(node_mesh(cage.faces, full.operator), node_mesh(faces, last))
+
+
+def node_mesh(faces: Int[np.ndarray, "f 3"], operator: sparse.csr_array) -> NodeMesh:
+    """Returns the control mesh of a subdivision, which keeps old vertices first: node i is laid out by vertex i."""
+    total, count = row_count(operator), row_count(sparse.csr_array(operator.T))
+    shape = sparse.csr_array((np.ones(count), (np.arange(count), np.arange(count))), shape=(count, total))
+    return NodeMesh(faces, sparse.csr_array(operator), shape)
+
+
+def _decimated(model: HeadModel) -> NodeMesh:
+    level, mean = model.levels["p95"], model.vertices(np.zeros(0))
+    distance, near = KDTree(mean[level.rows]).query(mean, k=NEIGHBOURS)
+    weight = np.exp(-2.0 * (distance / distance[:, -1:]) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    start = np.arange(0, NEIGHBOURS * len(mean) + 1, NEIGHBOURS)
+    operator = sparse.csr_array((weight.ravel(), near.ravel(), start), shape=(len(mean), level.count))
+    columns = (np.ones(level.count), (np.arange(level.count), level.rows))
+    return NodeMesh(level.faces, operator, sparse.csr_array(columns, shape=(level.count, len(mean))))

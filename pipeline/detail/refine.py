@@ -1,0 +1,308 @@
+"""The fitted head drawn to the dense surface.
+
+Enters: a fit with its posterior, and the dense stage's oriented points. Leaves: every vertex of the model's full level
+displaced (same vertices, same order), and its deviation. The displacement is a smooth field (``smooth_field``) whose
+amplitude is what the fit itself says that it may be off; each point of skin pulls the place of the head that it shows
+along their normals (``association``), robustly; where no point speaks the fit's own shape carries on. Coarse to fine:
+first every node moves in three dimensions, with a long reach, which brings ears and jaw in place and slides smoothly;
+then the vertices move along their normals alone, so that a vertex stays the same place on every subject.
+
+Hair bounds and does not pull: a point of hair or clothes says that the skin does not stand out of it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.contour_fit.fit import Fit
+from pipeline.detail.association import Associated, associate, interpolated
+from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
+from pipeline.detail.ears import with_ears_in_place
+from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
+from pipeline.detail.folds import unfolded
+from pipeline.detail.nodes import NodeMesh, Nodes, solving_nodes
+from pipeline.detail.patch_points import PatchPlaces, PatchSearch
+from pipeline.detail.smooth_field import SmoothField, smooth_field
+from pipeline.detail.solve import (
+    Observed,
+    Posterior,
+    free_directions,
+    normal_directions,
+    solve_field,
+)
+from pipeline.detail.surface_points import SurfacePoints, thinned
+from pipeline.detail.untangling import untangled_head
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.regions import head_regions
+from pipeline.part_labels.codes import Part
+from pipeline.settings import FineSettings
+from rig.mesh import vertex_normals
+from rig.progress import Progress
+
+SEED = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Holds one association and one solution. ``agreement``: least cosine between a point's normal and the head's."""
+
+    reach_mm: float
+    loose_reach_mm: float
+    agreement: float
+    robust_mm: float
+
+
+COARSE = (Round(5.0, 10.0, 0.5, 3.0), Round(4.0, 7.0, 0.6, 2.0), Round(3.0, 5.0, 0.7, 1.0))
+FINE = Round(2.0, 2.5, 0.7, 0.5)
+LOOKS_MM = (1.0, 0.5)  # robust scale of each look at the photographs, on the head that the last one left
+PATCH_REACH_MM = 4.0  # about a patch no dense point is asked: a window reaches as far
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeformedSurface:
+    """Holds the head in the world frame, mm, and what is known of it."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    deviation_mm: Float[np.ndarray, " v"]  # along the normal
+    observed: Bool[np.ndarray, " v"]  # at a triangle that a point of skin showed
+    closed_eyes: frozenset[str] = frozenset()  # of ``right`` and ``left``
+    lids: Mapping[str, float] = field(default_factory=dict)  # how far each eye is closed, where the model blinks
+
+
+def refine_to_surface(
+    fit: Fit,
+    model: HeadModel,
+    surface: SurfacePoints,
+    settings: FineSettings,
+    *,
+    eigenheads: int,
+    deviation_mm: Float[np.ndarray, " v"],
+    eyes: Mapping[str, EyeEvidence] | None = None,
+    patches: PatchSearch | None = None,
+    report: Progress = lambda stage, fraction: None,
+) -> DeformedSurface:
+    """Returns a fit's head drawn to the dense surface.
+
+    Args:
+        fit: with its posterior.
+        model: with the modes that the fit has.
+        surface: what the dense stage knows, world frame.
+        settings: lengths and floors.
+        eigenheads: how many of the modes are a population's; the rest, expressions apart, are smooth deformations along
+            the normals.
+        deviation_mm: what the fit says of every vertex (``vertex_deviation_mm``).
+        eyes: what photographs show between the lids (``measure_eye_appearance``); without it they stay as the model has
+            them.
+        patches: the photographs, to be asked once more on the displaced head.
+        report: told the share done.
+
+    Returns:
+        The displaced head, without spoilt triangles (``untangling``), and what was decided about the eyes.
+    """
+    faces = model.levels["full"].faces
+    fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
+    shape = plain_shape(fit, model, eigenheads)
+    base = with_plain_lids(fitted, shape, model)
+    lids, unexplained = estimate_eyelid_closure(fit, model, base, surface, eyes or {})
+    closed = frozenset(side for side, shown in (eyes or {}).items() if shown.closed and lids.get(side, 1.0) == 1.0)
+    blink = blink_shift(fit, model, lids)
+    base = unfolded(shape + blink, base + blink, faces)
+    base = bridge_eyelids(base, model, closed.difference(lids) | unexplained)
+    surface = thinned(surface, settings.cell_mm)  # a million points of depth maps, a fiftieth of that in cells
+    base = with_ears_in_place(base, model, thinned(surface, settings.coarse_cell_mm))
+    regions = head_regions(model)
+    head = deform_to_points(
+        base,
+        deviation_mm,
+        faces,
+        solving_nodes(model),
+        surface,
+        settings,
+        loose=regions["ears"] | regions["neck"],
+        look=patches and patches.places,
+        report=report,
+    )
+    clean, clean_deviation_mm = untangled_head(model, head.vertices, head.deviation_mm)
+    observed = head.observed & (clean_deviation_mm < 2.0 * head.deviation_mm)  # what was moved farther is not as seen
+    return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids)
+
+
+def deform_to_points(
+    vertices: Float[np.ndarray, "v 3"],
+    deviation_mm: Float[np.ndarray, " v"],
+    faces: Int[np.ndarray, "f 3"],
+    nodes: Nodes,
+    surface: SurfacePoints,
+    settings: FineSettings,
+    *,
+    loose: Bool[np.ndarray, " v"],
+    look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
+    report: Progress = lambda stage, fraction: None,
+) -> DeformedSurface:
+    """Returns a surface displaced to points of another, as far as those speak.
+
+    Args:
+        vertices: of the surface, mm.
+        deviation_mm: how far they may be off, along their normals.
+        faces: its triangles.
+        nodes: the meshes that the displacement is solved on.
+        surface: the points, same frame.
+        settings: lengths and floors.
+        loose: vertices that may be farther off than the others.
+        look: asks the photographs about the surface as it stands.
+        report: told the share done.
+
+    Returns:
+        The same vertices displaced; where no point is near, as they were.
+    """
+    amplitude = np.maximum(deviation_mm, settings.least_amplitude_mm)
+    informative = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
+    many = thinned(informative, settings.cell_mm)
+    few = thinned(many, settings.coarse_cell_mm)
+    now = vertices
+    field = _laid_out(nodes.coarse, vertices, settings.coarse_length_mm)
+    directions = free_directions(nodes.coarse, nodes.coarse.shape @ amplitude)
+    for i, each in enumerate(COARSE):
+        report("fine", i / (len(COARSE) + 1))
+        observed, _ = observe(
+            vertices, now, faces, few, loose, each=each, settings=settings, floor_mm=settings.coarse_floor_mm
+        )
+        now = vertices + directions.moved(solve_field(field, directions, observed).mean)
+    base = now = unfolded(vertices, now, faces)
+    normals = vertex_normals(base, faces)
+    field = _laid_out(nodes.fine, base, settings.length_mm)
+    directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
+    report("fine", len(COARSE) / (len(COARSE) + 1))
+    observed, seen = observe(base, now, faces, many, loose, each=FINE, settings=settings, floor_mm=settings.floor_mm)
+    posterior = solve_field(field, directions, observed)
+    now = base + directions.moved(posterior.mean)
+    for robust_mm in LOOKS_MM:
+        if look is None:
+            break
+        both = with_patches(observed, look(now), base, now, faces, robust_mm)
+        posterior = solve_field(field, directions, both)
+        now = base + directions.moved(posterior.mean)
+    deviation = field_deviation(posterior, base, normals, amplitude, seen, settings)
+    return DeformedSurface(unfolded(base, now, faces), deviation, seen)
+
+
+def _laid_out(mesh: NodeMesh, vertices: Float[np.ndarray, "v 3"], length_mm: float) -> SmoothField:
+    return smooth_field(mesh.shape @ vertices, mesh.faces, length_mm)
+
+
+def observe(
+    base: Float[np.ndarray, "v 3"],
+    now: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    surface: SurfacePoints,
+    loose: Bool[np.ndarray, " v"],
+    *,
+    each: Round,
+    settings: FineSettings,
+    floor_mm: float,
+) -> tuple[Observed, Bool[np.ndarray, " v"]]:
+    """Returns what the points say of the head as it stands ``now``, as offsets from ``base``; and the vertices that
+    skin shows.
+
+    A normal is half the point's, half the head's (Rusinkiewicz 2019, *A symmetric objective function for ICP*): exact
+    to second order where both are curved.
+    """
+    normals = vertex_normals(now, faces)
+    found = associate(
+        surface.points,
+        surface.normals,
+        now,
+        normals,
+        faces,
+        reach_mm=each.loose_reach_mm,
+        least_agreement=each.agreement,
+    )
+    corner = faces[found.triangle]
+    reach = np.where(loose[corner].any(axis=1), each.loose_reach_mm, each.reach_mm)
+    between = interpolated(normals[corner], found.blend) + surface.normals[found.row]
+    between /= np.maximum(np.linalg.norm(between, axis=1, keepdims=True), 1e-9)
+    point = surface.points[found.row]
+    off = ((point - interpolated(now[corner], found.blend)) * between).sum(axis=1)
+    skin = surface.part[found.row] == Part.SKIN
+    speaks = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair speaks where skin stands out of it
+    variance = surface.deviation_mm[found.row] ** 2 + floor_mm**2
+    robust = np.where(skin, 1.0 / (1.0 + (off / each.robust_mm) ** 2) ** 2, 1.0)
+    shared = _local_density(found, corner, now, faces, settings.correlation_mm)
+    offset = ((point - interpolated(base[corner], found.blend)) * between).sum(axis=1)
+    kept = np.flatnonzero(speaks)
+    seen = np.zeros(len(now), bool)
+    seen[corner[speaks & skin]] = True
+    information = robust / (variance * shared)
+    return Observed(corner[kept], found.blend[kept], between[kept], offset[kept], information[kept]), seen
+
+
+def with_patches(
+    observed: Observed,
+    found: PatchPlaces,
+    base: Float[np.ndarray, "v 3"],
+    now: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    robust_mm: float,
+) -> Observed:
+    """Returns what patches of the head as it stands ``now`` say, and dense points where no patch is near."""
+    vertex, normals = found.vertex, vertex_normals(now, faces)[found.vertex]
+    if not len(vertex):
+        return observed
+    place = now[vertex] + found.place_mm[:, None] * normals
+    offset = ((place - base[vertex]) * normals).sum(axis=1)
+    information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
+    at = interpolated(base[observed.corner], observed.blend)
+    alone = KDTree(base[vertex]).query(at, distance_upper_bound=PATCH_REACH_MM)[0] > PATCH_REACH_MM
+    corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
+    return Observed(
+        np.concatenate([observed.corner[alone], corner]),
+        np.concatenate([observed.blend[alone], blend]),
+        np.concatenate([observed.normal[alone], normals]),
+        np.concatenate([observed.offset_mm[alone], offset]),
+        np.concatenate([observed.information[alone], information]),
+    )
+
+
+def _local_density(
+    found: Associated,
+    corner: Int[np.ndarray, "n 3"],
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    correlation_mm: float,
+) -> Float[np.ndarray, " n"]:
+    """How many points err alike with each, itself included: those within the area over which dense matching does."""
+    area = np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
+                                   vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1) / 6.0  # fmt: skip
+    mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
+    count = np.bincount(corner.ravel(), found.blend.ravel(), len(vertices))
+    for _ in range(2):  # over the triangles about, twice
+        mass, count = (
+            np.bincount(faces.ravel(), np.repeat(values[faces].sum(axis=1), 3), len(vertices))
+            for values in (mass, count)
+        )
+    density = (count / np.maximum(mass, 1e-9))[corner].mean(axis=1)
+    return np.maximum(1.0, density * np.pi * correlation_mm**2)
+
+
+def field_deviation(
+    posterior: Posterior,
+    base: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    deviation_mm: Float[np.ndarray, " v"],
+    observed: Bool[np.ndarray, " v"],
+    settings: FineSettings,
+) -> Float[np.ndarray, " v"]:
+    """Returns the standard deviation along the normal: from draws about what was observed, the fit's own far from it;
+    what all points may err alike stands beside the former."""
+    draws = posterior.draws(np.random.default_rng(SEED), settings.draws)
+    square = np.full(len(normals), settings.common_mm**2)
+    for k in range(settings.draws):
+        square += (posterior.directions.moved(draws[:, k]) * normals).sum(axis=1) ** 2 / settings.draws
+    if not observed.any():
+        return deviation_mm
+    distance, _ = KDTree(base[observed]).query(base, distance_upper_bound=6.0 * settings.length_mm)
+    near = np.exp(-0.5 * (np.where(np.isfinite(distance), distance, np.inf) / settings.length_mm) ** 2)
+    return np.sqrt(near * square + (1.0 - near) * np.maximum(square, deviation_mm**2))

@@ -1,0 +1,107 @@
+"""The displacement that the field's prior and point-to-plane observations agree on, and what they leave open.
+
+Unknown: a unit field w on the nodes, in ``d`` directions each (three, or one along the normals); the head moves by
+``operator @ (amplitude w direction)``. With K observations ``n . X = e`` of information q between three vertices each,
+
+    tr(w^T Q w) + sum q (n . dX(w) - e)^2
+
+is a sparse linear problem, solved exactly; draws of its posterior cost one more solution each (Papandreou and Yuille
+2010, *Gaussian sampling by local perturbations*).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Float, Int
+from scipy.sparse.linalg import SuperLU, splu
+
+from pipeline.detail.nodes import NodeMesh
+from pipeline.detail.smooth_field import SmoothField
+from pipeline.head_model.subdivision import row_count
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """Holds n observations of the surface, each between the three vertices of a triangle of the full level."""
+
+    corner: Int[np.ndarray, "n 3"]
+    blend: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]  # unit
+    offset_mm: Float[np.ndarray, " n"]  # along the normal, from the undisplaced head
+    information: Float[np.ndarray, " n"]  # mm^-2, robust weight included
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directions:
+    """Says how the head moves with the field: (3 v, d n), coordinates of a vertex and directions of a node side by
+    side."""
+
+    matrix: sparse.csr_array
+    count: int  # d
+
+    def moved(self, field: Float[np.ndarray, " u"]) -> Float[np.ndarray, "v 3"]:
+        """Returns the displacement, mm."""
+        return (self.matrix @ field).reshape(-1, 3)
+
+
+def free_directions(mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"]) -> Directions:
+    """Lets every node move as it likes."""
+    scaled = mesh.operator @ sparse.diags_array(amplitude_mm)
+    return Directions(sparse.csr_array(sparse.kron(scaled, sparse.identity(3), format="csr")), 3)
+
+
+def normal_directions(
+    mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"], normals: Float[np.ndarray, "v 3"]
+) -> Directions:
+    """Moves every vertex along its own normal, by the blend of its nodes."""
+    scaled = sparse.csr_array(mesh.operator @ sparse.diags_array(amplitude_mm))
+    vertices = len(normals)
+    along = sparse.csr_array(
+        (normals.ravel(), np.repeat(np.arange(vertices), 3), np.arange(3 * vertices + 1)),
+        shape=(3 * vertices, vertices),
+    )
+    return Directions(sparse.csr_array(along @ scaled), 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """Holds a Gaussian over the field's nodes: its mean, and its precision's factor."""
+
+    mean: Float[np.ndarray, " u"]
+    factor: SuperLU
+    rows: sparse.csr_array  # of the observations, by the root of their information
+    field: SmoothField
+    directions: Directions
+
+    def draws(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "u c"]:
+        """Draws about the mean."""
+        d = self.directions.count
+        prior = self.field.draw(rng, count * d).reshape(-1, d, count).reshape(-1, count)
+        noise = rng.standard_normal((row_count(self.rows), count))
+        return self.factor.solve(prior + self.rows.T @ noise)
+
+
+def solve_field(field: SmoothField, directions: Directions, observed: Observed) -> Posterior:
+    """Returns the field's posterior.
+
+    Args:
+        field: the unit field's prior on the nodes.
+        directions: how the head follows the nodes.
+        observed: the observations, of the head without displacement.
+    """
+    rows = sparse.csr_array(_planes(observed, row_count(directions.matrix)) @ directions.matrix)
+    prior = sparse.kron(field.precision(), sparse.identity(directions.count), format="csr")
+    right = rows.T @ (np.sqrt(observed.information) * observed.offset_mm)
+    matrix = sparse.csc_array(prior + rows.T @ rows)
+    # Symmetric and definite: no pivoting, and an ordering of A + A^T: a third of the default's time.
+    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return Posterior(factor.solve(right), factor, rows, field, directions)
+
+
+def _planes(observed: Observed, coordinates: int) -> sparse.csr_array:
+    """sqrt(q) n . X of each observation, by the coordinates of all vertices."""
+    count = len(observed.corner)
+    value = np.sqrt(observed.information)[:, None, None] * observed.blend[:, :, None] * observed.normal[:, None, :]
+    column = 3 * observed.corner[:, :, None].astype(np.int64) + np.arange(3)
+    return sparse.csr_array((value.ravel(), column.ravel(), np.arange(0, 9 * count + 1, 9)), shape=(count, coordinates))

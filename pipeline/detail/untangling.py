@@ -1,0 +1,163 @@
+"""A head's mesh that no triangle spoils: none turned over, none folded onto its neighbour, none through another.
+
+Expressions, kernel modes and displacements move vertices one by one and know nothing of the surface: lips that are
+pressed together pass through each other, lids that close fold behind the brow, an ear sinks into the head. Each such
+spot becomes the membrane through what is about it (every vertex the mean of its neighbours): loops shrink to nothing,
+and of two sheets that went through each other each stays on its side, as their borders do. A spot that is not clean
+then takes more rings of triangles along; all other vertices stay where they are, so that the mesh is the nearest clean
+one but for the spots themselves, most of which lie in slits that nobody sees.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.linalg import splu
+
+from pipeline.fusion.crossings import crossing_faces
+from pipeline.fusion.net_kernels import component_of
+from pipeline.head_model.model import HeadModel
+from rig.mesh import Mesh, face_normals
+
+MAX_FOLD_DEG = 100.0  # between the normals of triangles that share an edge
+RINGS = (1, 1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 33, 41, 50)  # about a spot that was spoilt so many times; heads of random
+# shapes and expressions need 5 to 8 of them
+ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles cut off is a part of their loop or lens
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topology:
+    """Holds triangles, which of them share an edge, and which vertices do (1 in ``beside``)."""
+
+    faces: Int[np.ndarray, "f 3"]
+    pairs: Int[np.ndarray, "e 2"]
+    beside: sparse.csr_array  # (v, v)
+
+
+def topology_of(faces: Int[np.ndarray, "f 3"], count: int) -> Topology:
+    """Returns the topology of a mesh with ``count`` vertices."""
+    ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
+    key, owner = ends[:, 0] * count + ends[:, 1], np.repeat(np.arange(len(faces)), 3)
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(key[order][1:] == key[order][:-1])
+    low, high = np.divmod(np.unique(key), count)
+    columns = (np.concatenate([low, high]), np.concatenate([high, low]))
+    beside = sparse.csr_array((np.ones(2 * len(low)), columns), shape=(count, count))
+    return Topology(faces, np.stack([owner[order][same], owner[order][same + 1]], axis=1), beside)
+
+
+@lru_cache(maxsize=2)  # models are few, jobs are many
+def head_topology(model: HeadModel) -> Topology:
+    """Returns the topology of a model's full level."""
+    return topology_of(model.levels["full"].faces, model.levels["full"].count)
+
+
+def untangled_head(
+    model: HeadModel, vertices: Float[np.ndarray, "v 3"], deviation_mm: Float[np.ndarray, " v"]
+) -> tuple[Mesh, Float[np.ndarray, " v"]]:
+    """Returns the head without spoilt triangles, and its deviation with what that moved each vertex by.
+
+    Args:
+        model: the topology.
+        vertices: full level, mm.
+        deviation_mm: standard deviation of each.
+    """
+    clean = untangled(vertices, head_topology(model))
+    moved_mm = np.linalg.norm(clean - vertices, axis=1)
+    return Mesh(clean, model.levels["full"].faces), np.hypot(deviation_mm, moved_mm)
+
+
+def untangled(vertices: Float[np.ndarray, "v 3"], topology: Topology) -> Float[np.ndarray, "v 3"]:
+    """Returns the vertices with every spoilt spot made smooth; it is clean in single precision, as files hold it."""
+    out, faces = vertices.astype(np.float32, order="C").astype(float), topology.faces
+    times, touched = np.zeros(len(out), int), np.zeros(len(out), bool)
+    spoilt = spoilt_faces(out, topology)
+    while spoilt.any() and times.max() < len(RINGS):
+        times[np.unique(faces[spoilt])] += 1
+        spot = _with_enclosed(_with_rings(times, spoilt, faces), faces)
+        if spot.all():
+            break
+        rows = np.flatnonzero(spot)
+        out[rows] = _membrane(out, rows, topology).astype(np.float32)
+        touched |= spot
+        spoilt = spoilt_faces(out, topology, spot)
+    return np.where(touched[:, None], out, vertices)
+
+
+def spoilt_faces(
+    vertices: Float[np.ndarray, "v 3"], topology: Topology, within: Bool[np.ndarray, " v"] | None = None
+) -> Bool[np.ndarray, " f"]:
+    """Returns the triangles that are turned over, folded onto a neighbour or crossing another; only of those at the
+    vertices ``within``, and what crosses them, where given."""
+    active = None if within is None else _any_corner(within, topology.faces)
+    return turned_faces(vertices, topology, active) | crossing_faces(vertices, topology.faces, active)
+
+
+def turned_faces(
+    vertices: Float[np.ndarray, "v 3"], topology: Topology, active: Bool[np.ndarray, " f"] | None = None
+) -> Bool[np.ndarray, " f"]:
+    """Returns the triangles that look against the mean normal of their corners, and every two that share an edge and
+    are folded by more than ``MAX_FOLD_DEG``; only among the ``active`` and their neighbours, where given."""
+    faces, count = topology.faces, len(vertices)
+    near = np.ones(len(faces), bool) if active is None else _around(_around(active, faces, count), faces, count)
+    rows, pairs = np.flatnonzero(near), topology.pairs
+    triangle_normals = face_normals(vertices, faces[rows])
+    corners = faces[rows].ravel()
+    mean = np.stack([np.bincount(corners, np.repeat(triangle_normals[:, k], 3), count) for k in range(3)], axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    turned, unit = np.zeros(len(faces), bool), np.zeros((len(faces), 3))
+    a, b, c = faces[rows].T
+    turned[rows] = np.einsum("fk,fk->f", triangle_normals, mean[a] + mean[b] + mean[c]) <= 0.0
+    unit[rows] = (
+        triangle_normals
+        / np.maximum(np.sqrt(np.einsum("fk,fk->f", triangle_normals, triangle_normals)), 1e-12)[:, None]
+    )
+    pairs = pairs if active is None else pairs[near[pairs[:, 0]] & near[pairs[:, 1]]]
+    cosine = np.einsum("ek,ek->e", unit[pairs[:, 0]], unit[pairs[:, 1]])
+    turned[pairs[cosine < np.cos(np.radians(MAX_FOLD_DEG))]] = True
+    # At the border of what was looked at, means lack triangles.
+    return turned if active is None else turned & _around(active, faces, count)
+
+
+def _around(chosen: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"], count: int) -> Bool[np.ndarray, " f"]:
+    """The chosen triangles and those that share a corner with them."""
+    corner = np.zeros(count, bool)
+    corner[faces[chosen]] = True
+    return _any_corner(corner, faces)
+
+
+def _any_corner(vertex: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    return vertex[faces[:, 0]] | vertex[faces[:, 1]] | vertex[faces[:, 2]]  # a tenth of the time of ``any(axis=1)``
+
+
+def _with_rings(
+    times: Int[np.ndarray, " v"], spoilt: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"]
+) -> Bool[np.ndarray, " v"]:
+    """The corners of spoilt triangles with as many rings about each as the times that it was spoilt ask for."""
+    spot, reach = np.unique(faces[spoilt]), np.zeros(len(times), int)
+    reach[spot] = 1 + np.array(RINGS)[np.minimum(times[spot], len(RINGS)) - 1]
+    for _ in range(int(reach.max()) - 1):
+        part = faces[_any_corner(reach > 1, faces)]
+        np.maximum.at(reach, part.ravel(), np.repeat(reach[part].max(axis=1) - 1, 3))
+    return reach > 0
+
+
+def _with_enclosed(spot: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " v"]:
+    """The spot and the small pieces that it cuts off from the rest."""
+    piece = component_of(faces[~_any_corner(spot, faces)].astype(np.int32, copy=False), len(spot))
+    size = np.bincount(piece[~spot], minlength=len(spot))
+    return spot | (size[piece] < ENCLOSED_SHARE * len(spot))
+
+
+def _membrane(
+    vertices: Float[np.ndarray, "v 3"], rows: Int[np.ndarray, " r"], topology: Topology
+) -> Float[np.ndarray, "r 3"]:
+    """Places of ``rows`` at which each is the mean of its neighbours, the others held."""
+    beside, free = topology.beside[rows], np.zeros(len(vertices), bool)
+    free[rows] = True
+    count = np.asarray(beside.sum(axis=1)).ravel()
+    matrix = sparse.csc_array(sparse.diags_array(count) - beside[:, rows])
+    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return factor.solve(beside @ np.where(free[:, None], 0.0, vertices))

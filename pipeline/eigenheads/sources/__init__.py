@@ -1,1 +1,0 @@
-"""Where models come from: MakeHuman's population, other programs' files, downloads."""

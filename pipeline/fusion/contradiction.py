@@ -1,0 +1,59 @@
+"""Outlines that the depth of other views contradicts: a mask that leaves out what two of them see solid is wrong there.
+
+A surface lies inside every silhouette, hidden or not. Where points of two views fall outside a third one's, that one's
+outline says nothing any more, so that one bad mask cuts no hole through what the others know. Near an outline it is the
+depth that errs: matching windows make what is thin (frames of glasses, a collar's edge) wider by their own size, in
+every view alike.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.compute.threads import map_in_threads
+from pipeline.fusion.contradiction_kernels import BLOCK, mark_contradicted
+from pipeline.fusion.view_stack import ViewStack
+from pipeline.fusion.vote_kernels import OUTLINE
+
+MIN_VIEWS = 2  # that see something solid
+WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines
+SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
+
+
+def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
+    """Returns the views without the outlines that others contradict, and by view the share of its crop that was."""
+
+    def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
+        height, width = views.sizes[v]
+        blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
+        mark_contradicted(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
+        solid = np.bitwise_count(blocks) >= MIN_VIEWS
+        outline_px = views.pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
+        return _beyond_windows(solid, outline_px.reshape(height, width)) if solid.any() else None
+
+    wrong = map_in_threads(wrong_pixels, len(views.cameras))
+    shares = np.array([0.0 if mask is None else mask.mean() for mask in wrong])
+    if not shares.any():  # as usual: a hundred megabytes need no copy
+        return views, shares
+    pixels = views.pixels.copy()
+    for start, mask in zip(views.starts, wrong, strict=True):
+        if mask is not None:
+            pixels[start : start + mask.size, OUTLINE][mask.ravel()] = SILENT_PX
+    return ViewStack(views.cameras, views.sizes, views.starts, pixels), shares
+
+
+def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels in and next to solid blocks, of those connected ones that reach farther beyond the outline than windows
+    make anything wider."""
+    height, width = outline_px.shape
+    count, found = cv2.connectedComponents(cv2.dilate(solid.view(np.uint8), np.ones((3, 3), np.uint8)))
+    labels = np.asarray(found, np.int32)
+    middle = BLOCK // 2
+    rows, columns = (
+        np.minimum(middle + BLOCK * np.arange(n), size - 1)
+        for n, size in zip(solid.shape, (height, width), strict=True)
+    )
+    part, farthest = np.asarray(labels, np.int32), np.zeros(count)
+    np.maximum.at(farthest, part, np.where(solid, outline_px[np.ix_(rows, columns)], 0.0))
+    wrong = farthest[part] > WIDENED_PX
+    return np.kron(wrong, np.ones((BLOCK, BLOCK), bool))[:height, :width]

@@ -1,0 +1,46 @@
+"""The compiled loop that finds what other views see outside of a view's outline."""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.fusion.vote_kernels import CENTRE, DEPTH, FRAME, OUTLINE, SIGMA, nearest_pixel, seen_at
+from pipeline.geometry.projection_kernels import LENS, NEAREST_MM
+
+BLOCK = 4  # pixels along the side of what is decided at once
+STRIDE = 3  # every third pixel of every third row stands for the others
+CLEAR_PX = 2.5  # a point nearer to the outline is ordinary: blur, hair, calibration
+SURE_MM = 1.0  # points with a larger deviation do not count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mark_contradicted(
+    target: int,
+    cameras: np.ndarray,
+    sizes: np.ndarray,
+    starts: np.ndarray,
+    pixels: np.ndarray,
+    blocks: np.ndarray,
+    width: int,
+) -> None:
+    """Sets the bit of each view that has a sure point in a block outside of the target's outline."""
+    place = np.empty(3)
+    for v in range(len(cameras)):
+        if v == target:
+            continue
+        p, bit = cameras[v], np.uint64(1) << np.uint64(v % 64)
+        for row in range(0, sizes[v, 0], STRIDE):
+            for column in range(0, sizes[v, 1], STRIDE):
+                at = starts[v] + row * sizes[v, 1] + column
+                if not pixels[at, SIGMA] < SURE_MM:
+                    continue
+                depth = pixels[at, DEPTH]
+                x, y = (column - p[LENS + 2]) / p[LENS] * depth, (row - p[LENS + 3]) / p[LENS + 1] * depth
+                for axis in range(3):  # the rotation's inverse, from the camera's centre
+                    place[axis] = p[axis] * x + p[3 + axis] * y + p[6 + axis] * depth + p[CENTRE + axis]
+                ahead, at_column, at_row = seen_at(cameras[target], place)
+                if ahead <= NEAREST_MM:
+                    continue
+                near, beyond = nearest_pixel(at_column, at_row, sizes[target])
+                there = starts[target] + near
+                if beyond == 0.0 and pixels[there, FRAME] < 0.0 and pixels[there, OUTLINE] > CLEAR_PX:
+                    blocks[near // width // BLOCK, near % width // BLOCK] |= bit

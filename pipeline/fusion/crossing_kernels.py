@@ -1,0 +1,113 @@
+"""Triangles of a mesh that cross each other (compiled).
+
+Triangles are sorted into cubic cells by the middles of their boxes; a cell is as wide as the widest box, so that those
+which meet lie in neighbouring cells. Two cross if an edge of one goes through the other (strictly: touching is no
+crossing).
+"""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.geometry.cell_kernels import COLUMNS, columns_about
+
+
+@njit(cache=True, nogil=True)
+def triangle_boxes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Lowest and highest corner of the box about each triangle, (f, 6)."""
+    boxes = np.empty((len(faces), 6))
+    for f in range(len(faces)):
+        for axis in range(3):
+            a, b, c = vertices[faces[f, 0], axis], vertices[faces[f, 1], axis], vertices[faces[f, 2], axis]
+            boxes[f, axis], boxes[f, 3 + axis] = min(min(a, b), c), max(max(a, b), c)
+    return boxes
+
+
+@njit(cache=True, nogil=True)
+def crossing_triangles(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    boxes: np.ndarray,
+    order: np.ndarray,
+    keys: np.ndarray,
+    spans: np.ndarray,
+    active: np.ndarray,
+    crossing: np.ndarray,
+    first: int,
+    last: int,
+) -> None:
+    """Marks triangles that cross another, for pairs of which one is ``active`` and stands from ``first`` to ``last`` in
+    the order; threads that mark one triangle write the same.
+
+    ``order`` sorts the triangles by ``keys`` (given sorted): the rank of their cell in a box of ``spans`` cells, whose
+    outermost cells are empty.
+    """
+    ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
+    for position in range(first, last):
+        f = order[position]
+        if not active[f]:
+            continue
+        if keys[position] != cell:
+            cell = keys[position]
+            columns_about(cell, keys, spans, ranges)
+        for column in range(COLUMNS):
+            for at in range(ranges[column, 0], ranges[column, 1]):
+                g = order[at]
+                if at <= position and active[g]:  # the pair is looked at from the other side
+                    continue
+                if not _boxes_meet(boxes, position, at):
+                    continue
+                if _cross(vertices, faces[f], faces[g]):
+                    crossing[f] = crossing[g] = True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _boxes_meet(boxes: np.ndarray, f: int, g: int) -> bool:
+    apart = False
+    for axis in range(3):
+        apart |= boxes[f, axis] > boxes[g, 3 + axis] or boxes[g, axis] > boxes[f, 3 + axis]
+    return not apart
+
+
+@njit(cache=True, nogil=True)
+def _cross(vertices: np.ndarray, f: np.ndarray, g: np.ndarray) -> bool:
+    shared = 0
+    for a in range(3):
+        for b in range(3):
+            shared += f[a] == g[b]
+    if shared >= 2:  # neighbours over an edge
+        return False
+    if _beside(vertices, f, g) or _beside(vertices, g, f):  # most pairs whose boxes meet
+        return False
+    for k in range(3):
+        if _pierces(vertices, f[k], f[(k + 1) % 3], g) or _pierces(vertices, g[k], g[(k + 1) % 3], f):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _beside(vertices: np.ndarray, f: np.ndarray, g: np.ndarray) -> bool:
+    """Whether all of ``g`` lies on one side of the plane of ``f``, touching it at most."""
+    one = _side(vertices, f[0], f[1], f[2], g[0])
+    two = _side(vertices, f[0], f[1], f[2], g[1])
+    three = _side(vertices, f[0], f[1], f[2], g[2])
+    return (one >= 0 and two >= 0 and three >= 0) or (one <= 0 and two <= 0 and three <= 0)
+
+
+@njit(cache=True, nogil=True)
+def _pierces(vertices: np.ndarray, p: int, q: int, face: np.ndarray) -> bool:
+    a, b, c = face[0], face[1], face[2]
+    if p in (a, b, c) or q in (a, b, c):  # an edge that ends in a corner does not go through the face
+        return False
+    if _side(vertices, a, b, c, p) * _side(vertices, a, b, c, q) >= 0:
+        return False
+    one, two, three = _side(vertices, p, q, a, b), _side(vertices, p, q, b, c), _side(vertices, p, q, c, a)
+    return (one > 0 and two > 0 and three > 0) or (one < 0 and two < 0 and three < 0)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _side(v: np.ndarray, a: int, b: int, c: int, d: int) -> float:
+    """Six times the signed volume of a tetrahedron."""
+    bx, by, bz = v[b, 0] - v[a, 0], v[b, 1] - v[a, 1], v[b, 2] - v[a, 2]
+    cx, cy, cz = v[c, 0] - v[a, 0], v[c, 1] - v[a, 1], v[c, 2] - v[a, 2]
+    dx, dy, dz = v[d, 0] - v[a, 0], v[d, 1] - v[a, 1], v[d, 2] - v[a, 2]
+    return bx * (cy * dz - cz * dy) + by * (cz * dx - cx * dz) + bz * (cx * dy - cy * dx)

@@ -1,0 +1,107 @@
+"""A mesh that does not cross itself: vertices go back, where it does, towards places where it cannot."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from pipeline.compute.threads import in_threads
+from pipeline.fusion.crossing_kernels import crossing_triangles, triangle_boxes
+from pipeline.fusion.grid_kernels import grown
+from pipeline.geometry.cells import sorted_into_cells
+from rig.mesh import Mesh
+
+MAX_ROUNDS = 40
+APART_SHARE = 0.05  # of the way to the middle of a vertex's neighbours: some 0.03 mm
+SIZES = 4  # classes of triangles, each half as wide as the last
+HALVINGS = 6  # rounds in which vertices go half their way; later ones go all of it, and take their neighbours along
+
+
+def crossing_faces(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], active: Bool[np.ndarray, " f"] | None = None
+) -> Bool[np.ndarray, " f"]:
+    """Returns triangles that cross another one, among pairs of which one is ``active`` (all of them, if None)."""
+    faces = faces.astype(np.int32)  # a copy: a model's own are read-only, which is another type
+    if active is None:
+        return _crossing_by_size(vertices, faces)
+    boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
+    near = np.flatnonzero(_near(boxes, active))
+    crossing[near] = _crossing(vertices, faces[near], boxes[near], active[near])
+    return crossing
+
+
+def _crossing_by_size(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    """All triangles that cross another one: cells as wide as the neck's triangles hold too many of the face's, so that
+    each size is compared with itself and with what is smaller, in cells of its own."""
+    boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
+    wide = (boxes[:, 3:] - boxes[:, :3]).max(axis=1)
+    widest = float(wide.max(initial=0.0))
+    for size in range(SIZES):
+        rows = np.flatnonzero(wide <= widest / 2.0**size)
+        same_size = wide[rows] > (widest / 2.0 ** (size + 1) if size < SIZES - 1 else -1.0)
+        if same_size.any():
+            crossing[rows] |= _crossing(vertices, faces[rows], boxes[rows], same_size)
+    return crossing
+
+
+def _crossing(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    boxes: Float[np.ndarray, "f 6"],
+    active: Bool[np.ndarray, " f"],
+) -> Bool[np.ndarray, " f"]:
+    low, high = boxes[:, :3], boxes[:, 3:]
+    cells = sorted_into_cells(0.5 * (low + high), max(float((high - low).max(initial=0.0)), 1e-9))
+    crossing = np.zeros(len(faces), bool)
+    sorted_boxes, (order, keys, spans) = boxes[cells.order], cells
+
+    def mark(first: int, last: int) -> None:
+        crossing_triangles(vertices, faces, sorted_boxes, order, keys, spans, active, crossing, first, last)
+
+    in_threads(len(faces), mark)
+    return crossing
+
+
+def _near(boxes: Float[np.ndarray, "f 6"], active: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Triangles in or beside the cells that active ones lie in."""
+    middle = 0.5 * (boxes[:, :3] + boxes[:, 3:])
+    wide = max(float((boxes[:, 3:] - boxes[:, :3]).max(initial=0.0)), 1e-9)
+    cell = ((middle - middle.min(axis=0, initial=np.inf)) / wide).astype(np.int64) + 1
+    taken = np.zeros(cell.max(axis=0, initial=0) + 2, bool)
+    taken[tuple(cell[active].T)] = True
+    return grown(taken)[tuple(cell.T)]
+
+
+def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh, int]:
+    """Returns the mesh without self-intersections, and how many of its vertices moved; with all vertices in their
+    ``safe`` places it has none."""
+    vertices, faces = mesh.vertices.copy(), mesh.faces
+    moved = np.zeros(len(vertices), bool)
+    active: Bool[np.ndarray, " f"] | None = None
+    for done in range(MAX_ROUNDS):
+        crossing = crossing_faces(vertices, faces, active)
+        if not crossing.any():
+            break
+        back = np.zeros(len(vertices), bool)
+        back[faces[crossing]] = True
+        for _ in range(max(0, done - HALVINGS + 1)):
+            back[faces[back[faces].any(axis=1)]] = True
+        share = 0.5 if done < HALVINGS else 0.0
+        vertices[back] = safe[back] + share * (vertices[back] - safe[back])
+        moved |= back
+        active = np.asarray(back[faces].any(axis=1))
+    return Mesh(vertices, faces), int(moved.sum())
+
+
+def without_coincidences(mesh: Mesh) -> Mesh:
+    """Moves vertices that lie at one place, to the precision of a file, towards their own neighbours: a program that
+    merges vertices by place would join sheets there, and find the surface open."""
+    stored = mesh.vertices.astype(np.float32)
+    _, same, count = np.unique(stored, axis=0, return_inverse=True, return_counts=True)
+    rows = np.flatnonzero(count[same.ravel()] > 1)
+    if not len(rows):
+        return mesh
+    vertices = mesh.vertices.copy()
+    corners = mesh.faces[np.isin(mesh.faces, rows).any(axis=1)]
+    for row in rows:
+        beside = np.setdiff1d(corners[(corners == row).any(axis=1)], row)
+        vertices[row] += APART_SHARE * (mesh.vertices[beside].mean(axis=0) - mesh.vertices[row])
+    return Mesh(vertices, mesh.faces, mesh.colours)

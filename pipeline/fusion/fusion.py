@@ -1,0 +1,145 @@
+"""All that the cameras see, as one closed surface.
+
+Enters: depth maps, silhouettes and the fitted head. Leaves: a two-manifold mesh with a standard deviation and a part
+for each vertex. A signed distance is found on a grid (``signed_distance``), its zero level made a mesh
+(``pipeline.geometry.surface_nets``), the vertices are drawn to the depth maps themselves (``refinement``) and taken
+back where the mesh would cross itself (``crossings``).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.fusion.contradiction import silence_contradicted
+from pipeline.fusion.crossings import without_coincidences, without_crossings
+from pipeline.fusion.net_kernels import component_of, compose_well
+from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
+from pipeline.fusion.refinement import refine_vertices
+from pipeline.fusion.signed_distance import Level, NoSurface, solve
+from pipeline.fusion.skin import drawn_to_skin
+from pipeline.fusion.view_stack import stack_views
+from pipeline.geometry.surface_nets import surface_net
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.part_labels.codes import Part
+from pipeline.part_labels.votes import PartVotes, part_codes, part_shares
+from pipeline.settings import BustSettings
+from pipeline.stereo.depth_map import DepthMap
+from pipeline.stereo.window_bias import WindowBias, without_bias
+from pipeline.warnings import ReportWarning
+from rig.mesh import Mesh, face_normals
+from rig.messages.message import compose
+from rig.progress import Progress
+from rig.rig import Rig
+
+TURNED_TO = 0.01  # steps from the surface at which a node that is turned over lies
+MIN_VIEWS = 3
+HEAD_STRIDE = 7  # every seventh vertex of the fitted head says which piece is the subject
+CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and others see solid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BustSurface:
+    """Holds the whole visible surface: closed, two-manifold, wound outwards, one piece, without self-intersections."""
+
+    mesh_world: Mesh
+    deviation_mm: Float[np.ndarray, " v"]  # standard deviation along the normal
+    part: UInt8[np.ndarray, " v"]  # codes of ``Part``
+    views: UInt8[np.ndarray, " v"]  # whose depth agrees with the place
+    warnings: tuple[ReportWarning, ...] = ()
+
+    @property
+    def seen(self) -> Bool[np.ndarray, " v"]:
+        """Returns vertices that some photograph measures."""
+        return self.views > 0
+
+
+def fuse(
+    depth_maps: Sequence[DepthMap],
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    head_world: Mesh | None,
+    *,
+    votes: PartVotes | None,
+    bias: WindowBias,
+    settings: BustSettings,
+    head_skin_world: Mesh | None = None,
+    report: Progress,
+) -> BustSurface:
+    """Returns the closed surface that the views agree on.
+
+    Args:
+        depth_maps: one a view; those that know nothing are left out.
+        silhouettes: by camera, at least of the depth maps' cameras.
+        rig: the cameras as calibrated, world frame.
+        head_world: the fitted head, closed but for its neck (mm); None where there is none.
+        votes: what the places show; without them all that is seen counts as skin.
+        bias: what the depth maps' windows err.
+        settings: spacing of the vertices.
+        head_skin_world: what of the fitted head the photographs measured, where they did; seen skin agrees with it.
+        report: called with the stage's progress.
+
+    Raises:
+        NoSurface: fewer than three views know any depth, or they contradict each other.
+    """
+    maps = [depth_map for depth_map in depth_maps if depth_map.known.any()]
+    if len(maps) < MIN_VIEWS:
+        raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
+    views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
+    report("bust", 0.1)
+    level = solve(maps, views, head_world, settings.spacing_mm)
+    report("bust", 0.6)
+    net, safe = closed_net(level, head_world)
+    mesh, measured = refine_vertices(net, views, settings.spacing_mm)
+    measured = without_islands(mesh, measured)
+    seen = measured.views > 0
+    mesh = without_bias(mesh, seen, bias)
+    if head_skin_world is not None:
+        skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, Part.SKIN.channel]
+        mesh = drawn_to_skin(mesh, seen * skin, head_skin_world, seen_deviation_mm(measured))
+    mesh, _ = without_crossings(mesh, safe)
+    mesh = without_coincidences(mesh)
+    report("bust", 0.9)
+    shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
+    part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
+    names = [depth_map.camera.name for depth_map in maps]
+    warnings = tuple(_mask_warnings(names, contradicted))
+    return BustSurface(mesh, deviation_mm(mesh, measured), part, measured.views, warnings)
+
+
+def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -> Iterator[ReportWarning]:
+    for name, share in zip(names, contradicted, strict=True):
+        if share > CONTRADICTED_WARNED:
+            yield compose("mask-contradicted", camera=name, share=share)
+
+
+def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
+    """Returns the subject's piece of the zero level, and places of its vertices at which it cannot cross itself: the
+    corners of the cubes about the inner nodes."""
+    grid, field = level.grid, level.field.copy()
+    compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
+    net = surface_net(field, grid.index, grid.neighbours)
+    vertices, faces, cells = net.vertices, net.faces, np.flatnonzero(net.of_cell >= 0)
+    head = None if head_world is None else (head_world.vertices - grid.corner) / grid.step_mm
+    kept = _subject(vertices, faces, head)
+    used, corners = np.unique(faces[kept], return_inverse=True)
+    placed = grid.corner + grid.step_mm * vertices[used]
+    safe = grid.corner + grid.step_mm * (grid.index[cells[used]] + 0.5)
+    return Mesh(placed, corners.reshape(-1, 3).astype(np.int32)), safe
+
+
+def _subject(
+    vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, head: Float[np.ndarray, "h 3"] | None
+) -> Bool[np.ndarray, " f"]:
+    """Faces of the piece that lies at most of the fitted head's vertices: who stands behind may be larger. Without a
+    head, of the piece that holds the greatest volume; cavities hold a negative one."""
+    piece = component_of(faces, len(vertices))
+    towards = vertices[faces[:, 0]] - vertices.mean(axis=0)
+    volume = np.bincount(piece[faces[:, 0]], (face_normals(vertices, faces) * towards).sum(axis=1))
+    if head is None or (volume > 0).sum() < 2:
+        return piece[faces[:, 0]] == np.argmax(volume)
+    solid = np.flatnonzero(volume[piece] > 0)
+    nearest = KDTree(vertices[solid]).query(head[::HEAD_STRIDE])[1]
+    return piece[faces[:, 0]] == np.bincount(piece[solid[nearest]]).argmax()

@@ -1,0 +1,65 @@
+"""A sparse grid of nodes about a surface, refined by halves from a coarse box that holds everything.
+
+Nodes are kept in the order of their keys ``(i * ny + j) * nz + k``, so that a neighbour at a fixed step in the key is
+found by walking two lists at once: no hash table and no index volume, whatever the spacing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32
+
+from pipeline.fusion import grid_kernels as kernels
+from pipeline.geometry.surface_nets import link_nodes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """Holds nodes at ``corner + step_mm * index``, world frame. ``neighbours`` are rows towards -x +x -y +y -z +z, -1
+    where there is none; ``outer`` nodes lack one of their 26 neighbours."""
+
+    corner: Float[np.ndarray, " 3"]
+    step_mm: float
+    shape: tuple[int, int, int]
+    index: Int32[np.ndarray, "n 3"]
+    neighbours: Int32[np.ndarray, "n 6"]
+    outer: Bool[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def whole_box(corner: Float[np.ndarray, " 3"], edges_mm: Float[np.ndarray, " 3"], step_mm: float) -> Grid:
+    """Returns every node of a box."""
+    shape = tuple(int(n) for n in np.ceil(edges_mm / step_mm).astype(int) + 1)
+    index = np.stack(np.meshgrid(*(np.arange(n, dtype=np.int32) for n in shape), indexing="ij"), axis=-1)
+    return _linked(corner, step_mm, (shape[0], shape[1], shape[2]), index.reshape(-1, 3))
+
+
+def refined(coarse: Grid, wanted: Bool[np.ndarray, "nx ny nz"]) -> Grid:
+    """Returns nodes of half the step: eight for every wanted node of the coarse grid's box, itself the lowest of
+    them."""
+    nx, ny, nz = coarse.shape
+    shape = (2 * nx - 1, 2 * ny - 1, 2 * nz - 1)
+    return _linked(coarse.corner, coarse.step_mm / 2, shape, kernels.halved(wanted))
+
+
+def everywhere(grid: Grid, values: Float32[np.ndarray, " n"], box: Float32[np.ndarray, "_ _ _"]) -> np.ndarray:
+    """Returns a volume over the grid's whole box: its nodes' values, beyond them those of the coarser ``box``."""
+    fine = kernels.doubled(box)
+    fine[tuple(grid.index.T)] = values
+    return fine
+
+
+def marked_box(grid: Grid, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "nx ny nz"]:
+    """Returns the chosen nodes as a volume over the whole box."""
+    box = np.zeros(grid.shape, bool)
+    box[tuple(grid.index[chosen].T)] = True
+    return box
+
+
+def _linked(
+    corner: Float[np.ndarray, " 3"], step_mm: float, shape: tuple[int, int, int], index: Int32[np.ndarray, "n 3"]
+) -> Grid:
+    neighbours = link_nodes(index, shape)
+    return Grid(corner, step_mm, shape, index, neighbours, kernels.outermost(neighbours))

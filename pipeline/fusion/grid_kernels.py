@@ -1,0 +1,112 @@
+"""Compiled loops of ``pipeline.fusion.grid``."""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.geometry.surface_nets_kernels import corners_of
+
+
+@njit(cache=True, nogil=True)
+def halved(wanted: np.ndarray) -> np.ndarray:
+    """Indices (n, 3) int32, in the order of their keys, of the nodes of half the step that the wanted nodes open."""
+    nx, ny, nz = wanted.shape
+    count = 0
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                if wanted[i, j, k]:
+                    count += (2 if i < nx - 1 else 1) * (2 if j < ny - 1 else 1) * (2 if k < nz - 1 else 1)
+    index = np.empty((count, 3), np.int32)
+    made = 0
+    for i in range(2 * nx - 1):
+        for j in range(2 * ny - 1):
+            for k in range(nz):
+                if not wanted[i // 2, j // 2, k]:
+                    continue
+                for half in range(2 if k < nz - 1 else 1):
+                    index[made, 0], index[made, 1], index[made, 2] = i, j, 2 * k + half
+                    made += 1
+    return index
+
+
+@njit(cache=True, nogil=True)
+def outermost(neighbours: np.ndarray) -> np.ndarray:
+    """Nodes that lack one of their 26 neighbours."""
+    count = len(neighbours)
+    full = np.ones(count, np.bool_)
+    for axis in range(3):  # a node has all 3^d neighbours of d axes if it and both next to it have those of d - 1
+        before = full.copy()
+        for n in range(count):
+            low, high = neighbours[n, 2 * axis], neighbours[n, 2 * axis + 1]
+            full[n] = before[n] and low >= 0 and high >= 0 and before[low] and before[high]
+    return ~full
+
+
+@njit(cache=True, nogil=True)
+def interpolated(box: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Values of a coarse box at nodes of half its step: the mean of the two, four or eight around, or the same."""
+    out = np.empty(len(index), np.float32)
+    for n in range(len(index)):
+        i, j, k = index[n, 0], index[n, 1], index[n, 2]
+        total = 0.0
+        for a in (i // 2, (i + 1) // 2):
+            for b in (j // 2, (j + 1) // 2):
+                for c in (k // 2, (k + 1) // 2):
+                    total += box[a, b, c]
+        out[n] = total / 8
+    return out
+
+
+@njit(cache=True, nogil=True)
+def doubled(box: np.ndarray) -> np.ndarray:
+    """A volume at half its step, linear between its nodes."""
+    nx, ny, nz = box.shape
+    out = np.empty((2 * nx - 1, 2 * ny - 1, 2 * nz - 1), np.float32)
+    for i in range(2 * nx - 1):
+        a, b = i // 2, (i + 1) // 2
+        for j in range(2 * ny - 1):
+            c, d = j // 2, (j + 1) // 2
+            for k in range(nz):
+                here = 0.25 * (box[a, c, k] + box[a, d, k] + box[b, c, k] + box[b, d, k])
+                out[i, j, 2 * k] = here
+                if k > 0:
+                    out[i, j, 2 * k - 1] = 0.5 * (out[i, j, 2 * k - 2] + here)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def grown(marked: np.ndarray) -> np.ndarray:
+    """The marked nodes of a volume and their 26 neighbours."""
+    nx, ny, nz = marked.shape
+    out = marked.copy()
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                if marked[i, j, k]:
+                    out[max(0, i - 1) : i + 2, max(0, j - 1) : j + 2, max(0, k - 1) : k + 2] = True
+    return out
+
+
+@njit(cache=True, nogil=True)
+def crossed(values: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+    """Lowest nodes of the cells that have corners of both signs."""
+    out = np.zeros(len(values), np.bool_)
+    corners = np.empty(8, np.int64)
+    for n in range(len(values)):
+        if corners_of(n, neighbours, corners):
+            inside = 0
+            for c in range(8):
+                inside += values[corners[c]] < 0
+            out[n] = 0 < inside < 8
+    return out
+
+
+@njit(cache=True, nogil=True)
+def crossed_at_rim(values: np.ndarray, neighbours: np.ndarray, outer: np.ndarray) -> bool:
+    """Whether the sign changes between two outer nodes: the surface leaves the grid there."""
+    for n in range(len(values)):
+        for axis in range(3):
+            other = neighbours[n, 2 * axis + 1]
+            if other >= 0 and outer[n] and outer[other] and (values[n] < 0) != (values[other] < 0):
+                return True
+    return False

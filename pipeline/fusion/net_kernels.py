@@ -1,0 +1,88 @@
+"""Signs of a sparse grid's nodes whose surface net is a two-manifold, and its connected pieces (compiled).
+
+A net (``pipeline.geometry.surface_nets``) is a manifold exactly if the set of inside nodes is well composed (Latecki,
+*3D well-composed pictures*, 1997): no square of four nodes has its diagonals of opposite kind, and no cell has two
+opposite corners alone of one kind. Nodes are turned over until that holds.
+"""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.geometry.surface_nets_kernels import corners_of
+
+SQUARES = np.array(
+    [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]], np.int64
+)  # around each face of a cell
+ROUNDS = 12  # in which the node nearest to the surface is turned over; later ones only fill, which comes to an end
+
+
+@njit(cache=True, nogil=True)
+def compose_well(field: np.ndarray, neighbours: np.ndarray, outer: np.ndarray, least: float) -> int:
+    """Turns nodes of ``field`` over (to +-``least``) until the inside is well composed; returns how many. ``outer``
+    nodes stay: the surface would lie in cells that the grid does not have."""
+    corners = np.empty(8, np.int64)
+    turned, changes, rounds = 0, 1, 0
+    while changes:
+        changes = 0
+        for n in range(len(field)):
+            if not corners_of(n, neighbours, corners):
+                continue
+            inside = 0
+            for c in range(8):
+                inside += field[corners[c]] < 0
+            if inside < 2 or inside > 6:
+                continue
+            node = _culprit(field, outer, corners, inside, rounds >= ROUNDS)
+            if node >= 0:
+                field[node] = least if field[node] < 0 else -least
+                changes += 1
+        turned += changes
+        rounds += 1
+    return turned
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _culprit(field, outer, corners, inside, fill):
+    """The node to turn over in a cell that is not well composed, or -1: the one nearest to the surface."""
+    worst, least = -1, np.inf
+    for s in range(6):
+        a, b = field[corners[SQUARES[s, 0]]] < 0, field[corners[SQUARES[s, 1]]] < 0
+        c, d = field[corners[SQUARES[s, 2]]] < 0, field[corners[SQUARES[s, 3]]] < 0
+        if a == c and b == d and a != b:
+            for k in range(4):
+                node = corners[SQUARES[s, k]]
+                if abs(field[node]) < least and not outer[node] and not (fill and field[node] < 0):
+                    worst, least = node, abs(field[node])
+    if worst >= 0 or (inside != 2 and inside != 6):
+        return worst
+    for c in range(4):
+        alone = field[corners[c]] < 0
+        if (field[corners[7 - c]] < 0) == alone and alone == (inside == 2):
+            for k in range(8):
+                node = corners[k]
+                if abs(field[node]) < least and not outer[node] and not (fill and field[node] < 0):
+                    worst, least = node, abs(field[node])
+    return worst
+
+
+@njit(cache=True, nogil=True)
+def component_of(faces: np.ndarray, count: int) -> np.ndarray:
+    """The lowest vertex of the connected piece that each vertex belongs to."""
+    root = np.arange(count).astype(np.int32)
+    for f in range(len(faces)):
+        for k in range(2):
+            a, b = faces[f, k], faces[f, k + 1]
+            while root[a] != a:
+                root[a] = root[root[a]]
+                a = root[a]
+            while root[b] != b:
+                root[b] = root[root[b]]
+                b = root[b]
+            if a < b:
+                root[b] = a
+            else:
+                root[a] = b
+    for v in range(count):
+        while root[v] != root[root[v]]:
+            root[v] = root[root[v]]
+    return root

@@ -1,0 +1,115 @@
+"""How far the vertices of a surface are from what the views see there (compiled)."""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.fusion.vote_kernels import (
+    DEPTH,
+    FLATTEST,
+    MAX_VIEWS,
+    NORMAL,
+    SIGMA,
+    UNKNOWN_MM,
+    Pixels,
+    agreed,
+    cosine,
+    nearest_pixel,
+    seen_at,
+)
+from pipeline.geometry.projection_kernels import NEAREST_MM
+from pipeline.imaging.sampling_kernels import bilinear
+
+TURNED = 0.4  # cosine between the normals of a vertex and of a pixel below which the pixel shows another surface
+STEP_MM = 4.0  # four pixels that differ by more in depth show two surfaces
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def measure(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    seen: Pixels,
+    limits: np.ndarray,
+    offset: np.ndarray,
+    information: np.ndarray,
+    scatter: np.ndarray,
+    views: np.ndarray,
+    first: int,
+    last: int,
+) -> None:
+    """Fills, a vertex: ``offset`` (mm along the normal) to the surface seen, its ``information`` (1/mm2, views taken as
+    independent), ``scatter`` (weighted mean square of the views about it, mm2) and the number of ``views``.
+
+    ``limits``: distance (mm) beyond which a view shows another surface, agreement (mm) and floor of a deviation (mm).
+    """
+    cameras, sizes, starts, pixels = seen
+    gate, agreement, floor = limits
+    votes, weights = np.empty(MAX_VIEWS), np.empty(MAX_VIEWS)
+    for n in range(first, last):
+        place, count = vertices[n], 0
+        for v in range(len(cameras)):
+            depth, column, row = seen_at(cameras[v], place)
+            if depth <= NEAREST_MM:
+                continue
+            near, beyond = nearest_pixel(column, row, sizes[v])
+            near += starts[v]
+            sigma = pixels[near, SIGMA]
+            if beyond > 0.0 or not sigma < UNKNOWN_MM:
+                continue
+            turn = 0.0
+            for axis in range(3):
+                turn += pixels[near, NORMAL + axis] * normals[n, axis]
+            facing = cosine(cameras[v], place, depth, pixels[near])
+            if turn < TURNED or facing < FLATTEST:
+                continue
+            behind = (depth - depth_between(pixels, starts[v], sizes[v], column, row, near)) * facing
+            if abs(behind) > gate:
+                continue
+            votes[count] = behind
+            weights[count] = min(1.0, 2.0 * facing) / (sigma * sigma * facing * facing + floor * floor)
+            count += 1
+        mean, _ = agreed(votes, weights, count, agreement)
+        total, squares, agreeing = 0.0, 0.0, 0
+        for a in range(count):
+            if abs(votes[a] - mean) <= agreement:
+                total += weights[a]
+                squares += weights[a] * (votes[a] - mean) ** 2
+                agreeing += 1
+        offset[n], information[n], views[n] = mean, total, agreeing
+        scatter[n] = squares / total if agreeing else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def depth_between(pixels: np.ndarray, start: int, size: np.ndarray, column: float, row: float, near: int) -> float:
+    """Depth between four pixels where they know one surface, else that of the nearest."""
+    c, r = min(int(column), size[1] - 2), min(int(row), size[0] - 2)
+    a = start + r * size[1] + c
+    b, d, e = a + 1, a + size[1], a + size[1] + 1
+    sigma = max(max(pixels[a, SIGMA], pixels[b, SIGMA]), max(pixels[d, SIGMA], pixels[e, SIGMA]))
+    low = min(min(pixels[a, DEPTH], pixels[b, DEPTH]), min(pixels[d, DEPTH], pixels[e, DEPTH]))
+    high = max(max(pixels[a, DEPTH], pixels[b, DEPTH]), max(pixels[d, DEPTH], pixels[e, DEPTH]))
+    if not sigma < UNKNOWN_MM or high - low > STEP_MM:
+        return pixels[near, DEPTH]
+    return bilinear(pixels[a, DEPTH], pixels[b, DEPTH], pixels[d, DEPTH], pixels[e, DEPTH], column - c, row - r)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def smooth_offsets(
+    offset: np.ndarray,
+    information: np.ndarray,
+    starts: np.ndarray,
+    indices: np.ndarray,
+    stiffness: float,
+    sweeps: int,
+) -> np.ndarray:
+    """Offsets that differ little between neighbours: Gauss-Seidel on ``sum information (d - offset)^2 + stiffness sum
+    over edges (d - d')^2``."""
+    out = offset.copy()
+    for _ in range(sweeps):
+        for v in range(len(out)):
+            total, weight = information[v] * offset[v], information[v]
+            for k in range(starts[v], starts[v + 1]):
+                total += stiffness * out[indices[k]]
+                weight += stiffness
+            if weight > 0:
+                out[v] = total / weight
+    return out

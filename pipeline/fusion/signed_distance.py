@@ -1,0 +1,184 @@
+"""The signed distance to all that the cameras see, on a sparse grid: depth, silhouettes and the fitted head together.
+
+It is sought from a coarse box that holds the subject down to the spacing asked for. Every view votes at every node
+(``vote_kernels``): the distance to the surface that it sees there, free space before that surface, nothing behind it.
+Silhouettes bound the body from outside. Between votes a membrane fills in (``relaxation_kernels``), drawn to the fitted
+head with its hair, or to the visual hull, where nobody looks. The coarsest level decides what is inside; each finer one
+is solved about the surface of the one before.
+
+Volumetric fusion with free space: Curless and Levoy, *A volumetric method for building complex models from range
+images*, SIGGRAPH 1996. Departures: votes are robust (a median, and what agrees with it), silhouettes are inequalities,
+and holes are filled by the membrane.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from pipeline.compute.threads import in_threads
+from pipeline.fusion import grid_kernels
+from pipeline.fusion.grid import Grid, everywhere, marked_box, refined, whole_box
+from pipeline.fusion.prior import distance_to_head
+from pipeline.fusion.relaxation_kernels import Membrane, relax
+from pipeline.fusion.view_stack import ViewStack
+from pipeline.fusion.vote_kernels import vote
+from pipeline.stereo.depth_map import DepthMap, points_world
+from rig.errors import EigenheadError
+from rig.mesh import Mesh
+from rig.messages.message import compose
+
+Field = Float32[np.ndarray, " n"]
+Points = Float[np.ndarray, "m 3"]
+
+COARSEST_MM = 5.0  # the first level's step is at least this: the whole box then has half a million nodes
+# Steps before and behind a surface within which its distance counts. Distances outside are cut off so short because the
+# inside of a shoulder is no thicker: a membrane between +3 and -1 step moves its surface inwards, or away.
+REACH, BEHIND = 1.5, 2.5
+AGREEMENT = 1.0  # steps (and at least a millimetre) within which votes are of one surface
+UNIT_STEPS, FLOOR_MM = 1 / 3, 0.1  # a vote of the first deviation weighs one; none is better than the second
+DATA_WEIGHT = 10.0  # of a vote, by that of one edge of the membrane
+BLEND_MM = 1.5  # from the edge of what is seen to where the guess prevails: its weight is (step / that)^2
+UNDECIDED_BLEND_MM = 150.0  # the same where there is hardly a guess
+SWEEPS, FINE_SWEEPS = 60, 16
+FACTOR, FINE_FACTOR = 1.8, 1.4  # of over-relaxation
+EVERY = 7  # known pixel is used to tell where a surface may be
+WIDENINGS = 4  # of a grid by one coarse step
+STRAYS = 0.1  # per cent of these that may lie outside of the box
+HORN_MM, AWAY_MM = 30.0, 20.0  # radius of what a guess must hold, and how far from all that is seen it must
+UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
+
+
+class NoSurface(EigenheadError):
+    """Reports photographs that do not tell where the surface is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Votes:
+    """Holds at every node of a grid: signed distance (mm), its weight (0: nobody sees the place), and the distance (mm)
+    by which the body's outline leaves the node out at least. See ``vote_kernels.vote``."""
+
+    value: Field
+    weight: Field
+    bound: Field
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """Holds the field on one grid: signed distance (mm, negative inside), and the weight of the votes behind it."""
+
+    grid: Grid
+    field: Field
+    weight: Field
+
+
+def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
+    """Returns the field that the votes, the silhouettes and, where nothing is known, ``start`` make."""
+    reach = np.float32(REACH * grid.step_mm)
+    start = np.clip(start, -reach, reach)
+    unseen = votes.weight <= 0
+    target = np.where(unseen, start, votes.value).astype(np.float32)
+    blend = np.where(votes.weight < 0, UNDECIDED_BLEND_MM, BLEND_MM)
+    pull = np.where(unseen, (grid.step_mm / blend) ** 2, DATA_WEIGHT * votes.weight).astype(np.float32)
+    field = np.where(grid.outer, start, np.maximum(target, votes.bound)).astype(np.float32)
+    fixed = grid.outer | (votes.bound >= reach)
+    membrane = Membrane(target, pull, votes.bound, fixed)
+    for sweep in range(2 * sweeps):
+
+        def sweep_nodes(first: int, last: int, parity: int = sweep % 2) -> None:
+            relax(field, membrane, grid.index, grid.neighbours, parity, factor, first, last)
+
+        in_threads(len(grid), sweep_nodes)
+    return Level(grid, field, votes.weight)
+
+
+def votes_at(grid: Grid, views: ViewStack) -> Votes:
+    """Returns what the views say of every node."""
+    value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
+    step = grid.step_mm
+    limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
+    packed = views.packed()
+
+    def fill(first: int, last: int) -> None:
+        vote(grid.index, grid.corner, step, packed, limits, value, weight, bound, first, last)
+
+    in_threads(len(grid), fill)
+    return Votes(value, weight, bound)
+
+
+def solve(depth_maps: Sequence[DepthMap], views: ViewStack, head_world: Mesh | None, spacing_mm: float) -> Level:
+    """Returns the field about the surface, on a grid of ``spacing_mm``."""
+    halvings = 1
+    while spacing_mm * 2**halvings < COARSEST_MM:
+        halvings += 1
+    seen = np.concatenate([points_world(depth_map)[::EVERY] for depth_map in depth_maps])
+    grid = whole_box(*_box(depth_maps, seen, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
+    votes = votes_at(grid, views)
+    level = solve_level(grid, votes, _prior(grid, votes, head_world, seen), SWEEPS, FACTOR)
+    box = level.field.reshape(grid.shape)
+    for halving in range(halvings):
+        wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
+        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views)
+        if halving < halvings - 1:
+            box = everywhere(level.grid, level.field, box)
+    return level
+
+
+def _finer(
+    coarse: Grid, box: Float32[np.ndarray, "nx ny nz"], wanted: Bool[np.ndarray, "nx ny nz"], views: ViewStack
+) -> Level:
+    """The field at half the step about the ``wanted`` nodes, and farther where the surface would leave the grid."""
+    for _ in range(WIDENINGS + 1):
+        grid = refined(coarse, wanted)
+        start = grid_kernels.interpolated(box, grid.index)
+        level = solve_level(grid, votes_at(grid, views), start, FINE_SWEEPS, FINE_FACTOR)
+        if not grid_kernels.crossed_at_rim(level.field, grid.neighbours, grid.outer):
+            return level
+        wanted = grid_kernels.grown(wanted)
+    raise NoSurface(compose("depth-contradictory"))
+
+
+def _box(
+    depth_maps: Sequence[DepthMap], seen: Points, step_mm: float
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Corner and edges of a box about the points that are seen, and as far behind them as a body may be."""
+    low, high = np.percentile(seen, [STRAYS, 100 - STRAYS], axis=0)
+    behind = np.array([depth_map.camera.axis_world for depth_map in depth_maps]) * UNSEEN_DEPTH_MM
+    middle = np.median(seen, axis=0)
+    far = middle + behind
+    low = np.minimum(low, np.maximum(far.min(axis=0), low - UNSEEN_DEPTH_MM)) - 4 * step_mm
+    high = np.maximum(high, np.minimum(far.max(axis=0), high + UNSEEN_DEPTH_MM)) + 4 * step_mm
+    return low, high - low
+
+
+def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> Field:
+    """The hull, cut down to the fitted head where that is known."""
+    prior = np.maximum(votes.value, votes.bound).astype(float)
+    if head_world is not None:
+        unseen = (prior < 0) & (votes.weight <= 0)
+        places = grid.corner + grid.step_mm * grid.index[unseen]
+        prior[unseen] = np.maximum(prior[unseen], distance_to_head(places, head_world, seen[::10]))
+    prior[grid.outer] = REACH * grid.step_mm
+    return without_horns(prior, votes, grid).astype(np.float32)
+
+
+def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
+    """Returns the guess (mm, negative inside) on a whole box, without what no ball of ``HORN_MM`` fits into: beyond the
+    photographs cones of sight that no outline bounds end in fins and horns. Beside what is seen the guess stays."""
+    from scipy.ndimage import distance_transform_edt  # 0.05 s, and only a bust needs it
+
+    radius = HORN_MM / grid.step_mm
+    core = np.asarray(distance_transform_edt((guess < 0).reshape(grid.shape))) > radius
+    filled = np.asarray(distance_transform_edt(~core)) <= radius
+    away = np.asarray(distance_transform_edt((votes.weight <= 0).reshape(grid.shape))) > AWAY_MM / grid.step_mm
+    return np.where((away & ~filled).ravel(), np.maximum(guess, 0.5 * grid.step_mm), guess)
+
+
+def _near_points(grid: Grid, points: Points) -> Bool[np.ndarray, "nx ny nz"]:
+    """Nodes whose eight finer ones hold a seen point, and their neighbours."""
+    box = np.zeros(grid.shape, bool)
+    at = np.floor((points - grid.corner) / grid.step_mm).astype(int)
+    inside = ((at >= 1) & (at < np.array(grid.shape) - 1)).all(axis=1)
+    box[tuple(at[inside].T)] = True
+    return grid_kernels.grown(box)

@@ -1,0 +1,152 @@
+"""What the views say of a place: how far in front of the surface it lies, and that nobody may be there (compiled)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, pinhole, placed
+
+DEPTH, NORMAL, SIGMA, OUTLINE, FRAME = 0, 1, 4, 5, 6  # columns of a pixel; the normal has three
+CENTRE = 16  # of a camera's row: its centre
+MAX_VIEWS = 64
+PLANE_SHARE = 0.3  # of the way along the ray that a place before a surface is off at least, however flat that is seen
+THICKEST_MM = 60.0  # of a body behind its surface, where no silhouette bounds it
+UNDECIDED = -1.0  # weight of a place inside of the outlines that only their guess beyond the photographs leaves out
+WIDENING = 1.0  # beyond a photograph a body may widen by as much as it lies beyond it: shoulders do
+FLATTEST = 0.1  # cosine beyond which a tangent plane says nothing of a place beside it
+UNKNOWN_MM = 1e9  # deviations beyond are infinite
+
+
+class Pixels(NamedTuple):
+    """What the views see, as ``view_stack.ViewStack`` has it."""
+
+    cameras: np.ndarray
+    sizes: np.ndarray
+    starts: np.ndarray
+    pixels: np.ndarray
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def vote(
+    index: np.ndarray,
+    corner: np.ndarray,
+    step_mm: float,
+    views: Pixels,
+    limits: np.ndarray,
+    value: np.ndarray,
+    weight: np.ndarray,
+    bound: np.ndarray,
+    first: int,
+    last: int,
+) -> None:
+    """Fills ``value`` (mm, positive outside), ``weight`` and ``bound`` (mm: the surface is at least so far inside).
+
+    A view's vote is the distance to the tangent plane of the pixel that shows the place, cut off at ``reach`` in front
+    and left out ``behind`` it. Votes are put together by their weighted median and the mean of those that agree with
+    it; weight falls with the square of the share that does not. Without a vote the weight is 0 and the value that of
+    the hull, whose silhouettes go on beyond their photographs, and of the body behind a surface that is seen.
+    ``limits``: reach, behind, agreement (mm), unit and
+    floor of a vote's deviation (mm).
+    """
+    cameras, sizes, starts, pixels = views
+    reach, behind, agreement, unit, floor = limits
+    votes, weights, place = np.empty(MAX_VIEWS), np.empty(MAX_VIEWS), np.empty(3)
+    for n in range(first, last):
+        for axis in range(3):
+            place[axis] = corner[axis] + step_mm * index[n, axis]
+        count = 0
+        hull, hull_next = -1e9, -1e9  # largest and second largest distance outside a silhouette
+        guess = -1e9  # the largest one with silhouettes that go on, widening, beyond their photographs
+        hidden = 1e9  # smallest depth behind a surface that is seen
+        framed, framed_next = 1e9, 1e9  # smallest and second smallest distance outside a photograph
+        for v in range(len(cameras)):
+            depth, column, row = seen_at(cameras[v], place)
+            if depth <= NEAREST_MM:
+                continue
+            at, beyond = nearest_pixel(column, row, sizes[v])
+            at += starts[v]
+            scale = depth / cameras[v, LENS]
+            edge, off = (pixels[at, FRAME] + beyond) * scale, pixels[at, OUTLINE] * scale
+            framed, framed_next = min(framed, edge), min(framed_next, max(framed, edge))
+            guess = max(guess, off - WIDENING * beyond * scale)
+            if edge > 0.0:
+                continue
+            hull, hull_next = max(hull, off), max(hull_next, min(hull, off))
+            if hull_next > reach:
+                break  # two silhouettes say that nobody is there
+            sigma = pixels[at, SIGMA]
+            if beyond > 0.0 or not sigma < UNKNOWN_MM:
+                continue
+            facing = max(cosine(cameras[v], place, depth, pixels[at]), FLATTEST)
+            before = (pixels[at, DEPTH] - depth) * facing
+            if before < -behind:
+                hidden = min(hidden, depth - pixels[at, DEPTH])
+                continue
+            share = min(unit * unit / (sigma * sigma + floor * floor) * min(1.0, 2.0 * facing), 2.0)
+            if before < 0.0:
+                share *= 1.0 + 0.75 * before / behind
+            votes[count] = min(max(before, PLANE_SHARE * (pixels[at, DEPTH] - depth)), reach)
+            weights[count] = share
+            count += 1
+        hull = max(hull, framed_next)
+        bound[n] = min(max(hull, -reach), reach)
+        value[n], weight[n] = agreed(votes, weights, count, agreement)
+        if count == 0:
+            body = min(max(guess, hull), max(hidden - THICKEST_MM, hull))
+            value[n] = min(max(body, -reach), reach)
+            if hull < 0.0 < body:
+                weight[n] = UNDECIDED
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
+    """Depth (mm), column and row of a place in the world frame; see ``view_stack.ViewStack.cameras``."""
+    x, y, depth = placed(camera, place[0], place[1], place[2])
+    column, row = pinhole(x / depth, y / depth, camera[LENS:])
+    return depth, column, row
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, float]:
+    """The pixel of an image that is nearest to a point, and how far (px) the point lies outside of the image."""
+    inside_column, inside_row = min(max(column, 0.0), size[1] - 1.0), min(max(row, 0.0), size[0] - 1.0)
+    beyond = np.sqrt((column - inside_column) ** 2 + (row - inside_row) ** 2)
+    return int(inside_row + 0.5) * size[1] + int(inside_column + 0.5), beyond
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def cosine(camera: np.ndarray, place: np.ndarray, depth: float, pixel: np.ndarray) -> float:
+    """Cosine between a pixel's normal and the way to the camera, times the length of the ray a unit of depth."""
+    x, y, z = place[0] - camera[CENTRE], place[1] - camera[CENTRE + 1], place[2] - camera[CENTRE + 2]
+    return -(x * pixel[NORMAL] + y * pixel[NORMAL + 1] + z * pixel[NORMAL + 2]) / depth
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def agreed(votes: np.ndarray, weights: np.ndarray, count: int, agreement: float) -> tuple[float, float]:
+    """Mean of the votes that agree with their weighted median, and their weight; both arrays are sorted."""
+    if count == 0:
+        return 0.0, 0.0
+    total = 0.0
+    for a in range(count):
+        total += weights[a]
+        b = a
+        while b > 0 and votes[b - 1] > votes[b]:
+            votes[b - 1], votes[b] = votes[b], votes[b - 1]
+            weights[b - 1], weights[b] = weights[b], weights[b - 1]
+            b -= 1
+    passed, middle = 0.0, votes[count - 1]
+    for a in range(count):
+        passed += weights[a]
+        if passed >= 0.5 * total:
+            middle = votes[a]
+            break
+    mean, agreeing = 0.0, 0.0
+    for a in range(count):
+        if abs(votes[a] - middle) <= agreement:
+            mean += weights[a] * votes[a]
+            agreeing += weights[a]
+    if agreeing <= 0.0:
+        return 0.0, 0.0
+    share = agreeing / total
+    return mean / agreeing, agreeing * share * share

@@ -1,0 +1,97 @@
+"""The camera for compiled loops: world to camera to pixel, and the derivatives. ``projection`` packs the rows.
+
+A row begins with rotation (9, row by row) and translation (3), mm: with ``pose``. Where a lens follows, from entry 12
+on, it is fx fy cx cy (px), and of a lens that distorts k1 k2 p1 p2 k3 and the turning radius. The helpers are inlined:
+arithmetic is the calling loop's, fast or strict. Only ``distorted`` is always fast: strict, it cost the hull a tenth.
+"""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+
+LENS = 12  # entry of a row at which the lens begins
+NOWHERE = 1e9  # a pixel outside of every image
+NEAREST_MM = 1.0  # nearer, or behind the camera, nothing is seen
+
+
+@njit(cache=True, nogil=True, inline="always")
+def turned(pose, x, y, z):
+    """A direction in the camera's frame."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z,
+        pose[3] * x + pose[4] * y + pose[5] * z,
+        pose[6] * x + pose[7] * y + pose[8] * z,
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def placed(pose, x, y, z):
+    """A point in the camera's frame."""
+    a, b, c = turned(pose, x, y, z)
+    return a + pose[9], b + pose[10], c + pose[11]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def pinhole(x, y, lens):
+    """Pixel (column, row) of the ray (x, y, 1) without distortion."""
+    return lens[0] * x + lens[2], lens[1] * y + lens[3]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def distorted(x, y, lens):
+    """Pixel (column, row) of the ray (x, y, 1); NOWHERE past the turning radius. ``rig.camera``'s equation."""
+    r2 = x * x + y * y
+    if r2 > lens[9] * lens[9]:
+        return NOWHERE, NOWHERE
+    radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
+    u = x * radial + 2.0 * lens[6] * x * y + lens[7] * (r2 + 2.0 * x * x)
+    v = y * radial + lens[6] * (r2 + 2.0 * y * y) + 2.0 * lens[7] * x * y
+    return lens[0] * u + lens[2], lens[1] * v + lens[3]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def distortion_slopes(x, y, lens):
+    """d(pixel) / d(ray) of the ray (x, y, 1): column by x and by y, row by x and by y."""
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
+    slope = 2.0 * (lens[4] + r2 * (2.0 * lens[5] + 3.0 * r2 * lens[8]))
+    cross = slope * x * y + 2.0 * lens[6] * x + 2.0 * lens[7] * y
+    xx = radial + slope * x * x + 2.0 * lens[6] * y + 6.0 * lens[7] * x
+    yy = radial + slope * y * y + 6.0 * lens[6] * y + 2.0 * lens[7] * x
+    return lens[0] * xx, lens[0] * cross, lens[1] * cross, lens[1] * yy
+
+
+@njit(cache=True, nogil=True, inline="always")
+def project(camera, x, y, z):
+    """Pixel (column, row) of a world point; NOWHERE behind the camera or past the lens's turning radius."""
+    a, b, depth = placed(camera, x, y, z)
+    if depth <= NEAREST_MM:
+        return NOWHERE, NOWHERE
+    return distorted(a / depth, b / depth, camera[LENS:])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def projection_slopes(camera, x, y, z):
+    """d(pixel) / d(world point): of the column, and of the row."""
+    a, b, depth = placed(camera, x, y, z)
+    per = 1.0 / depth
+    a, b = a * per, b * per
+    xx, xy, yx, yy = distortion_slopes(a, b, camera[LENS:])
+    xx, xy, yx, yy = xx * per, xy * per, yx * per, yy * per
+    dx0, dx1, dx2 = camera[0] - a * camera[6], camera[1] - a * camera[7], camera[2] - a * camera[8]
+    dy0, dy1, dy2 = camera[3] - b * camera[6], camera[4] - b * camera[7], camera[5] - b * camera[8]
+    return (
+        (xx * dx0 + xy * dy0, xx * dx1 + xy * dy1, xx * dx2 + xy * dy2),
+        (yx * dx0 + yy * dy0, yx * dx1 + yy * dy1, yx * dx2 + yy * dy2),
+    )
+
+
+@njit(cache=True, nogil=True)
+def project_all(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Pixels (n, 2) of world points (n, 3), mm; NaN where ``project`` has NOWHERE."""
+    pixels = np.empty((len(points), 2))
+    for n in range(len(points)):
+        column, row = project(camera, points[n, 0], points[n, 1], points[n, 2])
+        seen = column < NOWHERE
+        pixels[n, 0], pixels[n, 1] = column if seen else np.nan, row if seen else np.nan
+    return pixels

@@ -1,0 +1,58 @@
+"""A compiled z-buffer on the CPU: which surface a pixel sees, and how far away.
+
+It serves visibility in the texture (section 4.5), a result's figures and its small pictures, where reading images
+back from the GL renderer costs more than drawing them here; ``rig.render`` is the reference and the tests compare the
+two. Vertices are projected exactly, lens distortion included; between them triangles are taken as straight, which on a
+head of 48,000 vertices (edges of 2 to 5 px) bends by less than 0.001 px.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int32, UInt8
+
+from pipeline.compute.threads import thread_count
+from pipeline.geometry.projection import project_points
+from pipeline.geometry.raster_kernels import interpolate, rasterise
+from rig.camera import Camera
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+
+def camera_depths(camera: Camera, points_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " v"]:
+    """Returns the camera z of world points, mm."""
+    return points_world @ camera.camera_from_world.rotation[2] + camera.camera_from_world.translation[2]
+
+
+def depth_map(
+    camera: Camera, vertices_world: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
+    """Returns ``rasterise`` for a camera and world vertices."""
+    k = camera.intrinsics
+    return rasterise(
+        project_points(camera, vertices_world), camera_depths(camera, vertices_world), faces, k.height, k.width
+    )
+
+
+def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
+    """Returns what every camera of a rig sees of a mesh: camera z (mm) at each pixel, inf beside it."""
+    with ThreadPoolExecutor(thread_count()) as pool:  # compiled code releases the interpreter lock
+        found = pool.map(lambda camera: depth_map(camera, mesh_world.vertices, mesh_world.faces)[0], rig)
+        return dict(zip(rig.names, found, strict=True))
+
+
+def picture(
+    camera: Camera,
+    vertices_world: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    colours: UInt8[np.ndarray, "v 3"],
+    background: tuple[int, int, int] = (255, 255, 255),
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns the mesh in its vertex colours, unlit, as the camera sees it."""
+    pixels, depths = camera.project(vertices_world), camera_depths(camera, vertices_world)
+    _, seen = rasterise(pixels, depths, faces, camera.intrinsics.height, camera.intrinsics.width)
+    image = interpolate(seen, pixels, depths, faces, colours.astype(np.float32))
+    canvas = np.full(image.shape, background, np.uint8)
+    cv2.copyTo(cv2.convertScaleAbs(image), (seen >= 0).view(np.uint8), canvas)  # it rounds
+    return canvas

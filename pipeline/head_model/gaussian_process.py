@@ -1,0 +1,130 @@
+"""A wider basis for the same solver: smooth deformations that no population has to contain.
+
+A Gaussian process on the mean surface, in the manner of Gaussian process morphable models (Luethi et al. 2018,
+https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's normal with covariance
+
+    k(x, y) = sum_i a_i^2 [ (1 - f) (g_i(x, y) + g_i(x, My)) + f g_i(x, y) ],   g_i(x, y) = exp(-|x - y|^2 / (2 l_i^2)),
+
+M the mirror through the median plane: faces deviate from a population mostly alike on both sides. Its leading
+eigenfunctions (Nystroem's method on a subset of the cage), each with its standard deviation in it, stand behind the
+eigenheads as modes with the same unit prior, orthogonal to the span of the eigenheads. Along the normal only: sliding
+along the surface changes no silhouette.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.head_model.model import HeadModel, with_modes
+from rig.mesh import vertex_normals
+
+NODES = 700  # of Nystroem's method; an l of 18 mm has about 250 independent places on a head
+KEPT = 0.98  # share of the process's variance that the modes must carry
+
+
+@dataclass(frozen=True, slots=True)
+class KernelScale:
+    """Holds one Gaussian of the kernel."""
+
+    length_mm: float
+    amplitude_mm: float
+
+
+# Measured on captures of heads outside the population (docs/lab-notes/captures.md): the residual of 60 modes of a
+# MakeHuman population has about these two scales.
+SCALES = (KernelScale(40.0, 2.0), KernelScale(18.0, 1.2))
+FREE = 0.4  # share of the variance that need not be symmetric
+
+
+def with_kernel(
+    model: HeadModel, count: int, *, scales: tuple[KernelScale, ...] = SCALES, most: int = 300
+) -> HeadModel:
+    """Returns the first ``count`` eigenheads followed by at most ``most`` kernel modes (mm per standard deviation)."""
+    span = with_modes(model, count)
+    modes = kernel_modes(span, scales, most)
+    sigma = np.linalg.norm(modes.reshape(len(modes), -1), axis=1).astype(np.float32)
+    return replace(
+        span,
+        modes=np.concatenate([span.modes, modes]),
+        sigma=np.concatenate([span.sigma, sigma]),
+        _bases={},
+    )
+
+
+def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float, most: int = 400) -> HeadModel:
+    """Returns the model with further modes of a shorter length inside the face region, for those who see more than a
+    rim.
+
+    They fade out over half a length beyond the region, and are not made orthogonal to the others: prior variance of a
+    deformation is meant to add up over lengths.
+    """
+    level = model.levels["cage"]
+    points = model.mean.astype(float)
+    inside = np.flatnonzero(level.face_region)
+    nodes = inside[spread_nodes(points[inside], min(NODES, len(inside)))]
+    values, vectors = np.linalg.eigh(_gaussian(points[nodes], points[nodes], length_mm, amplitude_mm))
+    order = np.argsort(values)[::-1]
+    share = np.cumsum(values[order]) / values.sum()
+    order = order[: min(most, int(np.searchsorted(share, KEPT)) + 1)]
+    fields = _gaussian(points, points[nodes], length_mm, amplitude_mm) @ (vectors[:, order] / np.sqrt(values[order]))
+    outside, _ = KDTree(points[inside]).query(points)
+    fields *= np.exp(-0.5 * (outside / (0.5 * length_mm)) ** 2)[:, None]
+    modes = (fields.T[:, :, None] * vertex_normals(points, level.faces)[None]).astype(np.float32)
+    sigma = np.linalg.norm(modes.reshape(len(modes), -1), axis=1).astype(np.float32)
+    return replace(
+        model, modes=np.concatenate([model.modes, modes]), sigma=np.concatenate([model.sigma, sigma]), _bases={}
+    )
+
+
+def _gaussian(
+    x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"], length_mm: float, amplitude_mm: float
+) -> Float[np.ndarray, "n m"]:
+    return amplitude_mm**2 * np.exp(_square_distance(x, y) / (-2.0 * length_mm**2))
+
+
+def kernel_modes(model: HeadModel, scales: tuple[KernelScale, ...], most: int) -> Float[np.ndarray, "r v0 3"]:
+    """Eigenfunctions of the process on the cage, along its normals, orthogonal to the model's own modes."""
+    points = model.mean.astype(float)
+    normals = vertex_normals(points, model.levels["cage"].faces)
+    nodes = spread_nodes(points, min(NODES, len(points)))
+    values, vectors = np.linalg.eigh(covariance(points[nodes], points[nodes], scales))
+    order = np.argsort(values)[::-1]
+    share = np.cumsum(values[order]) / values.sum()
+    order = order[: min(most, int(np.searchsorted(share, KEPT)) + 1)]
+    # Nystroem: f_k(x) = k(x, nodes) u_k / sqrt(value_k) has covariance sum_k f_k f_k^T ~ k.
+    fields = covariance(points, points[nodes], scales) @ (vectors[:, order] / np.sqrt(values[order]))
+    modes = (fields.T[:, :, None] * normals[None]).reshape(len(order), -1)
+    span, _ = np.linalg.qr(model.modes.reshape(len(model.modes), -1).astype(float).T)
+    modes -= (modes @ span) @ span.T
+    return modes.reshape(len(order), -1, 3).astype(np.float32)
+
+
+def covariance(
+    x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"], scales: tuple[KernelScale, ...]
+) -> Float[np.ndarray, "n m"]:
+    """Returns k(x, y) in mm^2."""
+    direct, mirrored = _square_distance(x, y), _square_distance(x, y * (-1.0, 1.0, 1.0))
+    total = np.zeros_like(direct)
+    for scale in scales:
+        width = 2.0 * scale.length_mm**2
+        near = np.exp(-direct / width)
+        total += scale.amplitude_mm**2 * ((1.0 - FREE) * (near + np.exp(-mirrored / width)) + FREE * near)
+    return total
+
+
+def _square_distance(x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "n m"]:
+    square = (x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1)[None, :] - 2.0 * x @ y.T
+    return np.maximum(square, 0.0)
+
+
+def spread_nodes(points: Float[np.ndarray, "v 3"], count: int) -> Int[np.ndarray, " n"]:
+    """Returns farthest-point sampling, from the point farthest along z: even cover, the same every time."""
+    nodes = np.empty(count, int)
+    nodes[0] = int(np.argmax(points[:, 2]))
+    distance = np.full(len(points), np.inf)
+    for i in range(1, count):
+        distance = np.minimum(distance, ((points - points[nodes[i - 1]]) ** 2).sum(axis=1))
+        nodes[i] = int(np.argmax(distance))
+    return nodes

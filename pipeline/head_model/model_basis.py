@@ -1,0 +1,35 @@
+"""The modes of a head model that a reconstruction solves for."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from pipeline.compute.array_cache import cached_arrays
+from pipeline.head_model.gaussian_process import with_kernel
+from pipeline.head_model.model import HeadModel, with_expressions, with_modes
+from pipeline.settings import Settings
+from rig.mesh import vertex_normals
+
+
+def model_basis(model: HeadModel, settings: Settings) -> HeadModel:
+    """Returns the model with the modes that the settings ask for: the eigenheads in use and, where the detail goes
+    beyond their span, the kernel's modes and the model's expressions."""
+    within_span = settings.detail == "span" or settings.method == "simplex"
+    return basis_of(model, min(settings.fitting.modes, len(model.modes)), kernel=not within_span)
+
+
+@lru_cache(maxsize=2)  # models are few, jobs are many, and others keep what they make of the same model
+def basis_of(model: HeadModel, eigenheads: int, *, kernel: bool) -> HeadModel:
+    """Returns the model with its first ``eigenheads`` modes, and with kernel modes and expressions if ``kernel``."""
+    if not kernel:
+        return with_modes(model, eigenheads)
+    inputs = (model.mean, model.modes[:eigenheads], model.sigma[:eigenheads], model.levels["cage"].faces)
+
+    def make() -> dict[str, np.ndarray]:
+        wider = with_kernel(model, eigenheads)
+        return {"modes": wider.modes, "sigma": wider.sigma}
+
+    arrays = cached_arrays("kernel-modes", inputs, make, made_by=(with_kernel, vertex_normals, HeadModel))
+    wide = replace(with_modes(model, eigenheads), modes=arrays["modes"], sigma=arrays["sigma"], _bases={})
+    return with_expressions(wide)

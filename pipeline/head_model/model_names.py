@@ -1,0 +1,75 @@
+"""Which head models are at hand, and the files behind their names. Loads nothing: the command line asks it."""
+
+import hashlib
+from functools import lru_cache
+from pathlib import Path
+
+from pipeline.head_model.data_folder import models_folder
+from rig.errors import EigenheadError
+
+PACKS = Path(__file__).parent / "packs"
+DEFAULT = "makehuman-138"
+_PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman": "makehuman.npz"}
+
+
+class UnknownModel(EigenheadError):
+    """Refuses a model name that is neither shipped nor in the user's folder, nor a file."""
+
+    def __init__(self, name: str) -> None:
+        known = ", ".join(sorted(list_models()))
+        super().__init__(
+            f"no head model {name!r}: known are {known}. Give a file path, or put one into {models_folder()} "
+            "with `eigenhead model import` or `eigenhead model fetch ict-facekit`"
+        )
+
+
+class ShippedModel(EigenheadError):
+    """Reports a model that comes with the program, where one of the user's own is meant."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"the head model {name!r} comes with the program and cannot be removed")
+
+
+def list_models() -> dict[str, Path]:
+    """Returns models at hand by name: the shipped default and the files of the user's folder."""
+    found = {DEFAULT: PACKS / _PACK_FILES[DEFAULT]}
+    folder = models_folder()
+    if folder.is_dir():
+        found |= {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    return found
+
+
+def model_path(name_or_path: str | Path) -> Path:
+    """Returns the file behind a name or path. Raises UnknownModel."""
+    name = str(name_or_path)
+    if name in _PACK_FILES:
+        return PACKS / _PACK_FILES[name]
+    named = list_models().get(name)
+    if named is not None:
+        return named
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    raise UnknownModel(name)
+
+
+def model_sha256(path: Path) -> str:
+    """Returns the SHA-256 of a model's file, as results name it. Raises OSError."""
+    state = path.stat()
+    return _sha256(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=64)
+def _sha256(path: Path, changed_ns: int, size: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def remove_model(name: str) -> Path:
+    """Removes a model of the user's folder; returns where it was. Raises UnknownModel, and ShippedModel for those that
+    come with the program."""
+    path = models_folder() / f"{name}.npz"
+    if path.parent != models_folder() or not path.is_file():
+        raise ShippedModel(name) if name in _PACK_FILES else UnknownModel(name)
+    path.unlink()
+    return path

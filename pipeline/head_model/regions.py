@@ -1,0 +1,67 @@
+"""Regions of a head by name, for every model: what figures are reported by, and where detail differs.
+
+Bounds are distances from the landmarks on the mean head, so that a region holds the same places whatever the mesh.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.head_model.model import HeadModel
+
+REGIONS = ("face", "eyes", "nose", "mouth", "ears", "neck", "cranium")
+EYE_MARGIN_MM, EYE_HALF_HEIGHT_MM, EYE_DEPTH_MM = 6.0, 13.0, 20.0  # about the line from corner to corner
+NOSE_MARGIN_MM = 4.0
+MOUTH_MARGIN_MM, MOUTH_HALF_HEIGHT_MM = 6.0, 16.0
+EAR_BEHIND_MM, EAR_BEFORE_MM, EAR_HALF_HEIGHT_MM, EAR_INSIDE_MM = 36.0, 4.0, 33.0, 12.0
+NECK_BELOW_TRAGION_MM = 30.0
+
+
+@lru_cache(maxsize=2)  # models are few, jobs are many
+def head_regions(model: HeadModel) -> dict[str, Bool[np.ndarray, " v"]]:
+    """Returns vertices of the full level by region. Eyes, nose and mouth are parts of the face; the others do not
+    overlap."""
+    vertices, marks = model.vertices(np.zeros(0)), model.landmarks
+    at = {name: vertices[row] for name, row in marks.items()}
+    face = model.levels["full"].face_region
+    ears = _ears(vertices, at) & ~face
+    neck = (vertices[:, 1] < at["tragion_left"][1] - NECK_BELOW_TRAGION_MM) & ~face & ~ears
+    eyes = np.zeros(len(vertices), bool)
+    for side in ("right", "left"):
+        outer, inner = at[f"exocanthion_{side}"], at[f"endocanthion_{side}"]
+        half = (0.5 * abs(outer[0] - inner[0]) + EYE_MARGIN_MM, EYE_HALF_HEIGHT_MM, EYE_DEPTH_MM)
+        eyes |= _within(vertices, 0.5 * (outer + inner), half)
+    wing = 0.5 * abs(at["alare_left"][0] - at["alare_right"][0]) + NOSE_MARGIN_MM
+    bridge = 0.5 * (at["nasion"] + at["subnasale"])
+    nose = _within(vertices, bridge, (wing, 0.5 * (at["nasion"] - at["subnasale"])[1] + 1.0, 40.0)) & ~eyes
+    corners = at["cheilion_left"], at["cheilion_right"]
+    half = (0.5 * abs(corners[0][0] - corners[1][0]) + MOUTH_MARGIN_MM, MOUTH_HALF_HEIGHT_MM, 30.0)
+    mouth = _within(vertices, at["stomion"], half) & ~nose
+    return {
+        "face": face,
+        "eyes": eyes & face,
+        "nose": nose & face,
+        "mouth": mouth & face,
+        "ears": ears,
+        "neck": neck,
+        "cranium": ~(face | ears | neck),
+    }
+
+
+def _within(
+    vertices: Float[np.ndarray, "v 3"], centre: Float[np.ndarray, " 3"], half_mm: tuple[float, float, float]
+) -> Bool[np.ndarray, " v"]:
+    return np.all(np.abs(vertices - centre) < half_mm, axis=1)
+
+
+def _ears(vertices: Float[np.ndarray, "v 3"], at: dict[str, Float[np.ndarray, " 3"]]) -> Bool[np.ndarray, " v"]:
+    """What stands off the side of the head about the opening of the ear."""
+    found = np.zeros(len(vertices), bool)
+    for side in ("right", "left"):
+        notch = at[f"tragion_{side}"]
+        off = vertices - notch
+        outwards = off[:, 0] * np.sign(notch[0]) > -EAR_INSIDE_MM
+        high = np.abs(off[:, 1]) < EAR_HALF_HEIGHT_MM
+        found |= outwards & high & (off[:, 2] > -EAR_BEHIND_MM) & (off[:, 2] < EAR_BEFORE_MM)
+    return found

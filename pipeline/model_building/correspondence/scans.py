@@ -1,0 +1,131 @@
+"""Raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) with a landmark file of the same name beside it.
+
+Landmarks: ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top), MeshLab's picked points
+``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label that covers one point names it). Names are the 26 of
+landmarks.py; case, blanks and hyphens do not matter.
+"""
+
+import json
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.head_model.landmarks import NAMES
+from rig.errors import InputError
+from rig.formats.mesh_file import read_mesh
+from rig.mesh import Mesh
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb")
+LANDMARK_SUFFIXES = (".json", ".pp", ".ljson")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """Holds one head as a scanner delivers it: any vertex count, holes, its own frame; landmarks in the same frame."""
+
+    name: str
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    landmarks: Mapping[str, Float[np.ndarray, " 3"]]
+
+
+def find_scans(folder: Path) -> list[Path]:
+    """Returns the mesh files of a folder, by name. Raises InputError where there is none, or a head would count
+    twice."""
+    found = sorted(p for p in folder.glob("*") if p.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
+    if not found:
+        raise InputError(str(folder), ["holds no .ply, .obj or .glb scans"])
+    stems = Counter(path.stem for path in found)
+    twice = [f"holds more than one scan called {name}: keep one" for name, count in stems.items() if count > 1]
+    if twice:
+        raise InputError(str(folder), twice)
+    return found
+
+
+def read_scan(path: Path) -> Scan:
+    """Returns a scan with its landmarks. Raises InputError."""
+    vertices, faces = welded(read_mesh(path))
+    landmarks_path = landmark_file(path)
+    if landmarks_path is None:
+        beside = ", ".join(path.with_suffix(suffix).name for suffix in LANDMARK_SUFFIXES)
+        raise InputError(path.name, [f"has no landmarks beside it ({beside})"])
+    return Scan(path.stem, vertices, faces, read_landmarks(landmarks_path))
+
+
+def landmark_file(mesh: Path) -> Path | None:
+    """Returns the landmarks that lie beside a mesh file, if any do."""
+    beside = (mesh.with_suffix(suffix) for suffix in LANDMARK_SUFFIXES)
+    return next((path for path in beside if path.is_file()), None)
+
+
+def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    """Returns each place once, and only places that triangles use: files repeat vertices along texture seams, or for
+    each triangle, and a surface torn there has no neighbours to tell noise by."""
+    _, first, index = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
+    corners = index.ravel()[mesh.faces]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
+    used, faces = np.unique(corners, return_inverse=True)
+    return mesh.vertices[first[used]], faces.reshape(-1, 3).astype(np.int32)
+
+
+def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
+    """Returns landmarks by our names; other points of the file are left out. Raises InputError."""
+    readers = {".json": _from_json, ".pp": _from_pp, ".ljson": _from_ljson}
+    try:
+        named = readers[path.suffix.lower()](path.read_text(encoding="utf-8-sig"))
+        points = {plain_name(name): np.array(point, float) for name, point in named.items()}
+    except (ValueError, KeyError, TypeError, AttributeError, ElementTree.ParseError) as fault:
+        raise InputError(
+            path.name, [f"is no landmark file that can be read ({type(fault).__name__}: {fault})"]
+        ) from None
+    known = {name: point for name, point in points.items() if name in NAMES}
+    if not known:
+        listed = ", ".join(sorted(points)[:8]) or "nothing"
+        raise InputError(path.name, [f"names none of the 26 landmarks ({', '.join(NAMES[:3])}, ...) but {listed}"])
+    bad = [name for name, point in known.items() if point.shape != (3,) or not np.isfinite(point).all()]
+    if bad:
+        raise InputError(path.name, [f"{name} is no point of three finite numbers" for name in bad])
+    return known
+
+
+def write_landmarks(path: Path, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> None:
+    """Writes the ``.json`` form."""
+    points = {name: [round(float(x), 4) for x in point] for name, point in landmarks.items()}
+    path.write_text(json.dumps({"format": "eigenhead-landmarks/1", "points": points}, indent=1), encoding="utf-8")
+
+
+def plain_name(name: str) -> str:
+    """Returns the name in lower case with underscores."""
+    return "_".join(name.strip().lower().replace("-", " ").replace("_", " ").split())
+
+
+def _from_json(text: str) -> Mapping[str, list[float]]:
+    content = json.loads(text)
+    return content.get("points", {k: v for k, v in content.items() if isinstance(v, list)})
+
+
+def _from_pp(text: str) -> Mapping[str, list[float]]:
+    root = ElementTree.fromstring(text)
+    return {
+        point.attrib["name"]: [float(point.attrib[axis]) for axis in "xyz"]
+        for point in root.iter("point")
+        if point.attrib.get("active", "1") != "0"
+    }
+
+
+def _from_ljson(text: str) -> Mapping[str, list[float]]:
+    content = json.loads(text)
+    if content["version"] == 1:
+        groups = [(g["label"], [p["point"] for p in g["landmarks"]]) for g in content["groups"]]
+        return {label: points[0] for label, points in groups if len(points) == 1}
+    groups = [content] if content["version"] == 2 else list(content["groups"].values())
+    out: dict[str, list[float]] = {}
+    for group in groups:
+        points = group["landmarks"]["points"]
+        out |= {label["label"]: points[label["mask"][0]] for label in group["labels"] if len(label["mask"]) == 1}
+    return out

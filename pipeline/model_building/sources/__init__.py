@@ -1,0 +1,1 @@
+"""Reads models from elsewhere: MakeHuman's population, other programs' files, downloads."""

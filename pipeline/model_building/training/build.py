@@ -1,0 +1,113 @@
+"""A head model from a folder of raw scans: check, correspond (section 3.2), align, principal components (3.1)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.head_model.model import HeadModel, assemble
+from pipeline.head_model.model_file import ModelParts, read_parts, save_model
+from pipeline.head_model.model_names import model_path
+from pipeline.model_building.correspondence.correspondence import Matching, correspond
+from pipeline.model_building.correspondence.parallel import workers
+from pipeline.model_building.correspondence.scan_checks import Checked, check
+from pipeline.model_building.correspondence.scans import Scan, find_scans, read_scan
+from pipeline.model_building.training.training import Training, train
+from rig.errors import InputError
+from rig.progress import Progress
+
+FEWEST = 3  # two modes; with fewer heads nothing can be left out
+_SHARPENINGS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Built:
+    """Holds a model made of scans, and what became of each of them."""
+
+    parts: ModelParts
+    used: tuple[str, ...]
+    repaired: Mapping[str, tuple[str, ...]]  # what was put right, by scan
+    skipped: Mapping[str, str]  # why it was left out, by scan
+
+
+def build_model(
+    scans_folder: Path,
+    out: Path,
+    *,
+    name: str,
+    licence: str = "not stated",
+    on_bad: Literal["stop", "skip"] = "stop",
+    matching: Matching | None = None,
+    report: Progress | None = None,
+) -> Built:
+    """Builds a model from the scans of a folder and saves it as ``out``.
+
+    Every scan is checked before any work is done. ``on_bad="stop"`` raises InputError naming all bad scans,
+    ``"skip"`` leaves them out. Raises InputError too where fewer than 3 sound scans remain.
+    """
+    parts, sha256 = read_parts(model_path("default"))
+    template = assemble(parts, sha256)
+    good, skipped = read_checked(scans_folder, template, report=report)
+    if skipped and on_bad == "stop":
+        raise InputError(str(scans_folder), [*skipped.values(), "mend or remove them, or choose to skip bad scans"])
+    if len(good) < FEWEST:
+        raise InputError(str(scans_folder), [f"{len(good)} sound scans, needed are {FEWEST}", *skipped.values()])
+    heads = corresponded_cages([entry.scan for entry in good], template, matching, report=report)
+    training = Training(
+        name=name,
+        licence=licence,
+        source=f"{len(good)} raw scans",
+        notice="Built by eigenhead from raw scans; the rights in the scans apply.",
+        subjects={"total": len(good), "male": 0, "female": 0},  # scans do not say
+        heads=heads,
+        faces=parts.faces,
+        landmarks=template.landmarks,
+        subdivisions=parts.subdivisions,
+    )
+    built = train(training, report=report)
+    save_model(out, built)
+    repaired = {entry.scan.name: entry.repairs for entry in good if entry.repairs}
+    return Built(built, tuple(entry.scan.name for entry in good), repaired, skipped)
+
+
+def read_checked(
+    folder: Path, template: HeadModel, *, report: Progress | None = None
+) -> tuple[list[Checked], dict[str, str]]:
+    """Returns the sound scans of a folder, and what is wrong with the others by name. Raises InputError for an empty
+    folder."""
+    paths = find_scans(folder)
+    with workers(2, len(paths)) as crew:
+        found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
+    good = [entry for entry in found if isinstance(entry, Checked)]
+    return good, {path.stem: fault for path, fault in zip(paths, found, strict=True) if isinstance(fault, str)}
+
+
+def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
+    """The sound scan, or what is wrong with it."""
+    try:
+        return check(read_scan(path), template)
+    except InputError as fault:
+        return str(fault)
+
+
+def corresponded_cages(
+    scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
+) -> Float[np.ndarray, "N V0 3"]:
+    """Cages (mm) whose subdivided surface runs through the corresponded points.
+
+    Correspondence puts cage vertices onto the scan, but subdivision draws its surface inside the cage: C solves
+    S C = P with S the subdivision's rows of the cage vertices. S nearly erases what is as fine as the cage itself, so
+    its inverse would blow noise up; a few steps of C += P - S C, from the template's own detail, stop short of that.
+    """
+    points = correspond(scans, template, matching, report=report).heads
+    rows = template.levels["full"].operator[: len(template.mean)]
+    mean = template.mean.astype(float)
+    away = points - rows @ mean
+    cages = away.copy()
+    for _ in range(_SHARPENINGS):
+        cages += away - np.array([rows @ cage for cage in cages])
+    return mean + cages

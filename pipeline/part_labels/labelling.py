@@ -1,0 +1,324 @@
+"""What every pixel of the subject shows: skin, hair or clothes, learned from the capture itself.
+
+What the middle of the fitted face shows is skin. What lies beside the head above the chin is hair unless it looks like
+that skin, as a bald crown does; what lies below is clothes unless it looks like skin. From those starts expectation and
+maximisation (Dempster, Laird and Rubin 1977) learn how the parts of this capture look, as histograms of colour and fine
+structure over all views, cameras' gains taken out; place on the head is the prior; a filter that
+keeps to the photograph's edges makes neighbours agree (He, Sun and Tang 2010, guided image filtering,
+https://doi.org/10.1007/978-3-642-15549-9_1).
+
+A cap is told from hair only where it looks like the clothes below; both hide skin alike.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from pipeline.compute.threads import thread_count
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.part_labels.appearance_cells import Cells, head_guide, make_cells
+from pipeline.part_labels.codes import CHANNELS
+from pipeline.part_labels.label_kernels import spread_parts
+from pipeline.settings import PartSettings
+from rig.mesh import Mesh
+from rig.progress import Progress
+from rig.rig import Rig
+
+SKIN_CHANNEL, HAIR_CHANNEL, CLOTHES_CHANNEL = (part.channel for part in CHANNELS)
+
+RED_BINS, BLUE_BINS, LIGHT_BINS, DETAIL_BINS = 36, 40, 20, 20
+RED_RANGE, BLUE_RANGE = (-0.8, 1.4), (-1.4, 1.0)  # of log ratios to green
+LIGHT_RANGE, DETAIL_RANGE = (-4.7, 0.4), (-4.7, -0.9)
+CHROMA_BLUR, LIGHT_BLUR, DETAIL_BLUR = 0.9, 1.6, 1.2  # bins; light falls off within each part
+SHADE_SHARE, SHADE_BLUR = 0.4, 4.0  # of a part's looks: its colours in light that only others of them have; bins
+OUTLIER = 0.02  # share of what belongs to no part
+BARE_PRIOR, BEARD_PRIOR = (0.8, 0.17), (0.3, 0.67)  # of skin and hair on a lower face without a beard, and with one
+BEARD_SHARE = (0.2, 0.45)  # of the lower face that looks otherwise than the cheeks: no beard, a beard for certain
+CONFIDENT = 0.8  # only cells so probable teach how their part looks: others would pull all parts together
+MIN_PRESENT = 1e-3  # share of a part's sure places that do not look like skin: a bald head has no hair
+SKIN_RATIO = 0.15  # looks that skin has so much less often than the whole subject are half not skin's
+OUTLIER_BINS = RED_BINS * BLUE_BINS * LIGHT_BINS * DETAIL_BINS / 50.0  # that a part of its own would fill evenly
+PLAIN = 0.1  # a cell that is less of a feature or underside than this is plain skin, or a beard
+FLOOR = 0.02  # of a part's looks that its histogram has not shown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartMap:
+    """Holds one view. ``probability`` of skin, hair and clothes on the photograph's own grid; what is missing to one is
+    unknown, all of it outside the subject."""
+
+    camera: str
+    probability: Float32[np.ndarray, "h w 3"]
+
+
+def classify_parts(
+    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    head_world: Mesh,
+    face_region: Bool[np.ndarray, " v"],
+    landmarks_world: Mapping[str, Float[np.ndarray, " 3"]],
+    *,
+    settings: PartSettings,
+    report: Progress,
+) -> dict[str, PartMap]:
+    """Returns what the pixels of every usable view with a photograph show.
+
+    Args:
+        images: sRGB photographs by camera.
+        silhouettes: The subject's, by camera; views that are not usable are left out.
+        rig: The calibrated cameras.
+        head_world: The fitted bare head (mm).
+        face_region: Its vertices from ear to ear and from the lower forehead to under the chin.
+        landmarks_world: Its 26 landmarks (mm).
+        settings: Grid, smoothness and priors.
+        report: Told of progress.
+
+    Returns:
+        A map for each view that took part.
+    """
+    masks = {n: s.mask for n, s in silhouettes.items() if s.quality.usable and n in images and n in rig.names}
+    used = rig.subset(name for name in rig.names if name in masks)
+    report("parts", 0.0)
+    head = head_guide(head_world, face_region, landmarks_world)
+    cells = make_cells(images, masks, used, head, settings.cell_mm)
+    if not cells:
+        return {}
+    inside = [view.inside > 0.5 for view in cells]
+
+    def gathered(maps: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate([each[mask] for each, mask in zip(maps, inside, strict=True)])
+
+    appearance = gathered([bins(view) for view in cells])
+    start, lower = gathered([starts(view) for view in cells]), gathered([lower_face(view) for view in cells])
+    by_colour, by_both = unlike_cheeks(appearance, start[:, SKIN_CHANNEL])
+    bearded = beard_evidence(by_both, lower)
+    unlikeness = by_colour + bearded * lower * (by_both - by_colour)
+    place = gathered([place_prior(view, bearded) for view in cells])
+    report("parts", 0.4)
+    share = posterior(fit_appearance(appearance, place, start, lower, unlikeness, settings), place)
+    report("parts", 0.6)
+    rows = np.split(share, np.cumsum([np.count_nonzero(mask) for mask in inside])[:-1])
+
+    def one(view: Cells, mask: Bool[np.ndarray, "r c"], probabilities: Float32[np.ndarray, "n 3"]) -> PartMap:
+        name = view.camera.name
+        return PartMap(name, upsample_guided(view, mask, probabilities, images[name], masks[name], settings))
+
+    with ThreadPoolExecutor(thread_count()) as pool:  # OpenCV and numpy release the interpreter lock
+        found = list(pool.map(one, cells, inside, rows))
+    report("parts", 1.0)
+    return {each.camera: each for each in found}
+
+
+def bins(view: Cells) -> Int[np.ndarray, "r c 2"]:
+    """Returns the bin of colour and of fine structure of every cell."""
+    red, blue, light = np.moveaxis(view.colour, 2, 0)
+    a, b = _bin(red, RED_RANGE, RED_BINS), _bin(blue, BLUE_RANGE, BLUE_BINS)
+    colour = (a * BLUE_BINS + b) * LIGHT_BINS + _bin(light, LIGHT_RANGE, LIGHT_BINS)
+    return np.stack([colour, _bin(view.detail, DETAIL_RANGE, DETAIL_BINS)], axis=-1)
+
+
+def _bin(values: Float32[np.ndarray, "r c"], span: tuple[float, float], count: int) -> Int[np.ndarray, "r c"]:
+    return np.clip(((values - span[0]) * (count / (span[1] - span[0]))).astype(np.int64), 0, count - 1)
+
+
+def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
+    """Returns cells that by their place can hardly be anything but skin, hair or clothes (1, else 0).
+
+    Skin: cheeks and nose. Hair:
+    the cranium far from the face, and what lies beside the head above the ears. Clothes: what lies well below the chin
+    and beside the neck.
+    """
+    skin = view.cheek > 0.5
+    beside = ~view.on_head & (view.outside_mm > 3.0)
+    hair = (beside | (view.into_face_mm < -45.0)) & (view.above_chin_mm > 70.0)
+    clothes = beside & (view.above_chin_mm < -50.0)
+    return np.stack([skin, hair, clothes], axis=-1).astype(np.float32)
+
+
+def beard_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
+    """Returns jaw, chin and upper lip."""
+    low = (view.above_chin_mm > -20.0) & (view.above_chin_mm < 50.0)
+    return view.on_head & low & (view.into_face_mm > -15.0)
+
+
+def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
+    """Marks the zone above it, between cheeks and ears, where only a beard reaches."""
+    above = (view.above_chin_mm >= 50.0) & (view.above_chin_mm < 80.0)
+    return view.on_head & above & (view.into_face_mm > -15.0) & (view.cheek < 0.5)
+
+
+def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
+    """Returns where a beard grows and light falls on skin, too: the zone without lips and without the underside of jaw
+    and chin, which is dark with a beard and without."""
+    return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
+
+
+def beard_evidence(unlikeness: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
+    """Returns 0 for a bare lower face, 1 for a beard, by the share of it that looks otherwise than cheeks and nose: of
+    heads without a beard it is below 0.12, of beards above 0.9."""
+    share = float(unlikeness[lower].mean()) if lower.any() else 0.0
+    return float(_ramp(np.full((1, 1), share, np.float32), *BEARD_SHARE)[0, 0])
+
+
+def place_prior(view: Cells, bearded: float = 0.0) -> Float32[np.ndarray, "r c 4"]:
+    """Returns the probability of each part, and of none, by place alone, and by whether there is a beard
+    (``beard_evidence``)."""
+    face = _ramp(view.into_face_mm, -25.0, 15.0)
+    upper = np.where(view.on_head, _ramp(view.above_chin_mm, -15.0, 45.0), _ramp(view.above_chin_mm, -45.0, 25.0))
+    skin_above = np.where(view.on_head, 0.15 + 0.8 * face, 0.12)
+    skin_below = np.where(view.on_head, 0.70, 0.2)
+    hair_below = np.where(view.on_head, 0.10, 0.2)
+    skin = upper * skin_above + (1.0 - upper) * skin_below
+    hair = (1.0 - skin) * (upper * 0.93 + (1.0 - upper) * hair_below / (1.0 - skin_below))
+    zone = beard_zone(view)
+    skin, hair = np.where(zone, BARE_PRIOR[SKIN_CHANNEL], skin), np.where(zone, BARE_PRIOR[HAIR_CHANNEL], hair)
+    grown = bearded * (zone | sideburn_zone(view))
+    skin = skin + grown * (BEARD_PRIOR[SKIN_CHANNEL] - skin)
+    hair = hair + grown * (BEARD_PRIOR[HAIR_CHANNEL] - hair)
+    # A beard grows close about the lips, and hides the underside of the jaw.
+    feature = view.feature - grown * np.minimum(view.feature, 1.0 - view.feature)
+    known = np.maximum(feature, (1.0 - grown) * view.underside)
+    named = np.maximum(skin, 0.985 * known)
+    hair, skin = hair * (1.0 - named) / (1.0 - skin), named
+    part = np.stack([skin, hair, 1.0 - skin - hair], axis=-1)
+    other = OUTLIER * (1.0 - 0.98 * known[:, :, None])  # lips look like no other skin
+    return np.concatenate([(1.0 - other) * part, other], axis=-1).astype(np.float32)
+
+
+def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float32[np.ndarray, "r c"]:
+    t = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def unlike_cheeks(
+    appearance: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Tells how far every cell does not look like those that are skin for certain, 0 to 1: by colour, and by colour and
+    fine structure, which tells a blond beard from skin (but shadows' borders from skin, too)."""
+    everything = np.ones(len(appearance), np.float32)
+    colour, detail = (
+        (of(which, cheeks) / of(which, everything))[which]
+        for which, of in ((appearance[:, 0], colour_histogram), (appearance[:, 1], detail_histogram))
+    )
+    first, second = ((SKIN_RATIO / (SKIN_RATIO + ratio)) ** 2 for ratio in (colour, colour * detail))
+    return first, second
+
+
+def fit_appearance(
+    appearance: Int[np.ndarray, "n 2"],
+    prior: Float32[np.ndarray, "n 4"],
+    start: Float32[np.ndarray, "n 3"],
+    lower: Bool[np.ndarray, " n"],
+    unlikeness: Float[np.ndarray, " n"],
+    settings: PartSettings,
+) -> Float32[np.ndarray, "n 4"]:
+    """Returns the log likelihood of every cell's looks under skin, hair, clothes and the outlier, and of there being
+    such a part.
+
+    Starts from the cells of each part that are sure by their place, less those of hair and clothes that look like skin.
+    """
+    colour, detail = appearance.T
+    share = start.copy()
+    share[:, HAIR_CHANNEL] = np.maximum(share[:, HAIR_CHANNEL], lower) * unlikeness
+    share[:, CLOTHES_CHANNEL] *= unlikeness
+    present = np.log(_presence(unlikeness, start, lower))
+    logs = np.empty((len(colour), 4), np.float32)
+    logs[:, 3] = settings.strength * -np.log(OUTLIER_BINS)
+    for step in range(settings.steps):
+        for part in (SKIN_CHANNEL, HAIR_CHANNEL, CLOTHES_CHANNEL):
+            like = colour_histogram(colour, share[:, part])[colour] * detail_histogram(detail, share[:, part])[detail]
+            logs[:, part] = settings.strength * np.log(like) + present[part]
+        if step < settings.steps - 1:
+            share = posterior(logs, prior)
+            share[share < CONFIDENT] = 0.0
+    return logs
+
+
+def _presence(
+    unlikeness: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], lower: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, " 3"]:
+    """Is there hair, are there clothes? The share of their sure places that look otherwise than skin; a beard is hair,
+    too."""
+    shares = [float(unlikeness[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
+    return np.maximum([1.0, max(shares[HAIR_CHANNEL], shares[3]), shares[CLOTHES_CHANNEL]], MIN_PRESENT)
+
+
+def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
+    """Returns the probability of each part; what is missing to one is the outlier's."""
+    share = prior * np.exp(logs - logs.max(axis=1, keepdims=True))
+    return share[:, :3] / share.sum(axis=1, keepdims=True)
+
+
+def colour_histogram(colour: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " b"]:
+    """Returns the probability of every bin of colour, smoothed, nowhere zero."""
+    shape = (RED_BINS, BLUE_BINS, LIGHT_BINS)
+    counts = np.bincount(colour, weight, np.prod(shape)).astype(np.float32)
+    counts = counts.reshape(RED_BINS, BLUE_BINS * LIGHT_BINS)
+    counts = cv2.GaussianBlur(counts, (1, 7), sigmaX=0.1, sigmaY=CHROMA_BLUR).reshape(shape)
+    for slab in counts:
+        slab[:] = cv2.GaussianBlur(slab, (0, 0), sigmaX=LIGHT_BLUR, sigmaY=CHROMA_BLUR)
+    light = cv2.GaussianBlur(counts.sum(axis=(0, 1))[None], (0, 0), sigmaX=SHADE_BLUR, sigmaY=0.1)[0]
+    shaded = counts.sum(axis=2, keepdims=True) * (light / max(light.sum(), 1e-9))
+    return _proper(((1.0 - SHADE_SHARE) * counts + SHADE_SHARE * shaded).ravel().astype(float))
+
+
+def detail_histogram(detail: Int[np.ndarray, " n"], weight: Float32[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
+    """Returns the probability of every bin of fine structure, smoothed, nowhere zero."""
+    counts = np.bincount(detail, weight, DETAIL_BINS).astype(np.float32)[None]
+    return _proper(cv2.GaussianBlur(counts, (0, 0), sigmaX=DETAIL_BLUR, sigmaY=0.1).ravel().astype(float))
+
+
+def _proper(counts: Float[np.ndarray, " b"]) -> Float[np.ndarray, " b"]:
+    even = 1.0 / len(counts)
+    return (1.0 - FLOOR) * counts / max(counts.sum(), 1.0) + FLOOR * even
+
+
+def upsample_guided(
+    view: Cells,
+    inside: Bool[np.ndarray, "r c"],
+    share: Float32[np.ndarray, "n 3"],
+    image: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    settings: PartSettings,
+) -> Float32[np.ndarray, "h w 3"]:
+    """Returns the cells' probabilities made smooth up to edges of the photograph, on its own grid."""
+    grid = np.zeros((*inside.shape, 3), np.float32)
+    grid[inside] = share
+    radius = max(1, round(0.5 * settings.smooth_mm / settings.cell_mm))
+    slope, offset = guided(view.grey, grid, inside.astype(np.float32), radius, settings.edge)
+    grey, smooth = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), np.zeros((*mask.shape, 3), np.float32)
+    spread_parts(slope, offset, view.size_px, grey, mask, smooth)
+    return smooth
+
+
+def guided(
+    guide: Float32[np.ndarray, "r c"],
+    values: Float32[np.ndarray, "r c p"],
+    weight: Float32[np.ndarray, "r c"],
+    radius: int,
+    edge: float,
+) -> tuple[Float32[np.ndarray, "r c p"], Float32[np.ndarray, "r c p"]]:
+    """Returns slope and offset of the guided filter: ``slope guide + offset`` are the smooth values (eqs. 5, 6 and 8
+    there).
+
+    ``weight`` is 0 where values are unknown; ``edge`` the contrast of the guide that ends a neighbourhood.
+    """
+
+    def mean(field: np.ndarray) -> np.ndarray:
+        return cv2.blur(field, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_CONSTANT)
+
+    known = np.maximum(mean(weight), 1e-6)
+    middle = mean(guide * weight) / known
+    spread = mean(guide * guide * weight) / known - middle * middle
+    seen = values * weight[:, :, None]
+    level = mean(seen) / known[:, :, None]
+    shared = mean(seen * guide[:, :, None]) / known[:, :, None] - level * middle[:, :, None]
+    slope = shared / (spread + edge * edge)[:, :, None]
+    offset = level - slope * middle[:, :, None]
+    slope, offset = (mean(each * weight[:, :, None]) / known[:, :, None] for each in (slope, offset))
+    return slope, offset

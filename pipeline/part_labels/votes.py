@@ -1,0 +1,93 @@
+"""What a place of the surface shows, by all the views that see it: their part maps vote, cell by cell.
+
+A pixel alone may be a freckle or a gap between strands; and views that see a place from the side know less of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.geometry.projection import project_points
+from pipeline.part_labels.codes import Part, codes_from_channels
+from pipeline.part_labels.labelling import PartMap
+from pipeline.stereo.depth_map import DepthMap, points_world
+from rig.rig import Rig
+
+SKIN = Part.SKIN  # as experiments call it
+PART_NAMES = tuple(part.name.lower() for part in Part)  # by code, in the report
+CELL_MM = 4.0  # edge of a cell
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartVotes:
+    """Holds cells of the visible surface: their mean places (world, mm) and the mean probability of skin, hair,
+    clothes."""
+
+    corner: Float[np.ndarray, " 3"]
+    size: Int[np.ndarray, " 3"]  # cells along each axis
+    keys: Int[np.ndarray, " g"]  # ascending
+    places: Float[np.ndarray, "g 3"]
+    probability: Float[np.ndarray, "g 3"]
+
+
+def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig: Rig) -> PartVotes | None:
+    """Returns the votes of all known pixels.
+
+    Args:
+        depth_maps: one a view.
+        parts: of the same views, on the photographs' own grids.
+        rig: the cameras as calibrated.
+
+    Returns:
+        The cells; None where no view has both depth and parts.
+    """
+    clouds = [(points_world(each), parts[each.camera.name]) for each in depth_maps if each.camera.name in parts]
+    clouds = [(points, part) for points, part in clouds if len(points)]
+    if not clouds:
+        return None
+    points = np.concatenate([points for points, _ in clouds])
+    shown = np.concatenate([_shown(points, part, rig) for points, part in clouds])
+    corner = points.min(axis=0)
+    cell = np.floor((points - corner) / CELL_MM).astype(np.int64)
+    size = cell.max(axis=0) + 1
+    group = _keys(cell, size)
+    count = np.bincount(group)  # a body has a few million such cells: counted sooner than sorted
+    keys = np.flatnonzero(count)
+    group = (np.cumsum(count > 0) - 1)[group]  # of the cells in which anything lies
+    count = count[keys, None]
+
+    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "g 3"]:
+        return np.stack([np.bincount(group, values[:, k]) for k in range(3)], axis=1) / count
+
+    return PartVotes(corner, size, keys, mean(points), mean(shown))
+
+
+def _shown(points: Float[np.ndarray, "n 3"], part: PartMap, rig: Rig) -> Float[np.ndarray, "n 3"]:
+    height, width = part.probability.shape[:2]
+    column, row = np.rint(np.nan_to_num(project_points(rig[part.camera], points), nan=-1.0)).astype(int).T
+    framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return part.probability[np.where(framed, row, 0), np.where(framed, column, 0)] * framed[:, None]
+
+
+def _keys(cell: Int[np.ndarray, "n 3"], size: Int[np.ndarray, " 3"]) -> Int[np.ndarray, " n"]:
+    return (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+
+
+def part_codes(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    """Returns the part (``Part``) that each point's own cell (or, without one, the nearest) shows most."""
+    return codes_from_channels(part_shares(votes, points).argmax(axis=1))
+
+
+def part_shares(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Returns the probability of skin, hair and clothes at each point, of its own cell or, without one, the nearest."""
+    cell = np.floor((points - votes.corner) / CELL_MM).astype(np.int64)
+    inside = ((cell >= 0) & (cell < votes.size)).all(axis=1)
+    keys = np.where(inside, _keys(cell, votes.size), -1)
+    row = np.minimum(np.searchsorted(votes.keys, keys), len(votes.keys) - 1)
+    lost = np.flatnonzero(votes.keys[row] != keys)
+    if len(lost):
+        row[lost] = KDTree(votes.places).query(points[lost])[1]
+    return votes.probability[row]

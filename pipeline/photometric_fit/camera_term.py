@@ -1,0 +1,98 @@
+"""What a patch's views say of the cameras: how far each view would like to slide in its image.
+
+At a patch's peak the mean correlation of its views is the least-squares problem ``sum_k v_k |f_k - T|^2``: f_k the
+patch's grey values in view k, centred and of unit norm, T their mean with the weights v_k (which eliminates the unknown
+texture exactly, and sliding along the surface with it). Linear in the image shifts delta_k (px) of the views,
+
+    H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>,
+
+g_k the images' slopes. A displacement u along the normal and camera corrections c_k make ``delta_k = p_k u + C_k c_k``.
+Eliminating u leaves the derivative of patch depth with respect to camera pose, and a quadratic form in the cameras
+alone: shifts that no surface explains. A camera of 0.2 px error shows in thousands of patches.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.compute.threads import in_threads
+from pipeline.geometry.projection import packed_camera
+from pipeline.photometric_fit.camera_term_kernels import add_by_camera, add_cameras, write_grams, write_image_motion
+from pipeline.photometric_fit.correlation_kernels import Members, Pictures, Samples
+from pipeline.photometric_fit.patches import Patches
+from rig.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraSensitivity:
+    """Holds, of n patches: the derivative of depth with respect to camera pose, and what they say of the cameras
+    alone."""
+
+    by_camera: Float[np.ndarray, "n c"]  # d(place, mm along the normal) / d(cameras), c = 6 K
+    view: Int[np.ndarray, "n v"]
+    stiff: Float[np.ndarray, "n a a"]  # of the image shifts of its views, by the patch's own information
+    slope: Float[np.ndarray, "n a"]
+    slides: Float[np.ndarray, "n a 6"]  # d(image shifts of a view) / d(its camera)
+
+    def cameras(self, information: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
+        """Returns the matrix and gradient (towards the minimum) in the cameras."""
+        size = self.by_camera.shape[1]
+        matrix, gradient = np.zeros((size, size)), np.zeros(size)
+        add_cameras(self.view, self.stiff, self.slope, self.slides, information, matrix, gradient)
+        return matrix, gradient
+
+
+def camera_sensitivity(
+    view: Int[np.ndarray, "n v"],
+    value: Float[np.ndarray, "n v"],
+    grams: tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]],
+    places: Float[np.ndarray, "n 3"],
+    axes: Float[np.ndarray, "n 3"],
+    cameras: tuple[Camera, ...],
+) -> CameraSensitivity:
+    """Computes it of patches whose surface lies at ``places`` and moves along ``axes``; ``grams``: of
+    ``gram_matrices``."""
+    slopes, mixed = grams
+    axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes
+    total = np.maximum(value.sum(axis=1), 1e-12)[:, None]
+    same = np.repeat(np.repeat(np.eye(value.shape[1], dtype=bool), 2, axis=0), 2, axis=1)
+    across_views = axis_value[:, :, None] * axis_value[:, None, :] / total[:, :, None]
+    matrix = slopes * (axis_value[:, :, None] * same - across_views)
+    own_shade = np.take_along_axis(mixed, (np.arange(axis_value.shape[1]) // 2)[None, :, None], axis=2)[:, :, 0]
+    gradient = axis_value * (own_shade - np.einsum("nav,nv->na", mixed, value / total))
+    ahead, slides = np.zeros(axis_value.shape), np.zeros((*axis_value.shape, 6))
+    write_image_motion(view, places, axes, np.stack([packed_camera(camera) for camera in cameras]), ahead, slides)
+    # The surface moves freely: u = - (ahead . (H delta + gradient)) / (ahead . H ahead).
+    across = np.einsum("nab,nb->na", matrix, ahead)
+    curvature = np.einsum("na,na->n", ahead, across)
+    curvature = np.where(curvature > 1e-12, curvature, np.inf)[:, None]
+    down = np.einsum("na,na->n", ahead, gradient)[:, None]
+    by_camera = np.zeros((len(view), 6 * len(cameras)))
+    add_by_camera(view, -across / curvature, slides, by_camera)
+    return CameraSensitivity(
+        by_camera=by_camera,
+        view=view,
+        stiff=(matrix - across[:, :, None] * across[:, None, :] / curvature[:, :, None]) / curvature[:, :, None],
+        slope=(gradient - across * down / curvature) / curvature,
+        slides=slides,
+    )
+
+
+def gram_matrices(
+    patches: Patches,
+    chosen: Int[np.ndarray, " n"],
+    weights: Float[np.ndarray, " e"],
+    view: Int[np.ndarray, "n v"],
+    shifts: Float[np.ndarray, " n"],
+    *,
+    samples: Samples,
+    pictures: Pictures,
+) -> tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]]:
+    """Returns <g, g> of the slopes of a patch's views, two axes each, and <g, f> of slopes and grey values, with the
+    surface moved by ``shifts`` (mm along the normals)."""
+    count, views = view.shape
+    slopes, mixed = np.zeros((count, 2 * views, 2 * views)), np.zeros((count, 2 * views, views))
+    members = Members(patches.start, patches.member, weights)
+    in_threads(count, lambda a, b: write_grams(a, b, chosen, members, view, shifts, samples, pictures, slopes, mixed))
+    return slopes, mixed

@@ -1,0 +1,152 @@
+"""The compiled loops of what patches say of the cameras."""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.geometry.projection_kernels import placed, projection_slopes, turned
+from pipeline.photometric_fit.correlation_kernels import read
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def write_image_motion(view, places, axes, cameras, ahead, slides):
+    """Per image axis of each patch's views: motion (px) by a mm along the axis, and by the correction of its camera (a
+    left perturbation, as everywhere: it acts on the point in the camera's frame)."""
+    for n in range(len(view)):
+        x, y, z = places[n, 0], places[n, 1], places[n, 2]
+        for j in range(view.shape[1]):
+            if view[n, j] < 0:
+                continue
+            camera = cameras[view[n, j]]
+            px, py, pz = placed(camera, x, y, z)
+            for axis, slope in enumerate(projection_slopes(camera, x, y, z)):
+                gx, gy, gz = turned(camera, slope[0], slope[1], slope[2])
+                row, moved = 2 * j + axis, 0.0
+                for c in range(3):
+                    moved += slope[c] * axes[n, c]
+                ahead[n, row] = moved
+                out = slides[n, row]
+                out[0], out[1], out[2] = py * gz - pz * gy, pz * gx - px * gz, px * gy - py * gx
+                out[3], out[4], out[5] = gx, gy, gz
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def add_by_camera(view, pull, slides, by_camera):
+    """The sum over image axes of ``pull . slides``, each at its camera's columns."""
+    for n in range(len(view)):
+        for row in range(pull.shape[1]):
+            first = 6 * view[n, row // 2]
+            if first < 0:
+                continue
+            for c in range(6):
+                by_camera[n, first + c] += pull[n, row] * slides[n, row, c]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def add_cameras(view, stiff, slope, slides, information, matrix, gradient):
+    """``slides^T stiff slides`` and ``-slides^T slope`` of all patches, each worth its ``information``: a block a pair
+    of views."""
+    pulled = np.empty(6)
+    for n in range(len(view)):
+        for a in range(stiff.shape[1]):
+            here = 6 * view[n, a // 2]
+            if here < 0:
+                continue
+            for c in range(6):
+                gradient[here + c] -= information[n] * slope[n, a] * slides[n, a, c]
+            for j in range(view.shape[1]):
+                there = 6 * view[n, j]
+                if there < 0:
+                    continue
+                for c in range(6):
+                    both = stiff[n, a, 2 * j] * slides[n, 2 * j, c] + stiff[n, a, 2 * j + 1] * slides[n, 2 * j + 1, c]
+                    pulled[c] = information[n] * both
+                for b in range(6):
+                    for c in range(6):
+                        matrix[here + b, there + c] += slides[n, a, b] * pulled[c]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def write_grams(first, last, chosen, members, view, shifts, samples, pictures, slopes, mixed):
+    start, member, weight = members
+    pixel, along, seen = samples
+    size, offset, image, noise = pictures
+    most = 0
+    for q in range(first, last):
+        most = max(most, start[chosen[q] + 1] - start[chosen[q]])
+    # By view a row each: its grey values, and their slopes; all by the root of the samples' weights.
+    rows, roots = np.empty((3 * view.shape[1], most), np.float32), np.empty(most, np.float32)
+    for q in range(first, last):
+        begin, count, views = start[chosen[q]], start[chosen[q] + 1] - start[chosen[q]], 0
+        while views < view.shape[1] and view[q, views] >= 0:
+            views += 1
+        for i in range(count):
+            roots[i] = np.sqrt(weight[begin + i])
+        for j in range(views):
+            k = view[q, j]
+            from_, width, height = offset[k], size[k, 0], size[k, 1]
+            shade, turn_x, turn_y = rows[2 * views + j], rows[2 * j], rows[2 * j + 1]
+            total = mean = mean_x = mean_y = 0.0
+            for i in range(count):
+                s, w = member[begin + i], weight[begin + i]
+                shade[i] = turn_x[i] = turn_y[i] = 0.0
+                if not seen[k, s]:
+                    continue
+                x = pixel[k, s, 0] + shifts[q] * along[k, s, 0]
+                y = pixel[k, s, 1] + shifts[q] * along[k, s, 1]
+                shade[i], turn_x[i], turn_y[i] = read_with_slopes(image, from_, width, height, x, y)
+                total += w
+                mean += w * shade[i]
+                mean_x += w * turn_x[i]
+                mean_y += w * turn_y[i]
+            grey, slope_x, slope_y = np.float32(mean / total), np.float32(mean_x / total), np.float32(mean_y / total)
+            energy = along_x = along_y = np.float32(0.0)
+            for i in range(count):
+                root = roots[i] if seen[k, member[begin + i]] else np.float32(0.0)
+                shade[i] = root * (shade[i] - grey)
+                turn_x[i] = root * (turn_x[i] - slope_x)
+                turn_y[i] = root * (turn_y[i] - slope_y)
+                energy += shade[i] * shade[i]
+                along_x += shade[i] * turn_x[i]
+                along_y += shade[i] * turn_y[i]
+            square = energy + np.float32(total * noise[k] * noise[k])
+            per, by_x, by_y = np.float32(1.0) / np.sqrt(square), along_x / square, along_y / square
+            for i in range(count):  # the slope of what has unit norm
+                turn_x[i] = (turn_x[i] - by_x * shade[i]) * per
+                turn_y[i] = (turn_y[i] - by_y * shade[i]) * per
+                shade[i] *= per
+        for a in range(2 * views):
+            for b in range(a + 1):
+                slopes[q, a, b] = slopes[q, b, a] = _product(rows[a], rows[b], count)
+            for b in range(views):
+                mixed[q, a, b] = _product(rows[a], rows[2 * views + b], count)
+
+
+@njit(cache=True, nogil=True, fastmath=True, inline="always")
+def _product(one, other, count):
+    product = np.float32(0.0)
+    for i in range(count):
+        product += one[i] * other[i]
+    return product
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def read_with_slopes(image, start, width, height, x, y):
+    """Bilinear, and the central differences over a pixel to both sides."""
+    if not (1.0 <= x < width - 3.0 and 1.0 <= y < height - 3.0):
+        across = read(image, start, width, height, x + 1.0, y) - read(image, start, width, height, x - 1.0, y)
+        down = read(image, start, width, height, x, y + 1.0) - read(image, start, width, height, x, y - 1.0)
+        half = np.float32(0.5)
+        return read(image, start, width, height, x, y), half * across, half * down
+    column, row = int(x), int(y)
+    right, low = np.float32(x - column), np.float32(y - row)
+    at = start + row * width + column
+    over, here, below, last = at - width, at, at + width, at + 2 * width
+    left, far = np.float32(1.0) - right, np.float32(1.0) - low
+    top0, top1 = left * image[over] + right * image[over + 1], left * image[last] + right * image[last + 1]
+    one, two = left * image[here] + right * image[here + 1], left * image[below] + right * image[below + 1]
+    ahead = left * image[here + 1] + right * image[here + 2], left * image[below + 1] + right * image[below + 2]
+    behind = left * image[here - 1] + right * image[here], left * image[below - 1] + right * image[below]
+    half = np.float32(0.5)
+    across = far * (ahead[0] - behind[0]) + low * (ahead[1] - behind[1])
+    down = far * (two - top0) + low * (top1 - one)
+    return far * one + low * two, half * across, half * down

@@ -1,0 +1,292 @@
+"""Photo-consistency: where along its normal each patch of the surface looks alike in the views that see it.
+
+The variance of a place is that of a shift between two signals of correlation rho,
+
+    variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|,
+
+so that texture, noise, defocus and grazing views all show in it. Gain and offset of a camera drop out.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from pipeline.compute.threads import thread_count
+from pipeline.contour_fit.problem import ContourProblem, State, SurfaceObservations, moved_views
+from pipeline.contour_fit.rim import Views
+from pipeline.geometry.projection import project_points
+from pipeline.geometry.raster import camera_depths
+from pipeline.geometry.raster_kernels import rasterise
+from pipeline.photometric_fit.camera_term import camera_sensitivity, gram_matrices
+from pipeline.photometric_fit.correlation import choose_views, correlate, sweep
+from pipeline.photometric_fit.correlation_kernels import Pictures, Samples
+from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred, distance_of
+from pipeline.photometric_fit.patches import Patches
+from pipeline.settings import PhotoSettings
+from rig.camera import Camera
+from rig.geometry import RigidTransform
+from rig.mesh import Mesh
+from rig.parabola import second_difference, vertex_offset
+
+DEPTH_LEVEL = "p95"  # of the z-buffer: it differs from the full mesh by far less than what may hide a sample
+MIN_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears over 5 times its size
+EDGE_PX = 4  # nothing is read nearer to the image's edge
+WINDOW_PX = 3  # around a sample in which a nearer surface may blur over it
+FLATTEST = 1e-6  # curvature of correlation by a step squared: below it a peak has no place of its own
+BOUND_HEIGHT = 0.9  # correlation from which on hair says where it is
+SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring a surface within the window
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Holds one pass over all patches."""
+
+    window_mm: float  # standard deviation of the patch's window
+    blur_mm: float  # of the images, on the head
+    reach_mm: float  # to both sides along the normal
+    steps: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleVisibility:
+    """Holds the head as it stands, and who sees what of it."""
+
+    cameras: tuple[Camera, ...]  # where the state has them
+    vertices: Float[np.ndarray, "v 3"]  # full level, world
+    normals: Float[np.ndarray, "v 3"]
+    points: Float[np.ndarray, "s 3"]  # samples
+    facing: Float32[np.ndarray, "k s"]  # cosine between normal and line of sight, 0 where a camera does not see it
+    pixel: Float[np.ndarray, "k s 2"]  # where each camera sees a sample, and how that moves along the normal, px / mm;
+    along: Float[np.ndarray, "k s 2"]  # both 0 where it does not
+
+
+def sample_visibility(
+    problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"], settings: PhotoSettings
+) -> SampleVisibility:
+    """Draws the depth of the head in every view, and asks for every sample."""
+    model, pose = problem.model, state.world_from_head
+    cage = model.cage(state.coefficients)
+    head = Mesh(pose.apply(model.levels["full"].operator @ cage), model.levels["full"].faces)
+    coarse = Mesh(pose.apply(model.levels[DEPTH_LEVEL].operator @ cage), model.levels[DEPTH_LEVEL].faces)
+    return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks, settings=settings)
+
+
+def visibility_of(
+    head_world: Mesh,
+    coarse_world: Mesh,
+    cameras: tuple[Camera, ...],
+    views: Views,
+    patches: Patches,
+    speaks: Bool[np.ndarray, " k"],
+    *,
+    settings: PhotoSettings,
+) -> SampleVisibility:
+    """Returns who sees what of a head; a mesh that is ``coarse`` is drawn for what hides it.
+
+    Args:
+        head_world: the patches' mesh, mm.
+        coarse_world: the same surface with fewer triangles.
+        cameras: those of the views, where they stand.
+        views: their silhouettes.
+        patches: whose samples are asked for.
+        speaks: views whose photograph shows something.
+        settings: margins.
+    """
+    normals = head_world.normals()
+    points, outward = patches.points(head_world.vertices), patches.normals(normals)
+
+    def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        camera, distance = cameras[k], distance_of(views, k)
+        facing, ends = np.zeros(len(points), np.float32), np.zeros((2, len(points), 2))
+        if not speaks[k]:
+            return facing, ends[0], ends[1]
+        pixel, depth = project_points(camera, coarse_world.vertices), camera_depths(camera, coarse_world.vertices)
+        depth, _ = rasterise(pixel, depth, coarse_world.faces, *distance.shape)
+        facing = facing_of(points, outward, camera, depth, distance, settings)
+        seen = np.flatnonzero(facing)
+        here, further = project_points(camera, points[seen]), project_points(camera, points[seen] + outward[seen])
+        ends[:, seen] = here, further - here
+        return facing, ends[0], ends[1]
+
+    with ThreadPoolExecutor(thread_count()) as pool:
+        facing, pixel, along = zip(*pool.map(one, range(len(cameras))), strict=True)
+    return SampleVisibility(
+        cameras, head_world.vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along)
+    )
+
+
+def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
+    """Returns the cameras where the state has them."""
+    views = moved_views(problem, state)
+    return tuple(
+        replace(camera, camera_from_world=RigidTransform(rotation, translation))
+        for camera, rotation, translation in zip(problem.rig, views.rotation, views.translation, strict=True)
+    )
+
+
+def facing_of(
+    points: Float[np.ndarray, "s 3"],
+    normals: Float[np.ndarray, "s 3"],
+    camera: Camera,
+    depth: Float32[np.ndarray, "h w"],
+    distance: Float32[np.ndarray, "h w"],
+    settings: PhotoSettings,
+) -> Float32[np.ndarray, " s"]:
+    """Returns the cosine between normal and line of sight for every sample that the camera sees; 0 where it does not.
+
+    ``depth`` is the z-buffer of the head, ``distance`` the silhouette's signed distance.
+    """
+    towards = camera.centre_world - points
+    cosine = np.einsum("sc,sc->s", towards, normals) / np.linalg.norm(towards, axis=1)
+    height, width = depth.shape
+    front = np.flatnonzero(cosine >= MIN_FACING)
+    pixel = project_points(camera, points[front])
+    with np.errstate(invalid="ignore"):  # NaN is outside
+        inside = ((pixel >= EDGE_PX) & (pixel < (width - EDGE_PX - 1, height - EDGE_PX - 1))).all(axis=1)
+    rows = front[inside]
+    column, row = np.rint(pixel[inside]).astype(int).T
+    nearest = cv2.erode(depth, np.ones((2 * WINDOW_PX + 1,) * 2, np.uint8))[row, column]
+    z, facing = camera_depths(camera, points[rows]), cosine[rows]
+    slope = np.minimum(np.sqrt(np.maximum(1.0 - facing**2, 0.0)) / facing, 4.0)
+    slack = settings.hidden_mm + SLOPE_SLACK * slope * z / camera.intrinsics.fx
+    seen = (distance[row, column] <= -settings.contour_margin_px) & (z <= nearest + slack)
+    out = np.zeros(len(points), np.float32)
+    out[rows[seen]] = facing[seen]
+    return out
+
+
+def observe(
+    problem: ContourProblem,
+    state: State,
+    photographs: Photographs,
+    patches: Patches,
+    visibility: SampleVisibility,
+    hair: Bool[np.ndarray, " c"],
+    *,
+    basis: Float32[np.ndarray, "m c 3"],
+    each: Round,
+    settings: PhotoSettings,
+) -> tuple[SurfaceObservations, Int[np.ndarray, " u"]]:
+    """Returns where the photographs see the surface, by the vertices at the patches' centres, and the vertices that
+    they see without knowing where they are; a patch of ``hair`` says only that the head is no farther out than that.
+    ``basis``: the model's modes at the centres."""
+    scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
+    found = find_places(photographs, patches, visibility, problem.views, scale, each=each, settings=settings)
+    several, clear, view, value = found.several, found.clear, found.view, found.value
+    kept = np.flatnonzero(several & clear & (~hair | ((found.place < 0.0) & (found.height > BOUND_HEIGHT))))
+    # Patches overlap: what they say together is worth their area, not their number.
+    overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / settings.centre_mm**2)
+    information = 1.0 / (overlap * found.variance[kept])
+    rows, place = patches.centre[kept], found.place[kept]
+    grams = gram_matrices(
+        patches, kept, found.weights, view[kept], place, samples=found.samples, pictures=found.pictures
+    )
+    stood, normal = visibility.vertices[rows], visibility.normals[rows]
+    sensitivity = camera_sensitivity(
+        view[kept], value[kept], grams, stood + place[:, None] * normal, normal, visibility.cameras
+    )
+    camera_matrix, camera_gradient = sensitivity.cameras(information)
+    metric = metric_rig(visibility.cameras, state.world_from_head.translation, settings.rig_scale_spread)
+    observations = SurfaceObservations(
+        vertex=rows,
+        basis=basis.take(kept, axis=1),  # basis[:, kept] is laid out by vertex, and copied whenever it is used
+        mean=problem.model.levels["full"].operator[rows] @ problem.model.mean.astype(float),
+        normal=normal,
+        seen_at=stood,
+        displacement=place,
+        information=information,
+        bound=hair[kept],
+        by_camera=sensitivity.by_camera,
+        camera_shift=state.camera_shift,
+        camera_matrix=camera_matrix + metric,
+        camera_gradient=camera_gradient - metric @ state.camera_shift.ravel(),
+    )
+    return observations, patches.centre[~hair & several & ~clear]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Says where c patches look most alike, and what that was read from."""
+
+    place: Float[np.ndarray, " c"]  # mm along the normal
+    height: Float[np.ndarray, " c"]  # the correlation there
+    variance: Float[np.ndarray, " c"]  # mm^2
+    several: Bool[np.ndarray, " c"]  # two views or more see the patch
+    clear: Bool[np.ndarray, " c"]  # they agree, inside the reach
+    view: Int[np.ndarray, "c n"]
+    value: Float[np.ndarray, "c n"]
+    weights: Float[np.ndarray, " e"]
+    samples: Samples
+    pictures: Pictures
+
+
+def find_places(
+    photographs: Photographs,
+    patches: Patches,
+    visibility: SampleVisibility,
+    views: Views,
+    scale: Float[np.ndarray, " k"],
+    *,
+    each: Round,
+    settings: PhotoSettings,
+) -> Places:
+    """Returns every patch moved along its normal through the photographs of the views that see it; ``scale``: px a
+    mm."""
+    steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
+    image, noise = blurred(photographs, each.blur_mm * scale)
+    weights, seen = patches.weights(each.window_mm), visibility.facing > 0
+    samples = Samples(visibility.pixel, visibility.along, seen)
+    pictures = Pictures(views.size, views.offset, image, noise)
+    grey = sweep(samples, pictures, steps)
+    view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
+    peaks = find_peaks(correlate(patches, weights, view, value, seen, grey=grey, noise=noise), steps)
+    blur_mm = np.maximum(each.blur_mm, MIN_BLUR_PX / scale).mean()
+    variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
+    clear = peaks.inside & (peaks.height > settings.least_correlation)
+    return Places(peaks.place, peaks.height, variance, view[:, 1] >= 0, clear, view, value, weights, samples, pictures)
+
+
+def metric_rig(
+    cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"], spread: float
+) -> Float[np.ndarray, "c c"]:
+    """Returns information that cameras do not all err towards the head alike: their distances come from one board,
+    whose size is known. Images alone cannot tell; a contour that lies a tenth of a pixel too far out would otherwise
+    move every camera closer, and the surface with them."""
+    depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
+    nearer = np.zeros((len(depth), 6))
+    nearer[:, 5] = 1.0 / (len(depth) * depth)
+    return np.outer(nearer, nearer) / spread**2
+
+
+def pixels_per_mm(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
+    """Tells how large each camera sees a mm at the head's place."""
+    return np.array([c.intrinsics.fx / c.camera_from_world.apply(at_world)[2] for c in cameras])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Peaks:
+    """Holds the highest point of each patch's correlation."""
+
+    place: Float[np.ndarray, " c"]  # mm along the normal
+    height: Float[np.ndarray, " c"]
+    curvature: Float[np.ndarray, " c"]  # mm^-2
+    inside: np.ndarray  # is it a peak, and not the end of the reach?
+
+
+def find_peaks(score: Float32[np.ndarray, "c d"], steps: Float[np.ndarray, " d"]) -> Peaks:
+    """Finds each patch's peak by the highest step and its neighbours."""
+    best = score.argmax(axis=1)
+    middle = np.clip(best, 1, len(steps) - 2)
+    rows, step = np.arange(len(score)), steps[1] - steps[0]
+    below, at, above = (score[rows, middle + j].astype(float) for j in (-1, 0, 1))
+    curvature = np.minimum(second_difference(below, at, above), -FLATTEST)
+    offset = np.clip(vertex_offset(below, above, curvature), -1.0, 1.0)
+    return Peaks(
+        place=steps[middle] + offset * step,
+        height=np.minimum(at + 0.25 * (above - below) * offset, 1.0),
+        curvature=-curvature / step**2,
+        inside=best == middle,
+    )

@@ -1,0 +1,68 @@
+"""The photographs as photo-consistency reads them: grey, with their noise, blurred to the size that is asked for."""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from pipeline.compute.threads import map_in_threads, thread_count
+from pipeline.contour_fit.rim import Views
+from pipeline.imaging.grey import LUMINANCE, noise_level
+
+MIN_BLUR_PX = 0.7  # below that a bilinear sample is mostly interpolation error
+INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photographs:
+    """Holds of the solver's views pictures in grey, the noise (grey levels) of each, and whether it shows anything at
+    all. A view without a photograph is black."""
+
+    grey: tuple[Float32[np.ndarray, "_ _"], ...]
+    noise: Float[np.ndarray, " k"]
+    speaks: Bool[np.ndarray, " k"]
+
+
+def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Views) -> Photographs:
+    """Loads those of the views; a view without a photograph, or with nothing to see in it, does not speak."""
+
+    def load(k: int) -> tuple[Float32[np.ndarray, "h w"], float, bool]:
+        width, height = views.size[k]
+        image = images.get(views.names[k], np.zeros((height, width, 3), np.uint8))
+        grey = image.astype(np.float32) @ LUMINANCE
+        noise = noise_level(grey)
+        return grey, noise, shows_texture(grey, distance_of(views, k) < -INSIDE_PX, noise)
+
+    grey, noise, speaks = zip(*map_in_threads(load, len(views.names)), strict=True)
+    return Photographs(grey, np.array(noise), np.array(speaks))
+
+
+def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:
+    """Returns the signed distance of one view."""
+    width, height = views.size[k]
+    return views.distance[views.offset[k] : views.offset[k] + width * height].reshape(height, width)
+
+
+def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], noise: float) -> bool:
+    """Tells whether there is more than noise inside the silhouette, and not half of it burnt out or black. A mask that
+    stands in for a photograph is one even value there."""
+    if not inside.any():
+        return False
+    smooth = cv2.GaussianBlur(grey, (0, 0), TEXTURE_BLUR_PX)[inside]
+    detail = float(np.std(smooth))
+    exposed = float(np.mean((grey[inside] > 2.0) & (grey[inside] < 253.0)))
+    sharp = detail > TEXTURE_NOISES * noise / (2.0 * np.sqrt(np.pi) * TEXTURE_BLUR_PX)
+    return bool(sharp and exposed > 0.5)
+
+
+def blurred(
+    photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
+) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
+    """Returns all images, blurred, in one row, and the noise that is left: white noise falls by 2 sqrt(pi) sigma."""
+    sigma = np.maximum(sigma_px, MIN_BLUR_PX)
+    with ThreadPoolExecutor(thread_count()) as pool:
+        smooth = pool.map(lambda i, s: cv2.GaussianBlur(i, (0, 0), s).ravel(), photographs.grey, sigma.tolist())
+        return np.concatenate(list(smooth)), photographs.noise / (2.0 * np.sqrt(np.pi) * sigma)

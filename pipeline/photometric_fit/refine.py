@@ -1,0 +1,154 @@
+"""Photographs as evidence inside the outline, in the contour solver's own problem.
+
+Enters: a solved contour problem and the photographs. Leaves: the same problem with a finer basis and with observations
+of the surface, solved again. Three rounds, coarse to fine: each patch of the current surface (``patches``) moves along
+its normals through the images of the cameras that see it; where its views look most alike, the surface is said to be
+(``depth_search``), and how far the views would rather slide says where the cameras are (``camera_term``). No peak
+inside the reach, or a low one (occluded, specular, textureless), is silence, and so is hair (``hair_mask``). The
+observations enter the normal equations beside rims, features and priors (``surface_term``), robustly; where they are
+silent the kernels carry on smoothly.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.compute.array_cache import cached_arrays
+from pipeline.contour_fit.contour import ContourSolution, run_stage
+from pipeline.contour_fit.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widened
+from pipeline.contour_fit.surface_term import surface_residual
+from pipeline.head_model.gaussian_process import with_fine_kernel
+from pipeline.head_model.model import HeadModel
+from pipeline.photometric_fit.depth_search import Round, observe, sample_visibility
+from pipeline.photometric_fit.hair_mask import HairProbability, under_hair
+from pipeline.photometric_fit.images import load_photographs
+from pipeline.photometric_fit.patches import Patches, arrays_of, make_patches
+from pipeline.settings import PhotoSettings
+from pipeline.warnings import Detail
+from rig.mesh import vertex_normals
+from rig.messages.message import compose
+
+ROUNDS = (Round(3.0, 0.8, 4.0, 17), Round(2.5, 0.55, 2.0, 13), Round(2.0, 0.45, 1.0, 9))
+RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its widest window
+LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is the full level's anyway
+MIN_VIEWS = 3
+NEIGHBOURS, NEAR_MM = 24, 4.0  # patches about a vertex: two windows
+HAIR_REACH_MM = 4.0  # patches are 3 mm apart
+LOST_MM = 2.5  # off by at least that where nothing matches: what two photographs still recognise
+MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's own misfit: its few patches know their
+# variance badly, all of them together well. So 95 % intervals hold 91 to 98 % of a scan and four draws
+
+
+def refine_with_photographs(
+    solved: ContourSolution,
+    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+    settings: PhotoSettings,
+    *,
+    hair: HairProbability | None = None,
+) -> tuple[ContourSolution, Detail]:
+    """Goes on from the contours' solution with what the photographs show inside the outline, in a finer basis.
+
+    Args:
+        solved: the contours' solution.
+        images: sRGB photographs by camera.
+        settings: lengths and thresholds.
+        hair: how probably each pixel shows hair, by camera; without it everything inside the outline is skin.
+
+    Returns:
+        The solution; where the photographs show too little, as it was. And which of the two, and why.
+    """
+    problem = solved.problem
+    photographs = load_photographs(images, problem.views)
+    speaking = int(np.count_nonzero(photographs.speaks))
+    if speaking < MIN_VIEWS:
+        why = compose("level-views-without-texture", speaking=speaking, all=len(problem.views.names), needed=MIN_VIEWS)
+        return solved, Detail("kernel", why)
+    model, patches, basis = finer(problem.model, settings)
+    problem = widened(problem, model, (LEVEL,))
+    stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
+    state, evaluations, reason, share = solved.state, solved.evaluations, solved.termination_reason, 0.0
+    evidence = solved.evidence
+    centres = model.vertices(np.zeros(0))[patches.centre]
+    lost, surface = np.zeros(0, int), None
+    for each in ROUNDS:
+        visibility = sample_visibility(problem, state, patches, photographs.speaks, settings)
+        seen = visibility.facing > 0
+        hidden = under_hair(patches, hair or {}, problem.views.names, visibility.pixel, seen, centres)
+        surface, lost = observe(
+            problem, state, photographs, patches, visibility, hidden, basis=basis, each=each, settings=settings
+        )
+        share = np.count_nonzero(~surface.bound) / max(len(patches.centre), 1)
+        if share < settings.least_share:
+            why = compose("level-alike-too-little", share=share, needed=settings.least_share)
+            return solved, Detail("kernel", why)
+        outline = {LEVEL: near_hair(model, patches.centre[hidden])}
+        evidence = StageEvidence(solved.evidence.noise, PhotoEvidence(surface, outline))
+        state, used, reason = run_stage(problem, evidence, state, stage, lambda fraction: None)
+        evaluations += used
+    assert surface is not None
+    misfit = local_misfit_mm(model, surface, state, lost)
+    why = compose("level-alike", share=share, photographs=speaking)
+    return ContourSolution(problem, evidence, state, stage, evaluations, reason, misfit), Detail("photo", why)
+
+
+@lru_cache(maxsize=1)  # 150 MB; studios work with one model
+def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
+    """Returns the model with the fine kernel, its patches, and its modes at their centres: what the model alone
+    decides."""
+    length, amplitude = settings.fine_length_mm, settings.fine_amplitude_mm
+    sizes = {
+        "sample_mm": settings.sample_mm,
+        "centre_mm": settings.centre_mm,
+        "radius_mm": RADIUS_WINDOWS * max(each.window_mm for each in ROUNDS),
+    }
+
+    def make() -> dict[str, np.ndarray]:
+        fine = with_fine_kernel(model, length_mm=length, amplitude_mm=amplitude)
+        patches = make_patches(model, **sizes)
+        basis = fine.basis("full", len(fine.modes), patches.centre)
+        return {"modes": fine.modes, "sigma": fine.sigma, "basis": basis, **arrays_of(patches)}
+
+    full, cage = model.levels["full"], model.levels["cage"]
+    operator = (full.operator.data, full.operator.indices, full.operator.indptr)
+    faces = (full.faces, full.face_region, cage.faces, cage.face_region)
+    kept = cached_arrays(
+        "fine-modes",
+        (model.mean, model.modes, model.sigma, *operator, *faces, length, amplitude, sizes),
+        make,
+        made_by=(with_fine_kernel, make_patches, vertex_normals, HeadModel),
+    )
+    fine = replace(model, modes=kept.pop("modes"), sigma=kept.pop("sigma"), _bases={})
+    basis = kept.pop("basis")
+    return fine, Patches(**kept), basis
+
+
+def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
+    """Returns the vertices of the rim's level about vertices of the full level that lie under hair: their outline is
+    hair's. A fit to contours alone has bulged into it wherever its edge hung together with the face's."""
+    mean = model.vertices(np.zeros(0))
+    if not len(hair):
+        return np.zeros(model.levels[LEVEL].count, bool)
+    return KDTree(mean[hair]).query(mean[model.levels[LEVEL].rows])[0] < HAIR_REACH_MM
+
+
+def local_misfit_mm(
+    model: HeadModel, seen: SurfaceObservations, state: State, lost: Int[np.ndarray, " u"]
+) -> Float[np.ndarray, " v0"]:
+    """Tells how far the surface that photographs see lies off the fitted one around each cage vertex, in mm (RMS).
+
+    Where several cameras see a place (vertex ``lost``) and find no match within reach, it is off by more than they can
+    tell: eyes that the model has open and the subject closed. That counts where it is, and not for the whole head.
+    Nothing is said beyond the patches.
+    """
+    skin = ~seen.bound
+    off = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)[0][skin]
+    full, cage = model.vertices(np.zeros(0)), model.mean.astype(float)
+    square = np.concatenate([np.minimum(np.abs(off), LOST_MM), np.full(len(lost), LOST_MM)]) ** 2
+    square = MISFIT_LOCAL * square + (1.0 - MISFIT_LOCAL) * square[: len(off)].mean()
+    distance, near = KDTree(full[np.concatenate([seen.vertex[skin], lost])]).query(cage, k=min(NEIGHBOURS, len(square)))
+    weight = np.exp(-0.5 * (distance / NEAR_MM) ** 2)
+    return MISFIT_FACTOR * np.sqrt((weight * square[near]).sum(axis=1) / np.maximum(weight.sum(axis=1), 0.1))

@@ -1,0 +1,1 @@
+"""Compares with other programs: soft rasterisers, morphable models, OpenMVS."""

@@ -1,0 +1,136 @@
+"""Eyes that are open, half closed and closed: how often is the warning ``eyes-closed`` wrong?
+
+Heads of both models in the studio, each with open, half closed and closed lids; every fourth head moves one eye alone.
+The warning is right where it names the eyes whose lids meet and no others: half closed lids are no closed ones.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.detail.eyelids import SIDES
+from pipeline.head_model.expressions import BLINKS, closed_lids, plain_name
+from pipeline.head_model.model import HeadModel
+from pipeline.research import markdown
+from pipeline.research.outcome import Outcome, Row
+from pipeline.research.records import Records
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.warnings import ReportWarning
+from rig.capture import Capture
+from rig.errors import EigenheadError, InputError
+from rig.mesh import Mesh
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import SimulatedCapture, simulate
+from rig.studio.scene.subject import Subject
+from rig.studio.sensor.preset import PRESET
+
+Job = Callable[[Capture, Rig], Reconstruction]
+STATES: Mapping[str, float] = {"open": 0.0, "half": 0.5, "closed": 1.0}
+HEADS = 10  # of each model
+WINKS_EVERY = 4
+SEED, SPREAD = 34, 0.8
+
+
+def eyes(
+    models: Mapping[str, HeadModel],
+    job: Job,
+    *,
+    renderer: Renderer,
+    report: Callable[[str, float], None],
+    key: str,
+    heads: int = HEADS,
+    folder: Path | None = None,
+) -> Outcome:
+    """Computes ``eyes_wrong`` of ``eyes_heads``, and ``eyes_<state>_wrong``.
+
+    Args:
+        models: that heads are drawn from, by name.
+        job: the product's whole job.
+        renderer: for the studio.
+        report: told the head and the share done.
+        key: names all that the rows depend on, as in ``Records``.
+        heads: of each model, each in all three states.
+        folder: keeps rows, so that a stopped run goes on.
+    """
+    records, rows = Records(folder, "people-eyes", key), []
+    cases = [*product(range(heads), models.items(), STATES)]
+    for done, (number, (label, model), state) in enumerate(cases):
+        name = f"{label}-{number:02} {state}"
+        report(name, done / len(cases))
+        row = records.row(name, partial(eye_row, model, number, state, job, renderer))
+        rows.append({"name": name, "state": state, **row})
+    report("done", 1.0)
+    return {"figures": figures(rows), "rows": rows, "markdown": table(rows), "lines": table(rows).splitlines()}
+
+
+def eye_row(model: HeadModel, number: int, state: str, job: Job, renderer: Renderer) -> Row:
+    """Runs one job: which eyes are closed, and which ones the operator is told of."""
+    closed = closed_sides(number) if state == "closed" else frozenset[str]()
+    shot = photograph_eyes(model, number, STATES[state], renderer)
+    try:
+        warnings = job(shot.capture, shot.rig).warnings
+    except EigenheadError as error:
+        return {"closed": sorted(closed), "refused": str(error)[:120], "is_wrong": True}
+    named = told_sides(warnings)
+    return {"closed": sorted(closed), "told": sorted(named), "is_wrong": named != closed}
+
+
+def closed_sides(number: int) -> frozenset[str]:
+    """Returns the eyes that head ``number`` moves."""
+    return frozenset(SIDES if number % WINKS_EVERY else SIDES[:1])
+
+
+def told_sides(warnings: Sequence[ReportWarning]) -> frozenset[str]:
+    """Returns the eyes that ``eyes-closed`` names; both where it names none."""
+    texts = [warning.text for warning in warnings if warning.code == "eyes-closed"]
+    return frozenset(side for side in SIDES for text in texts if side in text or not any(s in text for s in SIDES))
+
+
+def photograph_eyes(model: HeadModel, number: int, share: float, renderer: Renderer) -> SimulatedCapture:
+    """Photographs head ``number`` with its lids ``share`` of the way down. Raises InputError for a model whose eyes do
+    not close."""
+    weights = {blink_of(model, side): share for side in closed_sides(number)}
+    head = model.posed_vertices(
+        SPREAD * np.random.default_rng((SEED, number)).standard_normal(len(model.modes)), weights
+    )
+    full = model.levels["full"]
+    marks = {name: head[row] for name, row in model.landmarks.items()}
+    lids = closed_lids(weights)
+    sitter = Subject(Mesh(head, full.faces), marks, full.face_region, f"{model.name}-{number}", lids)
+    return simulate(sitter, default_layout(), PRESET, np.random.default_rng((SEED, number, 1)), renderer=renderer)
+
+
+def blink_of(model: HeadModel, side: str) -> str:
+    """Returns the first expression that closes an eye. Raises InputError where there is none."""
+    found = [name for name in model.expressions.names if BLINKS.get(plain_name(name)) == side]
+    if not found:
+        raise InputError(model.name, [f"closes no {side} eye: import it again with its expressions"])
+    return found[0]
+
+
+def figures(rows: Sequence[Row]) -> dict[str, float]:
+    """Counts wrong heads, of all and by state."""
+    found: dict[str, float] = {"eyes_wrong": sum(row["is_wrong"] for row in rows), "eyes_heads": len(rows)}
+    return found | {
+        f"eyes_{state}_wrong": sum(row["is_wrong"] for row in rows if row["state"] == state) for state in STATES
+    }
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Writes a Markdown table, the wrong ones marked."""
+    header = ("head", "closed", "told", "wrong")
+    cells = [
+        [
+            row["name"],
+            ", ".join(row["closed"]) or "-",
+            row.get("refused") or ", ".join(row["told"]) or "-",
+            "wrong" if row["is_wrong"] else "-",
+        ]
+        for row in rows
+    ]
+    return markdown.table(header, cells)

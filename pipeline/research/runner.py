@@ -1,0 +1,307 @@
+"""The experiments behind ``eigenhead experiments``: which there are, what each needs from this machine, and the files
+that they leave: rows (so that a stopped run goes on), a Markdown table, pictures."""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.head_model.data_folder import models_folder
+from pipeline.head_model.model import HeadModel, assemble, load_model
+from pipeline.head_model.model_names import model_path
+from pipeline.model_building.sources.imports import import_model
+from pipeline.research import markdown
+from pipeline.research.faults.drift import drift
+from pipeline.research.faults.exchanges import exchanges, false_alarms
+from pipeline.research.faults.planted import planted
+from pipeline.research.outcome import Outcome
+from pipeline.research.paper import detail, span, tables
+from pipeline.research.paper.alignment import alignment
+from pipeline.research.paper.convergence import convergence
+from pipeline.research.paper.cost import cost
+from pipeline.research.paper.levels import levels
+from pipeline.research.paper.limit import limit
+from pipeline.research.paper.posterior_check import posterior_check
+from pipeline.research.paper.robustness import robustness
+from pipeline.research.paper.views import views
+from pipeline.research.people.expressions import expressions
+from pipeline.research.people.people import people
+from pipeline.research.surface.hidden import hidden
+from pipeline.research.surface.light import light
+from pipeline.research.surface.relief import relief
+from pipeline.research.surface.repeat import repeat
+from pipeline.research.surface.surfaces import surfaces
+from pipeline.research.surface.templates import templates
+from pipeline.research.surface.texture import texture
+from pipeline.research.surface.visible import visible
+from rig.atomic_write import write_atomically
+from rig.errors import EigenheadError, InputError
+from rig.formats.images import write_image
+from rig.progress import Progress
+from rig.render.renderer import Renderer
+
+
+class UnknownExperiment(EigenheadError):
+    """Refuses a name that no experiment has."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"no experiment is called {name!r}; there are {', '.join(EXPERIMENTS)}")
+
+
+class MissingPeers(EigenheadError):
+    """Reports that a package of the group ``peers`` is not installed."""
+
+    def __init__(self, package: str) -> None:
+        super().__init__(f"{package} is not installed: run `uv sync --group peers`")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """Holds what some experiments take alone.
+
+    ``simplex``: how many subjects of a table the simplex fits too; ``captures``: whether those of the shared folder
+    count beside the studio's heads; ``openmvs``: that peer's programs. Of people and
+    relief ``folders`` are the captures, of people ``only`` says which of its rows, ``detail`` how deep.
+    """
+
+    simplex: int | None = None
+    captures: bool = False
+    openmvs: Path | None = None
+    folders: tuple[Path, ...] = ()
+    only: tuple[str, ...] = ()
+    detail: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """Holds what a command asks for."""
+
+    head: HeadModel
+    subjects: int | None
+    shared: Path
+    folder: Path | None
+    report: Progress
+    options: Options
+
+
+NO_OPTIONS = Options()
+
+
+def run_experiment(
+    name: str,
+    *,
+    model: str,
+    subjects: int | None,
+    shared: Path,
+    folder: Path | None,
+    report: Progress,
+    options: Options = NO_OPTIONS,
+) -> Outcome:
+    """Returns figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a
+    table and pictures are left there.
+
+    ``shared`` holds captures/ with their truths and ict-facekit/. Raises UnknownExperiment, MissingPeers, InputError.
+    """
+    if name not in EXPERIMENTS:
+        raise UnknownExperiment(name)
+    found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, options))
+    pictures = found.pop("pictures", {})
+    text = found.pop("markdown", None) or markdown.of_figures(found["figures"])
+    if folder is not None:
+        write_atomically(folder / f"{name}.md", text.encode())
+        for title, image in pictures.items():
+            write_image(folder / f"{name}-{title}.png", image)
+    return found
+
+
+def _drawn(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
+    """An experiment that needs a renderer, the model and a number of subjects."""
+
+    def run(task: Task) -> Outcome:
+        count = {"subjects": task.subjects} if task.subjects else {}
+        with Renderer.create() as renderer:
+            return experiment(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
+
+    return run
+
+
+def _table(table: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
+    def run(task: Task) -> Outcome:
+        requested = {"subjects": task.subjects, "simplex_subjects": task.options.simplex}
+        count = {key: value for key, value in requested.items() if value is not None}
+        with Renderer.create() as renderer:
+            return table(task.head, renderer=renderer, report=task.report, folder=task.folder, **count)
+
+    return run
+
+
+def _peers(task: Task) -> Outcome:
+    for package in ("cma", "pybobyqa", "jax"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingPeers(package)
+    from pipeline.research.peers.peers import peers
+
+    return _drawn(peers)(task)
+
+
+def _limit(task: Task) -> Outcome:
+    with Renderer.create() as renderer:
+        return limit(task.head, renderer=renderer, report=task.report, subjects=task.subjects or 15)
+
+
+def _span(task: Task) -> Outcome:
+    other = _facekit(task.shared)
+    truths = [span.read_truth(path) for path in _truths(task.shared).values()]
+    truths += span.random_draws(other, task.subjects or 20)
+    return span.run({"default": task.head, "ict": other}, truths, report=task.report)
+
+
+def _detail(task: Task) -> Outcome:
+    other = _facekit(task.shared)
+    captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
+    with Renderer.create() as renderer:
+        return detail.run(
+            {"default": task.head, "ict": other},
+            captures,
+            renderer=renderer,
+            report=task.report,
+            others=other,
+            draws=task.subjects or 20,
+            in_span=task.subjects or 10,
+            folder=task.folder,
+        )
+
+
+def _expressions(task: Task) -> Outcome:
+    models = {"default": task.head, "ict": _facekit(task.shared)}
+    for name, model in models.items():
+        if not len(model.expressions):
+            raise InputError(name, ["has no expressions: import it again, or name --shared"])
+    count = {"subjects": task.subjects} if task.subjects else {}
+    with Renderer.create() as renderer:
+        return expressions(models, renderer=renderer, report=task.report, folder=task.folder, **count)
+
+
+def _hidden(task: Task) -> Outcome:
+    with Renderer.create() as renderer:
+        return hidden(
+            task.head,
+            _captures(task),
+            renderer=renderer,
+            report=task.report,
+            others=_facekit(task.shared),
+            subjects=task.subjects or 4,
+            folder=task.folder,
+        )
+
+
+def _visible(task: Task) -> Outcome:
+    count = {"subjects": task.subjects} if task.subjects else {}
+    with Renderer.create() as renderer:
+        return visible(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
+
+
+def _texture(task: Task) -> Outcome:
+    count = {"subjects": task.subjects} if task.subjects else {}
+    with Renderer.create() as renderer:
+        return texture(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
+
+
+def _surfaces(task: Task) -> Outcome:
+    found = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
+    with Renderer.create() as renderer:
+        return surfaces(
+            task.head, found, renderer=renderer, report=task.report, openmvs=task.options.openmvs, folder=task.folder
+        )
+
+
+def _people(task: Task) -> Outcome:
+    shared = sorted((task.shared / "captures").glob("*.truth"))  # the studio has heads where there are none
+    try:
+        others = _facekit(task.shared)
+    except InputError:
+        others = None
+    with Renderer.create() as renderer:
+        return people(
+            task.head,
+            others,
+            list(task.options.folders) or [path.with_suffix("") for path in shared],
+            renderer=renderer,
+            report=task.report,
+            subjects=task.subjects,
+            only=task.options.only,
+            detail=task.options.detail,
+            folder=task.folder,
+        )
+
+
+def _relief(task: Task) -> Outcome:
+    folders = list(task.options.folders) or [path.with_suffix("") for path in _truths(task.shared).values()]
+    with Renderer.create() as renderer:
+        return relief(
+            task.head,
+            {path.name: path for path in folders},
+            renderer=renderer,
+            report=task.report,
+            folder=task.folder,
+        )
+
+
+def _templates(task: Task) -> Outcome:
+    count = {"draws": task.subjects} if task.subjects else {}
+    facekit = _facekit(task.shared)
+    return templates({"default": task.head}, facekit, report=task.report, folder=task.folder, **count)
+
+
+def _captures(task: Task) -> dict[str, Path]:
+    """The shared captures that have a truth, where they are asked for."""
+    return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
+
+
+EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
+    "table1": _table(tables.table1),
+    "table2": _table(tables.table2),
+    "table3": _table(tables.table3),
+    "cost": _drawn(cost),
+    "levels": _drawn(levels),
+    "peers": _peers,
+    "limit": _limit,
+    "robustness": _drawn(robustness),
+    "convergence": _drawn(convergence),
+    "alignment": _drawn(alignment),
+    "drift": _drawn(drift),
+    "exchanges": _drawn(exchanges),
+    "false-alarms": _drawn(false_alarms),
+    "posterior": _drawn(posterior_check),
+    "views": _drawn(views),
+    "repeat": _drawn(repeat),
+    "relief": _relief,
+    "span": _span,
+    "detail": _detail,
+    "hidden": _hidden,
+    "expressions": _expressions,
+    "people": _people,
+    "planted": _drawn(planted),
+    "visible": _visible,
+    "surfaces": _surfaces,
+    "texture": _texture,
+    "light": _drawn(light),
+    "templates": _templates,
+}
+
+
+def _truths(shared: Path) -> dict[str, Path]:
+    found = {path.stem: path for path in sorted((shared / "captures").glob("*.truth"))}
+    if not found:
+        raise InputError(str(shared), ["holds no captures/<name>.truth; name the folder that does with --shared"])
+    return found
+
+
+def _facekit(shared: Path) -> HeadModel:
+    """ICT-FaceKit: the user's own import, or the compact copy in the shared folder."""
+    if (models_folder() / "ict-facekit.npz").is_file():
+        return load_model(model_path("ict-facekit"))
+    source = shared / "ict-facekit" / "ict_facekit_light.npz"
+    if not source.exists():
+        raise InputError("ict-facekit", ["is not at hand: run `eigenhead model fetch ict-facekit`, or name --shared"])
+    return assemble(import_model(source), "imported")

@@ -1,0 +1,1 @@
+"""Measures the whole visible surface: depth, hidden skin, relief, texture, light, templates."""

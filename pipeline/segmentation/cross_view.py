@@ -1,0 +1,52 @@
+"""What other cameras say of doubtful pixels: could anything of the subject stand on the pixel's ray?
+
+A point of the ray is denied by every camera whose mask it falls outside of; of all points on the ray the least denied
+one counts, as for the visual hull (figure 1). One camera may err where another's hair or coat is lost in its backdrop,
+so that the answer is a number, and the asking side decides.
+"""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Int8
+
+from pipeline.geometry.projection import packed_camera
+from pipeline.multiview.visual_hull import mask_extent
+from pipeline.segmentation.cross_view_kernels import MIN_WITNESSES, least_dissent
+from rig.rig import Rig
+
+
+def count_rejecting_cameras(
+    doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
+) -> Int8[np.ndarray, "h w"]:
+    """Tells how many of the other cameras deny the subject at each doubtful pixel of camera ``name`` (at most
+    ``MAX_DISSENT``); -1 where nobody was asked or too few can see.
+
+    Masks may be smaller than the images; all are evenly reduced.
+    """
+    out = np.full(doubt.shape, -1, np.int8)
+    others = [camera for camera in rig if camera.name != name and masks[camera.name].any()]
+    if len(others) < MIN_WITNESSES or not doubt.any():
+        return out
+    centre, edge = mask_extent({camera.name: masks[camera.name] for camera in others}, rig)
+    rows, columns = np.nonzero(doubt)
+    asking = rig[name]
+    scale = asking.intrinsics.width / doubt.shape[1]
+    rays = asking.rays_world((np.stack([columns, rows], axis=1) + 0.5) * scale - 0.5)
+    distances, scales = _stacked([masks[camera.name] for camera in others], [c.intrinsics.width for c in others])
+    parameters = np.array([packed_camera(camera) for camera in others])
+    middle = float(np.linalg.norm(centre - asking.centre_world))
+    span = (middle - 0.75 * edge, middle + 0.75 * edge)
+    out[rows, columns] = least_dissent(asking.centre_world, rays, span, parameters, distances, scales)
+    return out
+
+
+def _stacked(masks: list[np.ndarray], widths: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (mask pixels) outside each mask, negative beyond the images; and image pixels a mask pixel."""
+    height, width = max(mask.shape[0] for mask in masks), max(mask.shape[1] for mask in masks)
+    out = np.full((len(masks), height, width), -1.0, np.float32)
+    for k, mask in enumerate(masks):
+        away = cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        out[k, : mask.shape[0], : mask.shape[1]] = away
+    return out, np.array([w / mask.shape[1] for w, mask in zip(widths, masks, strict=True)])

@@ -1,0 +1,235 @@
+"""What is subject and what plate, decided at a coarse level, where averaging quarters the noise.
+
+Foreground log-odds against the exposure-corrected background (``pipeline.segmentation.background``), a soft
+shadow being no subject, are made smooth by mean-field sweeps whose links are cut where the *difference* to the plate
+has an edge (Sun et al., *Background Cut*, ECCV 2006), so that edges of the backdrop cut nothing.
+
+A pixel that looks like the plate proves something only where the subject does not: ``Decision.clear``. Elsewhere, and
+where a shadow might be a coat, the other cameras are asked (``pipeline.segmentation.cross_view``), and ``reconsider``
+decides again.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from pipeline.imaging.chart_plates import empty_plates
+from pipeline.imaging.masks import dilated, eroded, spread
+from pipeline.segmentation.background import CHANNEL_SUM, Background, coarse_size, estimate_background
+from pipeline.segmentation.mean_field import smooth_odds
+from pipeline.segmentation.mean_field_kernels import MAX_ODDS
+from pipeline.segmentation.shadows import find_shadows
+from pipeline.settings import SegmentationSettings
+
+CLOSING = 2  # coarse pixels
+CONCLUSIVE = 10.0  # standard deviations between plate and subject's colour at which a look of the plate is proof
+SHADES = 0.35, 1.15  # by which the subject's colour may be darker (in codes; a tenth of the light) or brighter nearby
+
+
+PAINT_ODDS = 4.4  # log odds that the free choice of the shade costs: 1 % of brightness, the noise, out of 80 %
+ALLOWED, DENIED = 4.0, 3.0  # log odds for a pixel that no other camera denies, and against one that three deny
+PALETTE = 16  # bins a channel of the subject's colours
+ANY_LEVELS = 64  # a channel: the spread of any colour at all, as in settings.evidence
+REACH = 24  # coarse pixels from the mask in which a doubtful pixel may still be the subject
+MAX_PLATE_CHI2 = 3.0  # chi-squared by its median over the background, up to which a pixel is the plate: 93 % of it are
+HAIR_DEPTH = 6  # coarse pixels (24 px)
+
+
+NOISE_HOLE_COARSE_PX = 3  # coarse pixels: a hole of this size is noise wherever it is
+MIXED = 0.1  # of the difference to the plate: standard deviation within a coarse pixel from which it is a mixture
+STRAND_SHADES = 0.75, 1.0, 1.33  # of the subject's colour nearby, in which strands before the plate may be
+MAX_FAINT_CHI2 = 100.0  # chi-squared of a mean over nine pixels
+UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must leave, and that by the whole
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """Holds what one image says by itself. All arrays are at the coarse level; without a subject the mask is empty."""
+
+    coarse: Float32[np.ndarray, "h w 3"]  # the image
+    background: Background
+    odds: Float32[np.ndarray, "h w"]  # of subject against plate, clipped
+    probability: Float[np.ndarray, "h w"]
+    mask: Bool[np.ndarray, "h w"]  # the subject's one piece, with what a person would fill
+    detached_component_areas: tuple[float, ...]  # areas of the other pieces by its own
+    paint: Float32[np.ndarray, "h w 3"]  # the subject's own colour nearby
+    own_odds: Float32[np.ndarray, "h w"]  # of the subject's own colours, rather than any, against the plate
+    clear: Bool[np.ndarray, "h w"]  # that is nothing like the plate, in any shade
+    plain: Bool[np.ndarray, "h w"]  # and what is seen there is exactly the plate
+    mixed: Bool[np.ndarray, "h w"]  # hair before the plate, or an edge
+
+    @property
+    def reduction(self) -> float:
+        """Returns pixels of the image along a side of a coarse one."""
+        return self.background.plates.shape[2] / self.mask.shape[1]
+
+
+def decide(
+    image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...], settings: SegmentationSettings
+) -> Decision:
+    """Judges one image against its clean plates."""
+    size = coarse_size(image.shape, settings.coarse_columns)
+    coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    background = estimate_background(image, coarse, empty_plates(plates), settings)
+    chi2, variance = _against_plate(coarse, background, image.shape[1] / size[0], settings)
+    odds = np.clip(0.5 * chi2 - settings.evidence, -MAX_ODDS, MAX_ODDS)
+    left, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds, settings)
+    chi2, odds = np.where(shadow, left, chi2), np.where(shadow, -MAX_ODDS / 2, odds).astype(np.float32)
+    probability = smooth_odds(odds, coarse, background, settings)
+    raw = probability > 0.5
+    away, mixture = find_mixtures(image, coarse, background)
+    paint = spread(coarse, eroded(raw, 1) * away / (1 + mixture**2), 2.0)
+    clear = colours_apart(paint, background.coarse, variance) > CONCLUSIVE
+    other, unexplained = _other_colour(coarse - background.coarse, paint, background.coarse, variance, settings)
+    clear &= ~dilated(other, 1)
+    plain = (
+        clear & (chi2 < MAX_PLATE_CHI2 * np.median(chi2[background.inliers]))
+        if background.inliers.any()
+        else clear & False
+    )
+    mask, detached_component_areas = whole_subject(raw, plain, settings)
+    mixed = (mixture > 1) & (away > (2 * background.noise @ CHANNEL_SUM / 3) ** 2)
+    own_odds = _own_odds(coarse, raw, paint, chi2, variance, settings)
+    own_odds = np.where(other, np.maximum(own_odds, 0.5 * unexplained - settings.evidence), own_odds)
+    return Decision(
+        coarse, background, odds, probability, mask, detached_component_areas, paint, own_odds, clear, plain, mixed
+    )
+
+
+def doubtful(decision: Decision) -> Bool[np.ndarray, "h w"]:
+    """Returns where another camera's word could make a pixel the subject's."""
+    near = dilated(decision.mask, REACH) & ~decision.mask
+    return near & ~decision.clear & (decision.own_odds > -ALLOWED)
+
+
+def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: SegmentationSettings) -> Decision:
+    """Returns the decision after other cameras spoke: ``dissent`` is how many of them deny that a doubtful pixel shows
+    the subject, negative where they were not asked."""
+    prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
+    revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MAX_ODDS, MAX_ODDS)
+    odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
+    probability = smooth_odds(odds, decision.coarse, decision.background, settings)
+    mask, detached_component_areas = whole_subject(probability > 0.5, decision.plain, settings)
+    return replace(
+        decision, odds=odds, probability=probability, mask=mask, detached_component_areas=detached_component_areas
+    )
+
+
+def _own_odds(
+    image: Float32[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    paint: Float32[np.ndarray, "h w 3"],
+    chi2: Float32[np.ndarray, "h w"],
+    variance: Float32[np.ndarray, "h w 3"],
+    settings: SegmentationSettings,
+) -> Float32[np.ndarray, "h w"]:
+    """Log odds of the subject's own colours against the plate: of that nearby, in the shade that suits the pixel best,
+    or of all that it shows."""
+    nearby = 0.5 * (chi2 - colours_apart(paint, image, variance) ** 2) - PAINT_ODDS
+    bins = (image / (256 / PALETTE)).astype(np.int32).clip(0, PALETTE - 1)
+    counts = np.zeros((PALETTE,) * 3, np.float32)
+    np.add.at(counts, tuple(bins[eroded(mask, 1)].T), 1.0)
+    for axis in range(3):
+        low, high = (np.roll(counts, step, axis) for step in (1, -1))
+        counts = 0.5 * counts + 0.25 * (low + high)
+    share = counts / max(float(counts.sum()), 1.0) * (PALETTE * ANY_LEVELS / 256) ** 3  # density by that of any colour
+    gain = np.log(np.maximum(share[tuple(np.moveaxis(bins, 2, 0))], 1.0))
+    return np.maximum(nearby, 0.5 * chi2 - settings.evidence + gain)
+
+
+def find_mixtures(
+    image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], background: Background
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Returns the squared difference to the plate (mean of the channels), and how far a coarse pixel is a mixture of
+    subject and plate: where strands cross the plate, pixels differ within it by as much as their mean differs from the
+    plate."""
+    half = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(
+        np.float32
+    )
+    square = cv2.resize(half * half, (coarse.shape[1], coarse.shape[0]), interpolation=cv2.INTER_AREA)
+    third = CHANNEL_SUM / 3
+    within = np.maximum((square - coarse**2) @ third - (background.noise @ third / 2) ** 2, 0.0)
+    away = ((coarse - background.coarse) ** 2) @ third
+    return away, within / (MIXED**2 * away + 1e-6)
+
+
+def _against_plate(
+    image: Float32[np.ndarray, "h w 3"], background: Background, reduction: float, settings: SegmentationSettings
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w 3"]]:
+    """Chi-squared of a coarse image against the plate, and the variance of the difference."""
+    difference = image - background.coarse
+    measured = 1.4826 * np.median(np.abs(difference[background.inliers]), axis=0) if background.inliers.any() else 0.0
+    noise = np.maximum(background.noise / reduction, measured)  # JPEG and demosaicing leave noise that does not average
+    tolerance = settings.tolerance_levels + settings.tolerance_share * background.coarse
+    variance = (noise**2 + tolerance**2).astype(np.float32)
+    return (difference**2 / variance) @ CHANNEL_SUM, variance
+
+
+def colours_apart(
+    colour: Float32[np.ndarray, "h w 3"], other: Float32[np.ndarray, "h w 3"], variance: Float32[np.ndarray, "h w 3"]
+) -> Float32[np.ndarray, "h w"]:
+    """Tells how far (standard deviations) a colour is from another, in the shade that brings it nearest."""
+    sigma = np.sqrt(variance)
+    f, b = colour / sigma, other / sigma
+    shade = np.clip(((f * b) @ CHANNEL_SUM) / np.maximum((f * f) @ CHANNEL_SUM, 1e-6), *SHADES)
+    return np.sqrt(((shade[:, :, None] * f - b) ** 2) @ CHANNEL_SUM)
+
+
+def _other_colour(
+    difference: Float32[np.ndarray, "h w 3"],
+    paint: Float32[np.ndarray, "h w 3"],
+    plate: Float32[np.ndarray, "h w 3"],
+    variance: Float32[np.ndarray, "h w 3"],
+    settings: SegmentationSettings,
+) -> tuple[Bool[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Where neither the plate in any shade nor a mixture of it and the subject's colour nearby (``paint``, in a few
+    shades: strands are not all alike) explains a faint difference, so that the subject has another colour there; and
+    the chi-squared that they leave, of nine pixels' mean."""
+    weight = 3 / variance  # of a mean over nine pixels, whose errors are not all their own
+    faint = ((difference**2 * weight) @ CHANNEL_SUM < MAX_FAINT_CHI2).astype(np.float32)
+    mean = cv2.blur(difference * faint[:, :, None], (3, 3)) / np.maximum(cv2.blur(faint, (3, 3)), 0.1)[:, :, None]
+    square = (mean**2 * weight) @ CHANNEL_SUM
+    left = square
+    mixtures = [(shade * paint - plate, 1.0) for shade in STRAND_SHADES]
+    for direction, most in ((-plate, 1 - settings.darkest_shadow), *mixtures):
+        along, whole = (mean * direction * weight) @ CHANNEL_SUM, (direction**2 * weight) @ CHANNEL_SUM
+        share = np.clip(along / np.maximum(whole, 1e-6), 0, most)
+        left = np.minimum(left, square + share * (share * whole - 2 * along))
+    return (left > UNEXPLAINED + UNEXPLAINED_SHARE * square) & (faint > 0), left
+
+
+def _closed(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Gaps of up to four coarse pixels closed. Where a gap is one, between locks of hair, alpha finds it again; where
+    the subject has the backdrop's colour it cannot, and the mask stays whole."""
+    padded = np.pad(mask, CLOSING, mode="edge")
+    return eroded(dilated(padded, CLOSING), CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
+
+
+def whole_subject(
+    mask: Bool[np.ndarray, "h w"],
+    plain: Bool[np.ndarray, "h w"],
+    settings: SegmentationSettings,
+) -> tuple[Bool[np.ndarray, "h w"], tuple[float, ...]]:
+    """Returns the largest component with its small gaps and holes filled, and the areas of the others by its own."""
+    mask = mask | (_closed(mask) & ~plain)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
+    if count < 2:
+        return np.zeros_like(mask), ()
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    main = int(np.argmax(areas)) + 1
+    subject = labels == main
+    others = sorted((float(a) / float(areas[main - 1]) for k, a in enumerate(areas, 1) if k != main), reverse=True)
+    count, found, stats, _ = cv2.connectedComponentsWithStats((~subject).view(np.uint8), connectivity=4)
+    holes = np.asarray(found, np.int32)
+    size = stats[:, cv2.CC_STAT_AREA]
+    # A gap between hair and shoulder shows the plate where nothing of the subject is like it. Far inside the outline
+    # there are few gaps, and something small of the subject may look like the plate by chance.
+    small = size < settings.hole_share * subject.sum()
+    inner = np.bincount(holes[eroded(subject | small[holes], HAIR_DEPTH)], minlength=count) > 0.5 * size
+    shown = np.bincount(holes[plain], minlength=count) / size
+    gap = (shown > 0.5) & ~(inner & (size <= NOISE_HOLE_COARSE_PX))
+    filled = small & ~gap
+    filled[0] = False
+    return subject | filled[holes], tuple(others)

@@ -1,0 +1,118 @@
+"""Compiled loops of ``pipeline.segmentation.matting``."""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.imaging.sampling_kernels import bilinear
+
+OTHER = 10.0  # log odds that a pixel must show against every mixture before it is taken for another colour
+MAX_ALPHA_INFORMATION = 25.0  # 1 / variance of one pixel's alpha, below which it is averaged in a wider window
+
+
+@njit(cache=True, nogil=True, inline="always")
+def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
+    """Cell and fraction for linear interpolation between pixel centres of a smaller image."""
+    at = min(max((x + 0.5) * small / size - 0.5, 0.0), small - 1.0)
+    low = min(int(at), max(small - 2, 0))
+    return low, at - low
+
+
+@njit(cache=True, nogil=True, inline="always")
+def interpolated_colour(a: np.ndarray, y: int, x: int, c: int, fy: float, fx: float) -> float:
+    """One channel of an image between four of its pixels."""
+    return bilinear(a[y, x, c], a[y, x + 1, c], a[y + 1, x, c], a[y + 1, x + 1, c], fx, fy)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def decoded_level(table: np.ndarray, code: float) -> float:
+    """Linear light of a code between 0 and 255, between the table's entries."""
+    code = min(max(code, 0.0), 255.0)
+    low = int(code)
+    return table[low] + (code - low) * (table[low + 1] - table[low])
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def solve_alpha(
+    table: np.ndarray,
+    image: np.ndarray,
+    plates: np.ndarray,
+    light: np.ndarray,
+    sigma: np.ndarray,
+    zone: np.ndarray,
+    probability: np.ndarray,
+    subject: np.ndarray,
+    sigmas: tuple[float, float],
+    first: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Alpha (-0.5 to 1.5) of every pixel, and in the band |F - B| in standard deviations of the image's noise (-1
+    elsewhere) and 1 / variance of alpha (1 elsewhere).
+
+    ``zone``: 0 outside, 1 band, 2 inside, 3 band in which the first guess of the subject's colour is no help.
+    ``sigmas``: standard deviations of alpha about the coarse mask, and of the subject's brightness at the rim.
+    """
+    coarse_sigma, shade = sigmas
+    height, width = image.shape[:2]
+    ch, cw = zone.shape
+    columns = np.minimum(np.arange(width) * cw // width, cw - 1)
+    alpha = np.empty((height, width), np.float32)
+    contrast = np.full((height, width), -1.0, np.float32)
+    trust = np.full((height, width), MAX_ALPHA_INFORMATION, np.float32)
+    for y in range(height):
+        zy = min(y * ch // height, ch - 1)
+        ly, fly = corner_of(y, height, ch)
+        sy, fsy = corner_of(y, height, subject.shape[0])
+        for x in range(width):
+            zx = columns[x]
+            kind = zone[zy, zx]
+            if kind == 0 or kind == 2:
+                alpha[y, x] = 0.0 if kind == 0 else 1.0
+                continue
+            lx, flx = corner_of(x, width, cw)
+            p00, p01 = probability[ly, lx], probability[ly, lx + 1]
+            p10, p11 = probability[ly + 1, lx], probability[ly + 1, lx + 1]
+            prior = bilinear(p00, p01, p10, p11, flx, fly)
+            if first and kind == 3:
+                alpha[y, x] = prior
+                continue
+            sx, fsx = corner_of(x, width, subject.shape[1])
+            noise = sigma[zy, zx]
+            ff, fb, bb, df, db, dd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # sums in standard deviations
+            for c in range(3):
+                b = 0.0
+                for k in range(len(plates)):
+                    b += plates[k, y, x, c]
+                b *= interpolated_colour(light, ly, lx, c, fly, flx) / len(plates)
+                f = interpolated_colour(subject, sy, sx, c, fsy, fsx)
+                code = min(int(0.5 * (f + b)), 255)
+                scale = 1 / ((table[code + 1] - table[code]) * noise)
+                b, f, i = (
+                    scale * decoded_level(table, b),
+                    scale * decoded_level(table, f),
+                    scale * table[image[y, x, c]],
+                )
+                ff += f * f
+                fb += f * b
+                bb += b * b
+                df += (i - b) * f
+                db += (i - b) * b
+                dd += (i - b) * (i - b)
+            # Normal equations of I - B = q F - alpha B, q = alpha (within shade), alpha = prior (within coarse_sigma).
+            m11, m12, m22 = ff + 1 / shade**2, -fb - 1 / shade**2, bb + 1 / shade**2 + 1 / coarse_sigma**2
+            r1, r2 = df, -db + prior / coarse_sigma**2
+            determinant = m11 * m22 - m12 * m12
+            value = (m11 * r2 - m12 * r1) / determinant
+            square = ff - 2 * fb + bb
+            value = min(1.5, max(-0.5, value))  # wide, because clipping noise at 0 and 1 would bend the ramp
+            if (
+                first
+            ):  # what no mixture of the two explains, in any shade of the plate, is another colour of the subject
+                a = min(1.0, max(0.0, value))
+                left = dd - 2 * a * (df - db) + a * a * square
+                along = min(0.0, max(-0.4 * (1 - a), (db - a * (fb - bb)) / max(bb, 1e-12)))  # 0: black
+                left += along * along * bb - 2 * along * (db - a * (fb - bb))
+                value += max(0.0, 1.0 - value) / (1.0 + np.exp(OTHER - 0.5 * left))
+            alpha[y, x] = value
+            known = max(determinant / m11 - 1 / coarse_sigma**2, 1e-6)
+            contrast[y, x] = np.sqrt(known)
+            trust[y, x] = min(MAX_ALPHA_INFORMATION, known)
+    return alpha, contrast, trust

@@ -1,0 +1,287 @@
+"""Background subtraction (section 5.4): a capture to one silhouette a camera.
+
+``pipeline.segmentation.foreground`` decides what is subject, asking the other cameras where it is in doubt;
+``pipeline.segmentation.matting`` then finds the sub-pixel contour, and ``pipeline.segmentation.view_consistency``
+compares what the cameras say.
+
+The paper says only "background subtraction". A view whose mask cannot be trusted is reported: ``quality.usable`` is
+False where it would hurt a fit, and ``quality.warnings`` say why. Operator masks override everything.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from pipeline.compute.threads import thread_count
+from pipeline.imaging.contour_distance import distance_to_level
+from pipeline.imaging.masks import dilated, eroded
+from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
+from pipeline.segmentation.background import Background
+from pipeline.segmentation.cross_view import count_rejecting_cameras
+from pipeline.segmentation.foreground import Decision, decide, doubtful, reconsider
+from pipeline.segmentation.matting import Matte, solve_matte
+from pipeline.segmentation.view_consistency import judge_agreement
+from pipeline.segmentation.without_plates.head_seed import HeadSeed, find_head_seed
+from pipeline.settings import SegmentationSettings
+from rig.capture import Capture
+from rig.errors import InputError
+from rig.image import ImageRgb
+from rig.messages.message import Message, compose
+from rig.progress import Progress
+from rig.rig import Rig
+
+STRANGER_SHARE = 3e-4  # of the subject: smaller pieces are noise, and smaller holes: whites of eyes before a grey wall
+SOLID_HOLE = 0.995  # mean coarse probability: 1.000 in false holes of noisy captures, at most 0.99 in gaps of hair
+UNDECIDED = 0.3  # from one half: share of a cut's windows that is neither yes nor no
+UNDECIDED_PX = 15  # side of a window ...
+UNDECIDED_FILLED = 0.6  # ... and its part that is undecided where the outline is a guess
+NOISE_HOLE = 12  # pixels: a hole of this size in alpha is noise, however small the subject
+SEEDED_VIEWS = 8  # fewer do not tell the subject by each other, and begin with its face
+ENOUGH_USABLE = 0.7  # of the views: 1 of 11 where skin and wall are alike, all of them in scan-a and draw-b, which a
+# face as the beginning makes no better
+BODY_FILLS = 0.75  # of the subject's width is on the border where shoulders leave; a cut above the brow leaves less
+MIN_GAIN, MAX_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
+
+
+def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress) -> dict[str, Silhouette]:
+    """Returns the silhouette of every camera of the rig; without any plate or mask the subject is found from the
+    photographs. Raises InputError where only some cameras have neither."""
+    if not capture.backgrounds and not capture.masks:
+        return _without_plates(capture, rig, settings, report)
+    blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
+    if blind:
+        raise InputError("capture", [compose("neither-plate-nor-mask", camera=name) for name in blind])
+    silhouettes: dict[str, Silhouette] = {}
+    with ThreadPoolExecutor(thread_count()) as pool:  # cv2 and the compiled kernels release the interpreter lock
+        from_masks = {
+            name: pool.submit(_operators, capture.masks[name], capture.soft_masks.get(name), settings)
+            for name in rig.names & capture.masks.keys()
+        }
+        jobs = {
+            name: pool.submit(decide, capture.images[name], capture.backgrounds[name], settings)
+            for name in rig.names
+            if name not in from_masks
+        }
+        decisions = {name: job.result() for name, job in jobs.items()}
+        masks = {name: decision.mask for name, decision in decisions.items()}
+        masks |= {name: job.result().mask for name, job in from_masks.items()}
+
+        def finish(name: str) -> Silhouette:
+            decision = decisions[name]
+            doubt = doubtful(decision)
+            if doubt.any():
+                decision = reconsider(decision, count_rejecting_cameras(doubt, name, masks, rig), settings)
+            return _refined(capture.images[name], decision, settings)
+
+        finished = {name: pool.submit(finish, name) for name in decisions}
+        for count, name in enumerate(rig.names, 1):
+            silhouettes[name] = (from_masks | finished)[name].result()
+            report("segmentation", 0.4 + 0.5 * count / len(rig))
+    agreed = judge_agreement(silhouettes, rig, settings, ready=capture.masks.keys())
+    report("segmentation", 1.0)
+    return agreed
+
+
+def _without_plates(
+    capture: Capture, rig: Rig, settings: SegmentationSettings, report: Progress
+) -> dict[str, Silhouette]:
+    """Finds the subject as views tell it by each other; where few do, as its face does."""
+    few = len(rig) < SEEDED_VIEWS
+    found = _searched(capture, rig, settings, find_head_seed(capture.images, rig) if few else None, report)
+    if not few and _usable_count(found) < ENOUGH_USABLE * len(rig):
+        head = find_head_seed(capture.images, rig)
+        seeded = found if head is None else _searched(capture, rig, settings, head, report)
+        found = max(found, seeded, key=_usable_count)
+    report("segmentation", 1.0)
+    return found
+
+
+def _usable_count(silhouettes: Mapping[str, Silhouette]) -> int:
+    return sum(silhouette.quality.usable for silhouette in silhouettes.values())
+
+
+def _searched(
+    capture: Capture, rig: Rig, settings: SegmentationSettings, head: HeadSeed | None, report: Progress
+) -> dict[str, Silhouette]:
+    """The silhouettes of a search that begins at ``head``, or where all cameras look."""
+    from pipeline.segmentation.without_plates.decide import decide_without_plates  # packages that few captures need
+
+    found = decide_without_plates(
+        capture.images, rig, settings, head=head, report=lambda share: report("segmentation", 0.8 * share)
+    )
+    with ThreadPoolExecutor(thread_count()) as pool:
+        jobs = {n: pool.submit(_refined, capture.images[n], one, settings) for n, one in found.decisions.items()}
+        jobs |= {n: pool.submit(_as_cut, share, settings) for n, share in found.shares.items()}
+        silhouettes = {name: _doubted(jobs[name].result(), settings) for name in rig.names}
+    return judge_agreement(silhouettes, rig, settings)
+
+
+def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouette:
+    """What is said of a weak outline where there was no plate: another remedy than a change of the backdrop."""
+    quality, weak = silhouette.quality, float(np.asarray(silhouette.quality.figures.get("weak_share", 1.0)))
+    if weak <= settings.weak_share_warned:
+        return silhouette
+    text = compose("outline-guessed", share=weak)
+    kept = tuple(warning for warning in quality.warnings if not _speaks_of(warning, "outline-weak"))
+    if weak > settings.weak_share_unusable:
+        return replace(silhouette, quality=replace(quality, warnings=(*kept, compose("view-unused", remark=text))))
+    return replace(silhouette, quality=replace(quality, warnings=kept, doubts=(text,)))
+
+
+def _speaks_of(message: Message, code: str) -> bool:
+    """Whether a message has a code, or says why a view is left out by one that has."""
+    remark = message.parameters.get("remark")
+    return message.code == code or (isinstance(remark, Message) and remark.code == code)
+
+
+def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
+    """The silhouette of a view that was cut along its edges; where windows disagreed its outline is weak."""
+    alpha, holes = _without_specks(share, np.zeros_like(share))
+    mask = alpha > 0.5
+    undecided = dilated(np.abs(share - 0.5) < UNDECIDED, 1)
+    rim = mask & ~eroded(mask, 1)
+    broad = cv2.blur(undecided.astype(np.float32), (UNDECIDED_PX, UNDECIDED_PX)) > UNDECIDED_FILLED
+    weak = float(broad[rim].mean()) if rim.any() else 1.0
+    figures = {"cut": 1.0, "weak_share": round(weak, 4)}
+    return Silhouette(mask, distance_to_level(alpha), _quality(mask, (1, holes), float("inf"), weak, figures, settings))
+
+
+def _operators(
+    mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | None, settings: SegmentationSettings
+) -> Silhouette:
+    """The silhouette of a ready mask; where its edges are soft the outline is where the subject's share is half."""
+    if share is None:
+        return replace(silhouette_from_mask(mask), quality=_mask_quality(mask, settings))
+    smooth = cv2.GaussianBlur(share * np.float32(1 / 255), (0, 0), settings.alpha_blur_px)
+    return Silhouette(mask, distance_to_level(smooth), _mask_quality(mask, settings))
+
+
+def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Silhouette:
+    """Returns the silhouette of one image against its clean plates, without the other cameras' help."""
+    return _refined(image, decide(image, plates, settings), settings)
+
+
+def _refined(image: ImageRgb, decision: Decision, settings: SegmentationSettings) -> Silhouette:
+    """From a coarse decision to a sub-pixel silhouette."""
+    if decision.mask.mean() < settings.least_area:
+        return _nothing(image.shape[:2], decision.background)
+    matte = solve_matte(image, decision, settings)
+    return _silhouette(matte, decision, settings)
+
+
+def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings) -> Silhouette:
+    alpha = np.zeros(decision.background.plates.shape[1:3], np.float32)
+    coarse = cv2.resize(decision.probability.astype(np.float32), alpha.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    alpha[matte.box], holes = _without_specks(matte.alpha, coarse[matte.box])
+    distance = distance_to_level(alpha)
+    weak = float((matte.contrast < settings.weak_contrast).mean()) if len(matte.contrast) else 1.0
+    contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
+    others = sum(a for a in decision.detached_component_areas if a > STRANGER_SHARE)
+    background = decision.background
+    figures = {
+        "gain": [round(float(g), 4) for g in background.gain],
+        "noise_levels": round(float(np.median(background.noise)), 3),
+        "background_share": round(float(background.inliers.mean()), 4),
+        "weak_share": round(weak, 4),
+        "other_pieces": round(others, 4),
+    }
+    mask = alpha > 0.5
+    return Silhouette(mask, distance, _quality(mask, (1, holes), contrast, weak, figures, settings))
+
+
+def _without_specks(
+    alpha: Float32[np.ndarray, "h w"], coarse: Float32[np.ndarray, "h w"]
+) -> tuple[Float32[np.ndarray, "h w"], int]:
+    """Alpha of the subject's own component without holes of noise, and how many holes are left.
+
+    Noise is what is small, and what the ``coarse`` probability, whose pixels average the sensor's noise away, calls
+    subject all over: shaded skin before a backdrop of its colour. A gap in hair of that size is seen there, too.
+    """
+    mask = alpha > 0.5
+    labels, areas = _labelled(mask, 4)
+    if len(areas) > 2:
+        main = int(np.argmax(areas[1:])) + 1
+        alpha = np.where(mask & (labels != main), np.float32(0.49), alpha)
+    labels, areas = _labelled(alpha <= 0.5, 8)
+    solid = np.bincount(labels.ravel(), coarse.ravel(), len(areas)) > SOLID_HOLE * areas
+    small = solid | (areas < max(NOISE_HOLE, STRANGER_SHARE * np.count_nonzero(mask)))
+    small[0] = False
+    if small.any():
+        alpha = np.where(small[labels], np.float32(0.51), alpha)
+    enclosed = ~np.isin(np.arange(len(areas)), np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    enclosed[0] = False
+    return alpha, int((enclosed & ~small).sum())
+
+
+def _labelled(mask: Bool[np.ndarray, "h w"], connectivity: int) -> tuple[np.ndarray, np.ndarray]:
+    """Labels of the components, 0 where the mask is False, and their areas."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+        mask.view(np.uint8), connectivity, cv2.CV_16U, cv2.CCL_SPAGHETTI
+    )
+    return labels, stats[:, cv2.CC_STAT_AREA].copy()
+
+
+def _mask_quality(mask: Bool[np.ndarray, "h w"], settings: SegmentationSettings) -> ViewQuality:
+    """The quality of an operator's mask."""
+    components = len(_labelled(mask, 8)[1]) - 1
+    holes = len(_labelled(np.pad(~mask, 1, constant_values=True), 4)[1]) - 2
+    return _quality(mask, (components, holes), float("inf"), 0.0, {}, settings)
+
+
+def _quality(
+    mask: Bool[np.ndarray, "h w"],
+    components_holes: tuple[int, int],
+    contrast: float,
+    weak: float,
+    figures: dict,
+    settings: SegmentationSettings,
+) -> ViewQuality:
+    """What can be said of a mask by itself."""
+    borders = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
+    cut_off = tuple(name for name, line in borders.items() if line.sum() > 2)
+    warnings, fatal = [], []
+    crown = _crown_side(mask)
+    if crown in cut_off:
+        code = "head-cut-off-at-top" if crown == "top" else "head-cut-off-at-side"
+        warnings.append(compose(code, side=crown))
+    apart = figures.get("other_pieces", 0.0)
+    if apart > settings.other_pieces_warned:
+        text = compose("pieces-apart", share=apart)
+        (fatal if apart > settings.other_pieces_unusable else warnings).append(text)
+    if weak > settings.weak_share_warned:
+        text = compose("outline-weak", share=weak)
+        (fatal if weak > settings.weak_share_unusable else warnings).append(text)
+    share = np.count_nonzero(mask) / mask.size
+    if share < settings.least_area or share > 0.95:
+        fatal.append(compose("subject-area-absurd", share=share))
+    gains = figures.get("gain", [1.0])
+    if not all(MIN_GAIN < g < MAX_GAIN for g in gains):
+        fatal.append(compose("light-changed", factor=max(gains)))
+    warnings += [compose("view-unused", remark=text) for text in fatal]
+    components, holes = components_holes
+    return ViewQuality(not fatal, contrast, cut_off, components, holes, tuple(warnings), figures)
+
+
+def _crown_side(mask: Bool[np.ndarray, "h w"]) -> str:
+    """The border beyond which the crown would be: opposite to the one through which the body leaves the picture, for
+    cameras may hang on their side or upside down. A body fills as much of a border as it is wide; a cut crown less."""
+    across, down = mask.sum(axis=0), mask.sum(axis=1)
+    widest = {"top": down.max(), "bottom": down.max(), "left": across.max(), "right": across.max()}
+    touched = {"top": mask[0].sum(), "bottom": mask[-1].sum(), "left": mask[:, 0].sum(), "right": mask[:, -1].sum()}
+    body = max(touched, key=lambda side: touched[side])
+    return _OPPOSITE[body] if touched[body] >= BODY_FILLS * max(widest[body], 1) else "top"
+
+
+_OPPOSITE = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
+
+
+def _nothing(shape: tuple[int, ...], background: Background) -> Silhouette:
+    mask = np.zeros(shape, bool)
+    text = compose("no-subject-stands-out")
+    figures = {"background_share": float(background.inliers.mean())}
+    far = np.full(shape, float(sum(shape)), np.float32)  # no contour: farther than any pixel
+    return Silhouette(mask, far, ViewQuality(False, 0.0, (), 0, 0, (text,), figures))

@@ -1,0 +1,66 @@
+"""Soft shadows on the backdrop at the coarse level, which are no subject."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from pipeline.imaging.masks import dilated
+from pipeline.segmentation.background import CHANNEL_SUM
+from pipeline.settings import SegmentationSettings
+
+SHADOW_CHI2 = 11.3  # three channels, 99 %: what still counts as a darker piece of the plate
+STEEP = 0.03  # change of a shadow's depth a coarse pixel; blurred by 7 of them, as in the tests, a shadow has 0.016
+SOFT_ONSET = 0.15  # depth of a shadow 2 coarse pixels before it is noticed by that 2 behind; at a sharp edge 0 to 0.06
+
+
+def find_shadows(
+    image: Float32[np.ndarray, "h w 3"],
+    plate: Float32[np.ndarray, "h w 3"],
+    chi2: Float32[np.ndarray, "h w"],
+    variance: Float32[np.ndarray, "h w 3"],
+    odds: Float32[np.ndarray, "h w"],
+    settings: SegmentationSettings,
+) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Returns chi-squared against the plate in the shade that suits a pixel best, and where that explains one that
+    differs, and does so softly."""
+    ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
+    depth = 1 - np.clip(ratio, settings.darkest_shadow, 1.0)
+    shaded = (1 - depth)[:, :, None] * plate
+    slack = variance + (settings.shadow_chroma * depth[:, :, None] * plate) ** 2
+    left = (((image - shaded) ** 2 / slack) @ CHANNEL_SUM).astype(np.float32)
+    candidate = (left < SHADOW_CHI2) & (depth > 0) & (odds > 0)
+    return left, _soft_shadows(candidate, depth.astype(np.float32), np.sqrt(chi2 / (2 * settings.evidence)))
+
+
+def _soft_shadows(
+    candidate: Bool[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"], strength: Float32[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Candidates that begin softly: the plain background beside them is already darker. A coat begins at once, also
+    within a shadow, and is cut from it there.
+    ``strength`` is the difference to the plate, 1 where it is first noticed."""
+    across, down = (cv2.Sobel(depth, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
+    candidate = candidate & (across**2 + down**2 < STEEP**2)
+    noticed = (strength > 1).view(np.uint8)
+    inward = cv2.distanceTransform(noticed, cv2.DIST_L2, cv2.DIST_MASK_5)
+    outward = cv2.distanceTransform(1 - noticed, cv2.DIST_L2, cv2.DIST_MASK_5)
+    block = np.ones((3, 3), np.uint8)  # what hangs together by less is not one shadow
+    count, cores = cv2.connectedComponents(cv2.erode(candidate.view(np.uint8), block), connectivity=4)
+    cores = cores.astype(np.uint16)
+    labels = np.where(candidate, cv2.dilate(cores, block), 0).astype(np.int32)
+    beside = cv2.dilate(cores, np.ones((9, 9), np.uint8)).astype(np.int32)
+    # The first ring on either side holds the pixels that a sharp edge divides.
+    within, many = _means(depth, (inward > 1.2) & (inward < 2.6) & candidate, labels, count)
+    before, few = _means(depth, (outward > 1.2) & (outward < 2.6), beside, count)
+    soft = (many >= 4) & (few >= 4) & (before > SOFT_ONSET * within)
+    soft[0] = False
+    found = soft[labels]
+    fringe = candidate & (labels == 0)  # too thin for a core of its own
+    return found | (fringe & dilated(found, 3))
+
+
+def _means(
+    values: Float32[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], labels: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of the values of each component, and how many pixels it is over."""
+    sizes = np.bincount(labels[where], minlength=count)
+    return np.bincount(labels[where], values[where], count) / np.maximum(sizes, 1), sizes

@@ -1,0 +1,181 @@
+"""Do the cameras agree? Each silhouette is asked whether the others allow it (the idea of the visual hull, figure 1).
+
+On a coarse grid of voxels every camera votes: a voxel that falls clearly outside its silhouette is empty. Two things
+can be wrong with a view. *Strange* area is mask where every voxel behind it is empty for at least two of the others: a
+chair that was moved, a person walking by. *Missing* area is where all other cameras keep voxels that this one alone
+rejects: hair or a coat in the colour of the backdrop. One bad view must not make the others look bad, hence the second
+vote before a voxel counts as empty. Voxels outside an image have no vote there, and may hold what a view shows.
+
+A hull keeps more than the subject, the more the fewer and the farther apart the cameras are: the hull of three others
+shows up to 11 % more than a true fourth mask. Missing area is therefore believed only where the view also *contradicts*
+the others: mask of theirs behind which it alone leaves nothing. True masks contradict nobody, however few they are.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from pipeline.compute.threads import thread_count
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.visual_hull import depth_of, hull_extent
+from pipeline.settings import SegmentationSettings
+from rig.camera import Camera
+from rig.messages.message import compose
+from rig.rig import Rig
+
+GRID = 32  # voxels a side: 12 mm on a subject of 400 mm
+REDUCTION = 16  # of the image in which areas are counted
+MIN_CAMERAS = 4  # with fewer, one camera's word stands against another's
+MIN_CONTRADICTED = 1e-3  # of the others' masks, mean: 0 in 150 true views of 4 to 24 cameras; 0.0013 and more where a
+# crown is missing, and up to 0.0016 then in a good view beside it ...
+MAX_CONTRADICTED = 0.5  # ... which contradicts less than this share of what the worst view does
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Votes:
+    """Holds what each camera says of each voxel."""
+
+    pixels: Float[np.ndarray, "k n 2"]
+    radius_px: Float[np.ndarray, " k"]  # of a voxel in each camera
+    seen: Bool[np.ndarray, "k n"]
+    empty: Bool[np.ndarray, "k n"]
+    depth: Float[np.ndarray, "k n"]  # distance outside the silhouette, px
+
+
+def voxel_grid(centre: Float[np.ndarray, " 3"], edge: float, count: int) -> Float[np.ndarray, "n 3"]:
+    """Centres of ``count`` voxels a side, world frame."""
+    line = (np.arange(count) + 0.5) / count - 0.5
+    return centre + edge * np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRID) -> Votes:
+    """Returns every camera's vote on every voxel of a coarse grid around the subject."""
+    centre, edge = hull_extent(silhouettes, rig)
+    voxels = voxel_grid(centre, edge, count)
+
+    def vote(camera: Camera) -> tuple:
+        where = camera.project(voxels)
+        k = camera.intrinsics
+        radius = 0.87 * edge / count * k.fx / depth_of(camera, centre)  # half the diagonal of a voxel
+        inside = np.logical_and(where >= 0, where <= (k.width - 1, k.height - 1)).all(axis=1)  # NaN is not
+        at = np.rint(np.where(inside.reshape(-1, 1), where, 0.0)).astype(int)
+        depth = np.where(inside, silhouettes[camera.name].distance[at[:, 1], at[:, 0]], -np.inf)
+        return where, radius, inside, depth > radius, depth
+
+    with ThreadPoolExecutor(thread_count()) as pool:  # NumPy releases the interpreter lock
+        return Votes(*(np.array(values) for values in zip(*pool.map(vote, rig), strict=True)))
+
+
+def judge_agreement(
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    settings: SegmentationSettings,
+    *,
+    ready: Collection[str] = (),
+) -> dict[str, Silhouette]:
+    """Returns the same silhouettes with what the other cameras say of each in its quality.
+
+    Args:
+        silhouettes: by camera; those that are not usable have no say.
+        rig: the cameras as calibrated.
+        settings: which shares are warned of, and which make a view unusable.
+        ready: cameras whose mask is an operator's: they are warned of, and stay usable.
+    """
+    trusted = [name for name in rig.names if silhouettes[name].quality.usable]
+    if len(trusted) < MIN_CAMERAS:
+        return dict(silhouettes)
+    believed = rig.subset(trusted)
+    votes = cast_votes(silhouettes, believed)
+    judged = dict(silhouettes)
+    masks = [silhouettes[name].mask for name in trusted]
+    with ThreadPoolExecutor(thread_count()) as pool:
+        shares = [*pool.map(lambda k: _shares(votes, k, masks[k]), range(len(trusted)))]
+        suspects = [k for k, (_, missing) in enumerate(shares) if missing > settings.missing_share_warned]
+        contradicted = dict(zip(suspects, pool.map(lambda k: _contradicted(votes, k, masks), suspects), strict=True))
+    limit = max(MIN_CONTRADICTED, MAX_CONTRADICTED * max(contradicted.values(), default=0.0))
+    culprits = [k for k, share in contradicted.items() if share >= limit]
+    for k, (name, (strange, missing)) in enumerate(zip(trusted, shares, strict=True)):
+        if strange > settings.strange_share_warned and culprits:
+            # What a view that lacks something calls empty speaks against nobody.
+            heard = replace(votes, empty=votes.empty & ~np.isin(np.arange(len(trusted)), culprits)[:, None])
+            strange, _ = _shares(heard, k, masks[k])
+        missing = missing if k in culprits else 0.0
+        judged[name] = _judged(silhouettes[name], strange, missing, settings, ready=name in ready)
+    return judged
+
+
+def _shares(votes: Votes, k: int, mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
+    """Strange and missing area of camera k, by the area of its mask."""
+    small = _reduced(mask)
+    size, area = small.shape[::-1], max(float(small.sum()), 1.0)
+    others = np.delete(np.arange(len(votes.seen)), k)
+    witnesses, against = votes.seen[others].sum(axis=0), votes.empty[others].sum(axis=0)
+    known = votes.seen[k] & (witnesses >= 2)
+    explained = _splat(votes, k, votes.seen[k] & (against <= _allowed(len(others))), size)
+    strange = float(small[_splat(votes, k, known, size) & ~explained].sum()) / area
+    # Well inside for all others: a hull's natural excess is slivers along their contours.
+    solid = (~votes.seen[others] | (votes.depth[others] < -votes.radius_px[others, None])).all(axis=0)
+    wanted = known & (witnesses >= 0.5 * len(others)) & solid & (votes.depth[k] > 2 * votes.radius_px[k])
+    missing = float((_splat(votes, k, wanted, size, grow=False) & (small < 0.5)).sum()) / area
+    return strange, missing
+
+
+def _contradicted(votes: Votes, k: int, masks: Sequence[Bool[np.ndarray, "_ _"]]) -> float:
+    """Mean over the other cameras of the share of their mask behind which camera k alone leaves nothing."""
+    shares = []
+    for j in range(len(votes.seen)):
+        others = np.delete(np.arange(len(votes.seen)), [j, k])
+        if j == k or not len(others):
+            continue
+        small = _reduced(masks[j])
+        size = small.shape[::-1]
+        possible = votes.seen[j] & (votes.empty[others].sum(axis=0) <= _allowed(len(others)))
+        witnessed = possible & votes.seen[k] & votes.seen[others].any(axis=0)
+        explained = _splat(votes, j, possible & ~votes.empty[k], size)
+        lost = _splat(votes, j, witnessed, size, grow=False) & ~explained
+        shares.append(float(small[lost].sum()) / max(float(small.sum()), 1.0))
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def _allowed(others: int) -> int:
+    """How many cameras may call a voxel empty that is there: one may err, where enough are left."""
+    return 1 if others >= 5 else 0
+
+
+def _reduced(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "r c"]:
+    size = (-(-mask.shape[1] // REDUCTION), -(-mask.shape[0] // REDUCTION))
+    return cv2.resize(mask.view(np.uint8) * np.float32(1), size, interpolation=cv2.INTER_AREA)
+
+
+def _splat(
+    votes: Votes, k: int, chosen: Bool[np.ndarray, " n"], size: tuple[int, int], *, grow: bool = True
+) -> Bool[np.ndarray, "h w"]:
+    """The reduced image's pixels that a chosen voxel covers."""
+    drawn = np.zeros((size[1], size[0]), np.uint8)
+    at = (votes.pixels[k][chosen] / REDUCTION).astype(int)
+    drawn[np.clip(at[:, 1], 0, size[1] - 1), np.clip(at[:, 0], 0, size[0] - 1)] = 1
+    reach = int(np.ceil(votes.radius_px[k] / REDUCTION)) if grow else 0
+    return cv2.dilate(drawn, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).view(bool)
+
+
+def _judged(
+    silhouette: Silhouette, strange: float, missing: float, settings: SegmentationSettings, *, ready: bool
+) -> Silhouette:
+    quality = silhouette.quality
+    warnings, usable = list(quality.warnings), quality.usable
+    if strange > settings.strange_share_warned:
+        bad = strange > settings.strange_share_unusable and not ready
+        usable &= not bad
+        text = compose("mask-alone-ready" if ready else "mask-alone", share=strange)
+        warnings.append(compose("view-unused", remark=text) if bad else text)
+    if missing > settings.missing_share_warned:
+        bad = missing > settings.missing_share_unusable and not ready
+        usable &= not bad
+        text = compose("mask-incomplete-ready" if ready else "mask-incomplete", share=missing)
+        warnings.append(compose("view-unused", remark=text) if bad else text)
+    figures = {**quality.figures, "strange_share": round(strange, 4), "missing_share": round(missing, 4)}
+    return replace(silhouette, quality=replace(quality, usable=usable, warnings=tuple(warnings), figures=figures))

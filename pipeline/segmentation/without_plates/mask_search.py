@@ -1,0 +1,185 @@
+"""Coarse masks of all views together: colours say what is like the subject, the views what is there in all of them.
+
+The start is what geometry alone knows: a disc around the place that all cameras look at is the subject, and the image's
+border is not, but where the body goes down through it. From there colours and space are asked in turn. A view learns
+its background first from that border alone, then from what its mask leaves and the other views deny: a coat that it has
+not found yet must not become its background.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from pipeline.imaging.masks import dilated, eroded
+from pipeline.multiview.upright import guessed_up
+from pipeline.segmentation.mean_field_kernels import MAX_ODDS, mean_field_sweeps
+from pipeline.segmentation.without_plates.colour_odds import Samples, colour_odds, histogram
+from pipeline.segmentation.without_plates.head_seed import HeadSeed, beside_head, head_core
+from pipeline.segmentation.without_plates.viewing_volume import (
+    OtherViews,
+    ViewingVolume,
+    ask_other_views,
+    reachable,
+)
+from rig.camera import Camera
+from rig.rig import Rig
+
+ROUNDS = 8  # masks of the studio do not change after the sixth
+BORDER_ROUNDS = 1  # in which the background is what the border shows, no more
+LOCAL_ROUNDS = 4  # after which the colours nearby count
+CORE = 0.11  # of the image's smaller side: radius of the disc that is surely subject
+BORDER = 0.05  # of the same: width of the strip that is surely background ...
+BODY_SIDE = 0.3  # ... above this share of the way from the middle to the lower border, where a body may leave
+LEVEL = 0.5  # sine of the angle between view and up below which no side of the image is the lower one
+SUPPORT_WEIGHT, MAX_SUPPORT, MAX_DENIAL = 0.5, 1.0, 5.0  # of what the other views say, in log odds
+SOLID_ODDS = 3.0  # that a pixel gains where every other view has the subject
+CORE_ODDS, BORDER_ODDS = 2.0, -1.0
+FACE_ODDS = 10.0  # of a core that a found face is: highlights have the colour of a bright wall
+LINK, LINK_NOISE, SWEEPS = 0.7, 2.0, 12  # of neighbours: log odds, noise levels that hardly count as an edge
+MAX_GREY = 2.0  # levels by which the channels of a grey photograph differ
+TEXTURE_PX, TEXTURE_GAIN = 2.0, 4.0  # sigma of the window; scatter by it counts like a colour
+MIN_SAMPLES = 50  # pixels that a background is learnt from
+
+Mask = Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seeds:
+    """Holds what geometry knows of a view before any colour: surely subject, surely background, and where either may
+    be."""
+
+    core: Mask
+    border: Mask
+    reachable: Mask
+    core_odds: float = CORE_ODDS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseMask:
+    """Holds ``odds`` of the subject when colours, neighbours and other views are heard; ``mask`` its one piece."""
+
+    odds: Float32[np.ndarray, "h w"]
+    mask: Mask
+    other_views: OtherViews
+
+
+def find_seeds(
+    camera: Camera,
+    volume: ViewingVolume,
+    up_world: Float[np.ndarray, " 3"],
+    size: tuple[int, int],
+    head: HeadSeed | None = None,
+) -> Seeds:
+    """Finds the seeds of a view whose reduced image has ``size`` (height, width)."""
+    height, width = size
+    row, column = np.mgrid[:height, :width]
+    middle = (camera.project(volume.centre_world[None])[0] + 0.5) * (width / camera.intrinsics.width) - 0.5
+    core = np.hypot(column - middle[0], row - middle[1]) < CORE * min(size)
+    if head is not None:
+        core = head_core(head, camera, size)
+    strip = max(3, round(BORDER * min(size)))
+    border = np.ones(size, bool)
+    border[strip:-strip, strip:-strip] = False
+    down = -(camera.camera_from_world.rotation @ up_world)[:2]
+    if np.linalg.norm(down) > LEVEL:
+        along = (column - width / 2) * down[0] + (row - height / 2) * down[1]
+        border &= along < BODY_SIDE * 0.5 * (abs(down[0]) * width + abs(down[1]) * height)
+    if head is not None:
+        border |= beside_head(head, camera, size)
+        return Seeds(core, border & ~core, reachable(volume, camera.name, size), FACE_ODDS)
+    return Seeds(core, border & ~core, reachable(volume, camera.name, size))
+
+
+def search_masks(
+    images: Mapping[str, Float32[np.ndarray, "_ _ 3"]],
+    rig: Rig,
+    volume: ViewingVolume,
+    background: Mapping[str, Bool[np.ndarray, "_ _"]],
+    *,
+    bounded: bool,
+    head: HeadSeed | None = None,
+    report: Callable[[float], None],
+) -> dict[str, CoarseMask]:
+    """Returns the subject in every reduced image. ``background``: pixels that are known not to show it. ``bounded``:
+    the volume holds all of the subject, so that what is beyond it may be learnt as background nearby at once."""
+    up = guessed_up(rig) if head is None else head.up_world
+    sizes = {name: image.shape[:2] for name, image in images.items()}
+    seeds = {camera.name: find_seeds(camera, volume, up, sizes[camera.name], head) for camera in rig}
+    known = {name: seed.border | ~seed.reachable | (background[name] & ~seed.core) for name, seed in seeds.items()}
+    images = {name: _with_texture(image) for name, image in images.items()}
+    noise = {name: _noise(image) for name, image in images.items()}
+    samples = {name: Samples(seed.core, known[name]) for name, seed in seeds.items()}
+    found: dict[str, CoarseMask] = {}
+    for step in range(ROUNDS):
+        report(step / ROUNDS)
+        common = np.sum([histogram(images[name][sample.subject]) for name, sample in samples.items()], axis=0)
+        local = step >= (BORDER_ROUNDS if bounded else LOCAL_ROUNDS)
+        odds = {}
+        for name, image in images.items():
+            evidence = colour_odds(image, samples[name], common, noise[name], nearby=local)
+            evidence = np.where(known[name], evidence + BORDER_ODDS, evidence)
+            odds[name] = np.where(seeds[name].reachable, evidence, -MAX_ODDS).astype(np.float32)
+        start = {name: mask.odds for name, mask in found.items()} if local else odds
+        for _ in range(2):
+            other_views = ask_other_views(volume, start)
+            found = {
+                name: _with_neighbours(image, odds[name], other_views[name], seeds[name], noise[name])
+                for name, image in images.items()
+            }
+            start = {name: mask.odds for name, mask in found.items()}
+        samples = {name: _learn(mask, known[name], border=step < BORDER_ROUNDS) for name, mask in found.items()}
+    return found
+
+
+def _with_neighbours(
+    image: Float32[np.ndarray, "h w 3"],
+    odds: Float32[np.ndarray, "h w"],
+    other_views: OtherViews,
+    seeds: Seeds,
+    noise: Float[np.ndarray, " 3"],
+) -> CoarseMask:
+    combined = (
+        odds + np.clip(SUPPORT_WEIGHT * other_views.support, -MAX_DENIAL, MAX_SUPPORT) + SOLID_ODDS * other_views.solid
+    )
+    combined = np.where(seeds.reachable, combined + seeds.core_odds * seeds.core, -MAX_ODDS)
+    combined = np.clip(combined, -MAX_ODDS, MAX_ODDS).astype(np.float32)
+    smooth = mean_field_sweeps(combined, (image / (LINK_NOISE * noise)).astype(np.float32), LINK, SWEEPS)
+    smooth = np.asarray(2 * smooth, np.float32)
+    return CoarseMask(smooth, _one_piece(smooth > 0, seeds.core), other_views)
+
+
+def _learn(found: CoarseMask, known: Mask, *, border: bool) -> Samples:
+    inner = eroded(found.mask, 1)
+    subject = inner if inner.any() else found.mask
+    if border:
+        return Samples(subject, known)
+    background = (~dilated(found.mask, 2) & (found.other_views.support < 0)) | (known & ~found.mask)
+    return Samples(subject, background if background.sum() >= MIN_SAMPLES else known)
+
+
+def _one_piece(mask: Mask, core: Mask) -> Mask:
+    """The component that holds most of the core; without one, the largest."""
+    count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=4)
+    if count < 2:
+        return mask
+    sizes = np.bincount(labels[core & mask], minlength=count)
+    sizes = sizes if sizes[1:].any() else np.bincount(labels.ravel(), minlength=count)
+    return labels == 1 + int(np.argmax(sizes[1:]))
+
+
+def _with_texture(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """A grey photograph with its surroundings' mean and scatter in place of two channels that say nothing."""
+    if np.ptp(image, axis=2).max() > MAX_GREY:
+        return image
+    grey = image[:, :, 0]
+    mean = cv2.GaussianBlur(grey, (0, 0), TEXTURE_PX)
+    scatter = np.sqrt(np.maximum(cv2.GaussianBlur(grey * grey, (0, 0), TEXTURE_PX) - mean * mean, 0))
+    return cv2.merge([grey, mean, np.minimum(TEXTURE_GAIN * scatter, 255)])
+
+
+def _noise(image: Float32[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
+    """Levels, a channel, from neighbours; weave and texture count as noise."""
+    return np.maximum(1.4826 * np.median(np.abs(np.diff(image, axis=1)), axis=(0, 1)) / np.sqrt(2), 1.0)

@@ -1,0 +1,92 @@
+"""The paper's fit (sections 4.4 and 5.1): the downhill simplex, first on a coarse level, then on the working level.
+
+Enters: the aligned model and the silhouettes. Leaves: coefficients, at full mesh resolution whoever evaluates them. The
+pose stays what the alignment said, as in the paper. The coarse answer is the start p_0 of the working level, and both
+levels begin with p_i = p_0 + mu_i e_i, mu_i = 3 sigma_i (three standard deviations, the unit of our coefficients).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pipeline.contour_fit.fit import Fit
+from pipeline.head_model.model import HeadModel
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.settings import FittingSettings
+from pipeline.simplex.nelder_mead import minimise
+from pipeline.simplex.xor_objective import SilhouetteObjective
+from rig.geometry import Similarity
+from rig.progress import Progress
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+
+MU = 3.0  # section 4.4, in standard deviations
+TOLERANCE = 1e-4  # relative spread of the costs; the paper names none
+LIMIT = 3500  # evaluations a level: 60 modes have converged or will not
+
+
+@dataclass(frozen=True, slots=True)
+class HierarchyLevel:
+    """Holds which decimation of the mesh, and how large the images."""
+
+    mesh: str
+    image_scale: float
+
+
+HIERARCHY = (HierarchyLevel("p99", 0.25), HierarchyLevel("p95", 0.5))  # section 5.1
+
+
+def fit_simplex(
+    model: HeadModel,
+    world_from_head: Similarity,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    settings: FittingSettings,
+    *,
+    renderer: Renderer,
+    report: Progress,
+    hierarchy: tuple[HierarchyLevel, ...] = HIERARCHY,
+    speaking: Literal["face", "all"] = "face",
+    weighted: bool = True,
+) -> Fit:
+    """Returns coefficients that minimise eq. (2) from the mean head. ``report("fit", fraction)`` may raise Cancelled.
+
+    ``speaking`` and ``weighted`` are the objective's: which pixels count, and whether by eq. (5) or eq. (4).
+    ``rig`` and ``silhouettes`` may differ: cameras without a silhouette stay out.
+    """
+    rig = rig.subset(name for name in silhouettes if silhouettes[name].quality.usable)
+    coefficients = np.zeros(min(settings.modes, len(model.modes)))
+    evaluations, reasons = 0, []
+    for number, level in enumerate(hierarchy):
+
+        def watch(count: int, cost: float, number: int = number) -> None:
+            report("fit", (number + min(count / LIMIT, 1.0)) / len(hierarchy))
+
+        with SilhouetteObjective(
+            model,
+            world_from_head,
+            silhouettes,
+            rig,
+            renderer=renderer,
+            level=level.mesh,
+            scale=level.image_scale,
+            start=coefficients,
+            speaking=speaking,
+            weighted=weighted,
+        ) as objective:
+            solution = minimise(
+                objective, coefficients, np.full(len(coefficients), MU), tolerance=TOLERANCE, limit=LIMIT, watch=watch
+            )
+        coefficients = solution.value
+        evaluations += solution.stats.evaluations
+        reasons.append(f"{level.mesh}: {solution.result}")
+    return Fit(
+        method="simplex",
+        coefficients=coefficients,
+        world_from_head=world_from_head,
+        evaluations=evaluations,
+        termination_reason="; ".join(reasons),
+        used={name: name in rig for name in silhouettes},
+    )

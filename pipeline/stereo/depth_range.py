@@ -1,0 +1,149 @@
+"""Where along each ray the subject can be: behind the visual hull's front, before the fitted head or the hull's back.
+
+Hair lies between the skull and the hull, clothes inside the hull, and skin within a few mm of the fitted head; so that
+little is searched. The room is found at the least size; its two bounds are smooth surfaces, whose slopes the search
+takes for those of everything between.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from pipeline.compute.threads import map_in_threads
+from pipeline.geometry.raster import depth_map
+from pipeline.settings import DenseSettings
+from pipeline.stereo.crops import MAX_UNSEEN_PX, Crop
+from pipeline.stereo.depth_range_kernels import find_room
+from pipeline.stereo.stack import Stack
+from rig.mesh import Mesh
+
+STEPS = 128  # along a ray through the subject
+SLACK_PX = 1.0  # of the least size: a mask may be that narrow
+MIN_ROOM_MM = 4.0
+BOUND_BLUR_PX = 1.0  # of the least size: the hull has creases that the subject does not have
+LOOSE_HULL_MM = (
+    30.0  # of a hull's front before the fitted head: 5 to 15 for cameras around a head, 100 for three in front
+)
+STEEPEST = 3.0  # slope against the image plane: 72 degrees
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthRange:
+    """Holds the depth bounds (mm) of one view's pixels, 0 where there is none, and their slopes by x and y (mm a
+    pixel)."""
+
+    near: Float32[np.ndarray, "h w"]
+    far: Float32[np.ndarray, "h w"]
+    slopes: Float32[np.ndarray, "h w 4"]  # of near by x and y, of far by x and y
+
+
+def find_depth_ranges(
+    crops: Sequence[Crop],
+    least: Stack,
+    stack: Stack,
+    head_world: Mesh | None,
+    extent: tuple[Float[np.ndarray, " 3"], float],
+    settings: DenseSettings,
+) -> list[DepthRange]:
+    """Returns the room of every view at the size of ``stack``.
+
+    Args:
+        least: the crops at their least size, where silhouettes and head are asked.
+        head_world: the fitted head, world frame, mm; without it the hull's back bounds the room.
+        extent: middle (world) and edge (mm) of a cube that holds the subject.
+    """
+
+    def work(view: int) -> DepthRange:
+        near, far = _bounds(crops[view], least, view, head_world, extent, settings)
+        return _enlarged(near, far, stack, view)
+
+    return map_in_threads(work, len(crops))
+
+
+def _bounds(
+    crop: Crop,
+    least: Stack,
+    view: int,
+    head_world: Mesh | None,
+    extent: tuple[Float[np.ndarray, " 3"], float],
+    settings: DenseSettings,
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Depth bounds at the least size; 0 where there is none."""
+    camera = crop.levels[-1].camera
+    centre, edge = extent
+    middle, half = float(camera.camera_from_world.apply(centre)[2]), 0.5 * np.sqrt(3.0) * edge
+    step = 2.0 * half / STEPS
+    width, height = least.size[view]
+    others = np.delete(np.arange(len(least)), view)
+    near, far = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    find_room(
+        int(least.offset[view]), least.homographies(view, others), least.distance_px, SLACK_PX, max(middle - half, 1.0),
+        middle + half, step, near, far,
+    )  # fmt: skip
+    room = near > 0.0
+    near[room] -= step
+    if head_world is None:
+        far[room] = np.minimum(far[room], near[room] + settings.reach_mm)
+    else:
+        head, _ = depth_map(camera, head_world.vertices, head_world.faces)
+        _bound_by_head(near, far, room, head, settings)
+    far[room] = np.maximum(far[room], near[room] + MIN_ROOM_MM + step)
+    return near, far
+
+
+def _bound_by_head(
+    near: Float32[np.ndarray, "h w"],
+    far: Float32[np.ndarray, "h w"],
+    room: Bool[np.ndarray, "h w"],
+    head: Float[np.ndarray, "h w"],
+    settings: DenseSettings,
+) -> None:
+    """Narrows the bounds in place to what may stand before and behind the fitted head, whose depths are ``head`` (mm,
+    infinite beside it).
+
+    Cameras that all stand on one side leave a hull that reaches decimetres before the face. There neither its front
+    nor what is ``reach_mm`` behind it says where the subject is: the head does, and beside it its nearest and farthest
+    places.
+    """
+    seen = room & np.isfinite(head)
+    if not seen.any() or np.median((head - near)[seen]) < LOOSE_HULL_MM:
+        far[room] = np.minimum(far[room], near[room] + settings.reach_mm)
+    else:
+        beside = room & ~seen
+        near[beside] = np.maximum(near[beside], float(head[seen].min()) - settings.before_head_mm)
+        far[beside] = np.minimum(far[beside], float(head[seen].max()) + settings.before_head_mm)
+        near[seen] = np.maximum(near[seen], head[seen] - settings.before_head_mm)
+    far[seen] = np.minimum(far[seen], head[seen] + settings.behind_head_mm)
+
+
+def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"], stack: Stack, view: int) -> DepthRange:
+    """The bounds, smooth, at the size of ``stack``, over all that its view shows of the subject."""
+    room = near > 0.0
+    width, height = (int(side) for side in stack.size[view])
+    distance = stack.image(stack.distance_px, view)
+    live = (distance < 1.0) & (distance > MAX_UNSEEN_PX)
+    if not room.any():
+        return DepthRange(np.zeros_like(distance), np.zeros_like(distance), np.zeros((height, width, 4), np.float32))
+    bounds, slopes = [], []
+    for values in (near, far):
+        wide = cv2.resize(_extended(values, room), (width, height), interpolation=cv2.INTER_LINEAR)
+        steepest = STEEPEST * float(wide.mean() / stack.lens[view, 0])
+        slopes += [np.clip(slope, -steepest, steepest) for slope in np.gradient(wide)[::-1]]
+        bounds.append(np.where(live, wide, np.float32(0.0)))
+    return DepthRange(bounds[0], bounds[1], np.stack(slopes, axis=2).astype(np.float32))
+
+
+def _extended(values: Float32[np.ndarray, "h w"], room: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Blurred within the room, and carried on beyond it."""
+    weight = cv2.GaussianBlur(room.astype(np.float32), (0, 0), BOUND_BLUR_PX)
+    smooth = cv2.GaussianBlur(np.where(room, values, np.float32(0.0)), (0, 0), BOUND_BLUR_PX) / np.maximum(weight, 1e-3)
+    _, nearest = cv2.distanceTransformWithLabels(
+        (~room).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = nearest.astype(np.int64)
+    values_of = np.zeros(int(nearest.max()) + 1, np.float32)
+    values_of[nearest[room]] = smooth[room]
+    return values_of[nearest]

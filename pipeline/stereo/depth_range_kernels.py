@@ -1,0 +1,49 @@
+"""Compiled loops of the depth range: how far along each ray the silhouettes leave room for the subject."""
+
+from pipeline.compute.jit import njit
+from pipeline.geometry.projection_kernels import NEAREST_MM, placed
+from pipeline.stereo.matching_kernels import HEIGHT, START, UNSEEN_PX, WIDTH
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distance_at(distance_px, way, x, y):
+    """Signed distance at the nearest pixel; beyond the crop that of its edge."""
+    width, height = int(way[WIDTH]), int(way[HEIGHT])
+    column = min(max(int(x + 0.5), 0), width - 1)
+    row = min(max(int(y + 0.5), 0), height - 1)
+    return distance_px[int(way[START]) + row * width + column]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_room(start, ways, distance_px, slack_px, low, high, step, near, far):
+    """Fills ``near`` and ``far`` (mm of depth, for the view's pixels; 0 where no room is).
+
+    A place is inside where no view that sees it shows it beside the subject by more than ``slack_px``, and at least one
+    other sees it. The range goes from the first such place to the last: what lies between may be empty.
+    """
+    height, width = near.shape
+    for row in range(height):
+        for column in range(width):
+            near[row, column] = 0.0
+            far[row, column] = 0.0
+            here = distance_px[start + row * width + column]
+            if here > slack_px or here < UNSEEN_PX:
+                continue
+            z = low
+            while z <= high:
+                seen = 0
+                for k in range(len(ways)):
+                    x, y, depth = placed(ways[k], z * column, z * row, z)
+                    if depth < NEAREST_MM:
+                        continue
+                    distance = _distance_at(distance_px, ways[k], x / depth, y / depth)
+                    if distance > slack_px:
+                        seen = 0
+                        break
+                    if distance > UNSEEN_PX:
+                        seen += 1
+                if seen > 0:
+                    if near[row, column] == 0.0:
+                        near[row, column] = z
+                    far[row, column] = z
+                z += step

@@ -1,0 +1,88 @@
+"""Compiled loops over depth and slopes as images: doubling their size, and planes through neighbourhoods."""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def double(depth, slopes, live, depth_out, slopes_out):
+    """The planes of (h, w) pixels at twice the size, where ``live``; a pixel whose own parent is empty takes the plane
+    of the nearest of the parents about it."""
+    height, width = depth.shape
+    for row in range(2 * height):
+        for column in range(2 * width):
+            depth_out[row, column] = 0.0
+            slopes_out[row, column, 0] = 0.0
+            slopes_out[row, column, 1] = 0.0
+            if not live[row, column]:
+                continue
+            x, y = 0.5 * column - 0.25, 0.5 * row - 0.25
+            nearest, i0, j0 = 1e9, -1, -1
+            for j in range(max(row // 2 - 1, 0), min(row // 2 + 2, height)):
+                for i in range(max(column // 2 - 1, 0), min(column // 2 + 2, width)):
+                    if depth[j, i] > 0.0:
+                        far = (x - i) * (x - i) + (y - j) * (y - j)
+                        if far < nearest:
+                            nearest, i0, j0 = far, i, j
+            if i0 >= 0:
+                depth_out[row, column] = depth[j0, i0] + (x - i0) * slopes[j0, i0, 0] + (y - j0) * slopes[j0, i0, 1]
+                slopes_out[row, column, 0] = 0.5 * slopes[j0, i0, 0]
+                slopes_out[row, column, 1] = 0.5 * slopes[j0, i0, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def fit_planes(depth, slopes, information, radius, tolerance_mm, steepest, depth_out, slopes_out, relief_mm):
+    """A plane through the depths about every pixel, weighted by their ``information`` and by how well they agree with
+    the plane that the pixel has (half at ``tolerance_mm``): not across an edge. ``steepest`` slope, mm a pixel;
+    ``relief_mm``: by how much the depths deviate from the plane (RMS)."""
+    height, width = depth.shape
+    falloff = 1.0 / (tolerance_mm * tolerance_mm)
+    near = 1.0 / (radius * radius)
+    for row in range(height):
+        for column in range(width):
+            depth_out[row, column] = depth[row, column]
+            slopes_out[row, column, 0] = slopes[row, column, 0]
+            slopes_out[row, column, 1] = slopes[row, column, 1]
+            relief_mm[row, column] = 0.0
+            here = depth[row, column]
+            if here <= 0.0:
+                continue
+            s, s_x, s_y, s_xx, s_xy, s_yy = 1e-9, 0.0, 0.0, 1e-9, 0.0, 1e-9
+            s_z, s_xz, s_yz, s_zz = 0.0, 0.0, 0.0, 0.0
+            for j in range(max(-radius, -row), min(radius + 1, height - row)):
+                for i in range(max(-radius, -column), min(radius + 1, width - column)):
+                    there = depth[row + j, column + i]
+                    if there <= 0.0:
+                        continue
+                    z = there - here
+                    off = z - i * slopes[row, column, 0] - j * slopes[row, column, 1]
+                    apart = 1.0 + off * off * falloff
+                    w = information[row + j, column + i] / (apart * apart * (1.0 + (i * i + j * j) * near))
+                    s += w
+                    s_x += w * i
+                    s_y += w * j
+                    s_xx += w * i * i
+                    s_xy += w * i * j
+                    s_yy += w * j * j
+                    s_z += w * z
+                    s_xz += w * i * z
+                    s_yz += w * j * z
+                    s_zz += w * z * z
+            x, y, z = s_x / s, s_y / s, s_z / s
+            xx, xy, yy = s_xx / s - x * x, s_xy / s - x * y, s_yy / s - y * y
+            xz, yz = s_xz / s - x * z, s_yz / s - y * z
+            determinant = xx * yy - xy * xy
+            if determinant < 0.05 * (radius * radius) * (radius * radius) * 0.05:
+                continue
+            a = (xz * yy - yz * xy) / determinant
+            b = (yz * xx - xz * xy) / determinant
+            a, b = min(max(a, -steepest), steepest), min(max(b, -steepest), steepest)
+            plane = z - a * x - b * y
+            spread = max(s_zz / s - z * z - a * xz - b * yz, 0.0)
+            noise = 1.0 / (information[row, column] + 1e-9)
+            signal = max(spread - noise, 0.0)
+            depth_out[row, column] = here + plane * noise / (signal + noise)
+            relief_mm[row, column] = np.sqrt(spread)
+            slopes_out[row, column, 0] = a
+            slopes_out[row, column, 1] = b

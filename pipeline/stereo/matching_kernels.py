@@ -1,0 +1,222 @@
+"""Compiled matching of one window between two views: the window lies on a plane, which the other view sees slanted.
+
+Scores are zero-mean normalised cross-correlations, so that gain and offset of a camera drop out. The noise of both
+views stands in the norms: a window without texture is like nothing, however alike its noise may look.
+
+A view that is compared with is a row of 16 numbers (``Stack.homographies``): how a point there comes about, and where
+its pixels lie. Few and small arguments: a call that hands over twenty arrays takes longer than a window.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+from pipeline.geometry.projection_kernels import NEAREST_MM, turned
+from pipeline.imaging.sampling_kernels import bilinear, bilinear_slopes
+
+NO_SAY = 2.0  # a score that says nothing: the view does not see the place
+AGAINST = -1.0  # the view shows the place beside the subject
+BESIDE_PX = 2.0  # that far beside its outline
+WINDOW_PX = -1.0  # to the outline: nearer samples hold background, whose edge would be matched for the surface
+UNSEEN_PX = -1e4  # distances below are beyond the photograph
+MIN_AREA = 0.05  # of a pixel in the other view: flatter, or from behind, it is not compared
+WIDTH, HEIGHT, START, NOISE = 12, 13, 14, 15  # entries of a way, behind rotation and translation
+LOW = np.uint32(0xFFFF)
+HIGH = np.uint32(16)
+
+
+class Sight(NamedTuple):
+    """A view that is matched, and all that it is matched with."""
+
+    start: int  # of its first pixel
+    noise: float  # shades
+    ways: np.ndarray  # to the views that it is compared with, as ``Stack.homographies`` has them
+    pairs: np.ndarray  # all views' pixels, as ``Stack`` has them
+    distance_px: np.ndarray
+    pattern: np.ndarray  # samples of a window, across and down from its middle, px
+    contrast: float  # shades at which a sample counts half
+
+
+class Scratch(NamedTuple):
+    """Where one view's loops keep what they look at, for they make no arrays."""
+
+    window: np.ndarray  # zero-mean shades, weights
+    scores: np.ndarray  # of the views that it is compared with
+    place: np.ndarray  # by ``place_window``
+    found: np.ndarray  # by ``correlate_and_slide``, for each of the views
+
+
+def make_scratch(sight: Sight) -> Scratch:
+    """For a sight, and for one thread."""
+    count, samples = len(sight.ways), sight.pattern.shape[1]
+    return Scratch(np.empty((2, samples), np.float32), np.empty(count), np.empty(8), np.empty((count, 3)))
+
+
+class Loaded(NamedTuple):
+    """The window about one pixel, by ``load_window``."""
+
+    column: int
+    row: int
+    window: np.ndarray  # zero-mean shades, weights
+    total: float  # of the weights
+    energy: float  # of the weighted squares
+
+
+@njit(cache=True, nogil=True, error_model="numpy", allocates=False)
+def farthest(pattern):
+    """The farthest that a sample lies from a window's middle, across or down, px."""
+    reach = np.float32(0.0)
+    for i in range(pattern.shape[1]):
+        reach = max(reach, abs(pattern[0, i]), abs(pattern[1, i]))
+    return reach
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
+def load_window(sight, width, height, column, row, window):
+    """Fills ``window`` (zero-mean shades, weights) with the samples that the pattern has about a pixel;
+    returns the sums of the weights and of the weighted squares.
+
+    Pixels beside the subject weigh nothing, those of another brightness little: half at the sight's ``contrast``.
+    So a window at an outline or a crease holds one surface.
+    """
+    pairs, pattern, start = sight.pairs, sight.pattern, sight.start
+    centre = np.float32(np.int32(pairs[start + row * width + column] & LOW))
+    falloff = np.float32(1.0 / (sight.contrast * sight.contrast))
+    total, mean = np.float32(0.0), np.float32(0.0)
+    for i in range(pattern.shape[1]):
+        x = min(max(column + int(pattern[0, i]), 0), width - 1)
+        y = min(max(row + int(pattern[1, i]), 0), height - 1)
+        at = start + y * width + x
+        value = np.float32(np.int32(pairs[at] & LOW))
+        w = np.float32(0.0)
+        if sight.distance_px[at] < WINDOW_PX:
+            off = value - centre
+            w = np.float32(1.0) / (np.float32(1.0) + off * off * falloff)
+        window[0, i] = value
+        window[1, i] = w
+        total += w
+        mean += w * value
+    total = max(total, np.float32(1e-6))
+    mean /= total
+    energy = np.float32(0.0)
+    for i in range(pattern.shape[1]):
+        window[0, i] -= mean
+        energy += window[1, i] * window[0, i] * window[0, i]
+    return total, energy
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
+def place_window(way, z, z_x, z_y, column, row, reach, place):
+    """Where another view sees a window on the plane of depth ``z`` (mm) at the pixel and slopes ``z_x``, ``z_y`` (mm a
+    pixel). Fills ``place``: pixel x, y; their derivatives by the pixel here, x_x, x_y, y_x, y_y; by the depth, x_z, y_z
+    (px / mm). False where the view does not see all of it."""
+    ray0, ray1, ray2 = turned(way, column, row, 1.0)
+    depth = z * ray2 + way[11]
+    if depth < NEAREST_MM:
+        return False
+    per = 1.0 / depth
+    x, y = (z * ray0 + way[9]) * per, (z * ray1 + way[10]) * per
+    p_x2, p_y2 = z_x * ray2 + z * way[6], z_y * ray2 + z * way[7]
+    x_x, x_y = (z_x * ray0 + z * way[0] - x * p_x2) * per, (z_y * ray0 + z * way[1] - x * p_y2) * per
+    y_x, y_y = (z_x * ray1 + z * way[3] - y * p_x2) * per, (z_y * ray1 + z * way[4] - y * p_y2) * per
+    wide, tall = reach * (abs(x_x) + abs(x_y)), reach * (abs(y_x) + abs(y_y))
+    if x - wide < 0.0 or y - tall < 0.0 or x + wide > way[WIDTH] - 1.01 or y + tall > way[HEIGHT] - 1.01:
+        return False
+    if x_x * y_y - x_y * y_x < MIN_AREA:
+        return False
+    place[0], place[1], place[2], place[3], place[4], place[5] = x, y, x_x, x_y, y_x, y_y
+    place[6], place[7] = (ray0 - x * ray2) * per, (ray1 - y * ray2) * per
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
+def distance_there(way, place, distance_px):
+    """Signed distance to the other view's outline at the window's middle."""
+    return distance_px[int(way[START]) + int(place[1] + 0.5) * int(way[WIDTH]) + int(place[0] + 0.5)]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
+def correlate(way, place, sight, loaded):
+    """Correlation of the loaded window with another view at ``place``."""
+    pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
+    window, total, energy = loaded.window, loaded.total, loaded.energy
+    x, y = np.float32(place[0]), np.float32(place[1])
+    x_x, x_y, y_x, y_y = np.float32(place[2]), np.float32(place[3]), np.float32(place[4]), np.float32(place[5])
+    base, stride, narrow = np.uint64(np.int64(way[START])), np.uint64(np.int64(way[WIDTH])), np.int32(way[WIDTH])
+    first, second, product = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for i in range(pattern.shape[1]):
+        u, v = x + x_x * pattern[0, i] + x_y * pattern[1, i], y + y_x * pattern[0, i] + y_y * pattern[1, i]
+        left, top = np.int32(u), np.int32(v)
+        fx, fy = u - np.float32(left), v - np.float32(top)
+        at = base + np.uint64(np.uint32(top * narrow + left))
+        upper, lower = pairs[at], pairs[at + stride]
+        a, b = np.float32(np.int32(upper & LOW)), np.float32(np.int32(upper >> HIGH))
+        c, d = np.float32(np.int32(lower & LOW)), np.float32(np.int32(lower >> HIGH))
+        value = bilinear(a, b, c, d, fx, fy)
+        w = window[1, i] * value
+        first += w
+        second += w * value
+        product += w * window[0, i]
+    spread = max(second - first * first / total, np.float32(0.0))
+    return product / np.sqrt((energy + total * noise * noise) * (spread + total * way[NOISE] * way[NOISE]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
+def match(way, sight, loaded, z, z_x, z_y, reach, place):
+    """Correlation of the loaded window with another view, if the surface is that plane; NO_SAY or AGAINST where there
+    is nothing to compare."""
+    if not place_window(way, z, z_x, z_y, loaded.column, loaded.row, reach, place):
+        return NO_SAY
+    beside = distance_there(way, place, sight.distance_px)
+    if beside < UNSEEN_PX:
+        return NO_SAY
+    if beside > BESIDE_PX:
+        return AGAINST
+    return correlate(way, place, sight, loaded)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
+def correlate_and_slide(way, place, sight, loaded, found):
+    """``correlate``, and how the window would slide along the ray: fills ``found`` with the correlation, and with
+    gradient (1 / mm) and information (1 / mm^2) of the depth.
+
+    Least squares of ``shade = gain (other + slope step) + offset`` by gain, offset and step: gain and offset are
+    projected out. The variance of a sample is what the best gain leaves, and noise.
+    """
+    pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
+    window, total, energy = loaded.window, loaded.total, loaded.energy
+    x, y = np.float32(place[0]), np.float32(place[1])
+    x_x, x_y, y_x, y_y = np.float32(place[2]), np.float32(place[3]), np.float32(place[4]), np.float32(place[5])
+    x_z, y_z = np.float32(place[6]), np.float32(place[7])
+    base, stride, narrow = np.uint64(np.int64(way[START])), np.uint64(np.int64(way[WIDTH])), np.int32(way[WIDTH])
+    zero = np.float32(0.0)
+    s_k, s_j, s_kk, s_kj, s_jj, s_kr, s_jr = zero, zero, zero, zero, zero, zero, zero
+    for i in range(pattern.shape[1]):
+        u, v = x + x_x * pattern[0, i] + x_y * pattern[1, i], y + y_x * pattern[0, i] + y_y * pattern[1, i]
+        left, top = np.int32(u), np.int32(v)
+        fx, fy = u - np.float32(left), v - np.float32(top)
+        at = base + np.uint64(np.uint32(top * narrow + left))
+        upper, lower = pairs[at], pairs[at + stride]
+        a, b = np.float32(np.int32(upper & LOW)), np.float32(np.int32(upper >> HIGH))
+        c, d = np.float32(np.int32(lower & LOW)), np.float32(np.int32(lower >> HIGH))
+        value = bilinear(a, b, c, d, fx, fy)
+        across, along = bilinear_slopes(a, b, c, d, fx, fy)
+        slope = x_z * across + y_z * along
+        wk, wj = window[1, i] * value, window[1, i] * slope
+        s_k += wk
+        s_j += wj
+        s_kk += wk * value
+        s_kj += wk * slope
+        s_jj += wj * slope
+        s_kr += wk * window[0, i]
+        s_jr += wj * window[0, i]
+    theirs = total * way[NOISE] * way[NOISE]
+    kk = max(s_kk - s_k * s_k / total, zero) + theirs
+    kj = s_kj - s_k * s_j / total
+    jj = max(s_jj - s_j * s_j / total, zero)
+    gain = s_kr / kk
+    variance = (max(energy - gain * s_kr, zero) + total * noise * noise + gain * gain * theirs) / total
+    found[0] = s_kr / np.sqrt((energy + total * noise * noise) * kk)
+    found[1] = gain * (s_jr - gain * kj) / variance
+    found[2] = gain * gain * max(jj - kj * kj / kk, zero) / variance

@@ -1,0 +1,85 @@
+"""The first depth: every ray is tried at even steps through its room, and neighbouring rays agree on a path."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int32
+
+from pipeline.compute.threads import map_in_threads
+from pipeline.settings import DenseSettings
+from pipeline.stereo.depth_range import DepthRange
+from pipeline.stereo.field import Field
+from pipeline.stereo.matching_kernels import make_scratch
+from pipeline.stereo.stack import Stack
+from pipeline.stereo.sweep_kernels import aggregate, sweep_view
+from rig.camera import Camera
+
+# On the subject, of images that are searched: windows of 5 pixels then span 10 mm. At 512 x 384 a quarter of the size,
+# 4.2 mm a pixel, left 21 % of the face 2 mm off, half of it leaves 14 % (an oily head, noise of 6 levels).
+SEARCH_PIXEL_MM = 2.1
+FIRST_LEVELS = (1, 2)  # half and quarter of the photographs' size
+# Costs are 1 minus a correlation. A step of one label is a slope that the room's bounds do not have; a wider step is an
+# edge, which three or four pixels of clear texture pay for.
+STEP_COST, EDGE_COST = np.float32(0.1), np.float32(0.8)
+
+
+def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> int:
+    """Returns how often the crops are halved for the search: until a pixel is about ``SEARCH_PIXEL_MM``.
+
+    Args:
+        cameras: of the crops at full size; one at least.
+        at_world: about the middle of the subject, mm.
+    """
+    depths = [float(camera.camera_from_world.apply(at_world)[2]) for camera in cameras]
+    pixel_mm = np.median([depth / camera.intrinsics.fx for depth, camera in zip(depths, cameras, strict=True)])
+    halvings = int(np.rint(np.log2(SEARCH_PIXEL_MM / max(float(pixel_mm), 1e-9))))
+    return min(max(halvings, FIRST_LEVELS[0]), FIRST_LEVELS[-1])
+
+
+def first_fields(
+    stack: Stack,
+    depth_ranges: Sequence[DepthRange],
+    neighbours: Sequence[Int[np.ndarray, " _"]],
+    pattern: Float32[np.ndarray, "2 s"],
+    settings: DenseSettings,
+) -> list[Field]:
+    """Returns the fields of all views by a sweep through their rooms; their information is 0.
+
+    Args:
+        neighbours: of each view, those that it is compared with.
+        pattern: samples of a window, across and down from its middle, px.
+    """
+
+    def work(view: int) -> Field:
+        room = depth_ranges[view]
+        cost, strides = np.empty((*room.near.shape, settings.labels), np.float32), label_strides(room, settings)
+        sight = stack.match_arguments(view, neighbours[view], pattern, settings.contrast_levels)
+        sweep_view(sight, make_scratch(sight), room.near, room.far, room.slopes, strides, cost)
+        return _cheapest(cost, room, strides)
+
+    return map_in_threads(work, len(stack))
+
+
+def label_strides(room: DepthRange, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
+    """Returns one in how many labels is matched: 1, 2, 4 ..., so that places lie no farther apart than in the deepest
+    room."""
+    depth = np.clip(room.far - room.near, settings.reach_mm / settings.labels, settings.reach_mm)
+    return (2 ** np.floor(np.log2(settings.reach_mm / depth))).astype(np.int32)
+
+
+def _cheapest(cost: Float32[np.ndarray, "h w d"], room: DepthRange, strides: Int32[np.ndarray, "h w"]) -> Field:
+    """The label of the cheapest paths, and within a stride the least of its own costs: paths are no likeness."""
+    paths = np.empty_like(cost)
+    aggregate(cost, room.far > 0.0, STEP_COST, EDGE_COST, paths)
+    labels = cost.shape[2]
+    best = (paths.argmin(axis=2) + strides // 2) // strides * strides  # a label that was matched
+    best = np.clip(best, strides, labels - 1 - strides)
+    before, at, after = (
+        np.take_along_axis(cost, (best + j * strides)[:, :, None], axis=2)[:, :, 0] for j in (-1, 0, 1)
+    )
+    within = np.clip(0.5 * (before - after) / np.maximum(before + after - 2.0 * at, 1e-6), -0.5, 0.5)
+    share = (best + strides * within) / (labels - 1)
+    depth = np.where(room.far > 0.0, room.near + share * (room.far - room.near), 0.0).astype(np.float32)
+    slopes = room.slopes[:, :, :2] + share[:, :, None] * (room.slopes[:, :, 2:] - room.slopes[:, :, :2])
+    zero = np.zeros_like(depth)
+    return Field(depth, slopes.astype(np.float32), zero, zero, zero)

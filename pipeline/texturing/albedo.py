@@ -1,0 +1,119 @@
+"""Albedo: the texture with its light taken off.
+
+Enters: the head, its photograph-like texture, linear colours of all views. Leaves: the light
+(``pipeline.texturing.light``) and an image in the texture's layout of what the skin itself reflects. Highlights move with
+the camera, so that of each vertex' views a dim one tells what is matt; the texture is multiplied, in linear light, by
+the factor of its vertices from texture to matt colour by shading, which keeps every texel's detail.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from pipeline.compute.threads import in_threads
+from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.texturing.chart_colours import ChartColours, levelled_by_chart
+from pipeline.texturing.inpaint import fill_unknown
+from pipeline.texturing.layout.layout_image import spread_texels
+from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
+from pipeline.texturing.light import Light, fit_light, transfer
+from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.vertex_colours import Texture
+from pipeline.warnings import ReportWarning
+from rig.colour_space import linear_from_srgb, srgb_from_linear
+from rig.mesh import Mesh
+from rig.messages.message import compose
+
+DIM_SHARE = 0.3  # of a vertex' weight in dimmer views: of four views the second dimmest, which noise hardly makes
+MAX_SHINE = 0.5  # of a texture's light that may be taken for a highlight
+CALM = 6  # rounds of means with the neighbours: a highlight is wide, a dim view's noise is not
+MIN_SHADING = 0.35  # by the face's: what is darker (nostrils, below the jaw) would be noise, and errors, made bright
+FACTORS_PX = 1024  # side of the image of factors, smooth as the normals are
+BAND_ROWS = 64
+CODES = 65535
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Albedo:
+    """Holds the image, sRGB, in the texture's layout, and the light that was taken off."""
+
+    atlas: Atlas
+    light: Light
+
+
+def estimate_albedo(
+    mesh_world: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    coloured: Texture,
+    atlas: Atlas | None,
+    face_region: Bool[np.ndarray, " v"],
+    around: Neighbourhood | None,
+    *,
+    chart: ChartColours | None = None,
+) -> tuple[Albedo | None, list[ReportWarning]]:
+    """Returns the albedo of a textured head; a warning where it cannot be told. With a ``chart`` it is the skin's own
+    in level and colour, too; else by convention (``pipeline.texturing.light``)."""
+    if atlas is None or around is None or coloured.dim is None:
+        return None, [compose("no-albedo", reason=compose("albedo-without-texture"))]
+    seen = coloured.views > 0
+    shown = linear_from_srgb(coloured.colours / 255.0)
+    matt = shown * shine_left(shown, coloured.dim, seen, around)[:, None]
+    white = transfer(mesh_world, normals, around)
+    light = fit_light(white, matt, seen & face_region)
+    if light is None:
+        return None, [compose("no-albedo", reason=compose("albedo-without-face"))]
+    if chart is not None:
+        light = levelled_by_chart(light, chart.normal_world)
+    shading = white @ light.coefficients
+    least = MIN_SHADING * np.median(shading[seen & face_region], axis=0)
+    shading = 0.5 * (shading + least + np.hypot(shading - least, 0.5 * least))  # a maximum without a crease
+    albedo = fill_unknown(matt / shading, seen, mesh_world.faces)
+    factors = albedo / np.maximum(shown, 1e-4)
+    return Albedo(Atlas(atlas.layout, multiplied(atlas, factors)), light), []
+
+
+def shine_left(
+    shown: Float[np.ndarray, "v 3"],
+    dim: Float[np.ndarray, "v 3"],
+    seen: Bool[np.ndarray, " v"],
+    around: Neighbourhood,
+) -> Float[np.ndarray, " v"]:
+    """Returns the share of each vertex' light that is no highlight, ``MAX_SHINE`` to 1. By brightness: highlights of
+    skin have their lamp's colour, but a dim view's own colour is noise."""
+    ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
+    ratio = np.where(seen, ratio, 1.0)
+    ratio = around.calmed(ratio[:, None], CALM)[:, 0]
+    # Between its views every vertex differs by noise: what most of the head has is no highlight.
+    ordinary = float(np.median(ratio[seen])) if seen.any() else 1.0
+    return np.clip(ratio / max(ordinary, 1e-4), 1.0 - MAX_SHINE, 1.0)
+
+
+def multiplied(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
+    """Returns the texture's image, each texel by the factor of its triangle's corners, in linear light."""
+    image, size = atlas.image, len(atlas.image)
+    coarse = _factor_image(atlas.layout, factors)
+    linear = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
+    encoded = np.rint(255 * srgb_from_linear(np.arange(CODES + 1) / CODES)).astype(np.uint8)
+    stored = np.empty((size, size, 3), np.uint8)  # blue first, as the texture's own
+    at = ((np.arange(size) + 0.5) * len(coarse) / size - 0.5).astype(np.float32)
+
+    def work(first: int, last: int) -> None:
+        for band in range(first, last):
+            rows = slice(band * BAND_ROWS, min((band + 1) * BAND_ROWS, size))
+            x, y = np.meshgrid(at, at[rows])
+            by = cv2.remap(coarse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            light = np.clip(linear[image[rows]] * by, 0.0, 1.0)
+            stored[rows] = encoded[(CODES * light + 0.5).astype(np.int32)][:, :, ::-1]
+
+    in_threads(-(-size // BAND_ROWS), work)
+    return stored[:, :, ::-1]
+
+
+def _factor_image(layout: Layout, factors: Float[np.ndarray, "v 3"]) -> Float32[np.ndarray, "s s 3"]:
+    """The vertices' factors over the layout; beside it, those of the nearest texel."""
+    texels, ones = FACTORS_PX * layout.uv - 0.5, np.ones(len(layout.uv))
+    _, shown = rasterise(texels, ones, layout.faces, FACTORS_PX, FACTORS_PX)
+    image = interpolate(shown, texels, ones, layout.faces, factors[layout.source].astype(np.float32))
+    return spread_texels(image, shown >= 0)

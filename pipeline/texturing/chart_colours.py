@@ -1,0 +1,80 @@
+"""True colours, from a chart in the clean plates.
+
+Enters: plates, of which some show the chart; the photographs. Leaves: the photographs as a camera with true colours
+would have taken them (linear sRGB, D65, white where the chart's white is), for the texture alone; and which way the
+chart faced, so that the light taken off a head is the light that fell on the chart. A camera that saw no chart gets the
+mean of those that did: the balance of the views levels the rest.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.compute.threads import thread_count
+from pipeline.imaging.chart_plates import charts_in
+from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal
+from pipeline.texturing.light import BAND_FACTORS, Light, harmonics
+from pipeline.warnings import ReportWarning
+from rig.capture import Capture
+from rig.colour_space import linear_from_srgb, srgb_from_linear
+from rig.messages.message import compose
+from rig.rig import Rig
+
+CODES = 4095
+LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
+ENCODED = np.rint(255 * srgb_from_linear(np.arange(CODES + 1) / CODES)).astype(np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChartColours:
+    """Holds the corrections by camera, and the mean way that the charts face (unit vector, world frame)."""
+
+    cameras: Mapping[str, ChartCorrection]
+    normal_world: Float[np.ndarray, " 3"]
+
+
+def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
+    """Returns what the charts in all clean plates say of the cameras; a warning where none is found."""
+    with ThreadPoolExecutor(thread_count()) as pool:
+        charts = pool.map(charts_in, [capture.backgrounds.get(name, ()) for name in rig.names])
+        return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
+
+
+def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
+    """Returns the same of charts that were found, by camera."""
+    found = {name: chart_correction(visible) for name, visible in charts.items() if visible}
+    cameras = {name: correction for name, correction in found.items() if correction is not None}
+    if not cameras:
+        return None, [compose("no-chart")]
+    normals = [chart_normal(chart, rig[name]) for name in cameras for chart in charts[name]]
+    mean = np.mean(normals, axis=0)
+    return ChartColours(cameras, mean / np.linalg.norm(mean)), []
+
+
+def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
+    """Returns the capture with corrected photographs; its plates stay."""
+    mean = np.mean([correction.matrix for correction in colours.cameras.values()], axis=0)
+
+    def corrected(name: str) -> UInt8[np.ndarray, "h w 3"]:
+        correction = colours.cameras.get(name)
+        return in_true_colours(capture.images[name], mean if correction is None else correction.matrix)
+
+    with ThreadPoolExecutor(thread_count()) as pool:
+        return replace(capture, images=dict(zip(capture.images, pool.map(corrected, capture.images), strict=True)))
+
+
+def in_true_colours(
+    picture: UInt8[np.ndarray, "h w 3"], matrix: Float[np.ndarray, "3 3"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    linear = cv2.transform(LINEAR[picture], matrix.astype(np.float32))
+    return ENCODED[(CODES * np.clip(linear, 0.0, 1.0) + 0.5).astype(np.int32)]
+
+
+def levelled_by_chart(light: Light, normal_world: Float[np.ndarray, " 3"]) -> Light:
+    """Returns the light as strong, and of the colour, as it fell on the chart: there white is white."""
+    on_chart = (harmonics(normal_world[None]) * BAND_FACTORS) @ light.coefficients
+    return replace(light, coefficients=light.coefficients / on_chart[0], on_chart=True)

@@ -1,0 +1,40 @@
+"""The texture of a result's head, where the settings ask for a file that has one."""
+
+import numpy as np
+from jaxtyping import Bool
+
+from pipeline.head_model.model import HeadModel
+from pipeline.settings import Settings
+from pipeline.texturing.layout.model_layout import ModelLayout, model_layout
+from pipeline.texturing.layout.uv_unwrap import Atlas, NoLayout
+from pipeline.texturing.paint import paint_texture, texture_size
+from pipeline.texturing.vertex_colours import Texture
+from pipeline.warnings import ReportWarning
+from rig.mesh import Mesh
+from rig.messages.message import compose
+
+
+def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
+    """Returns the model's texture layout where a file of the result has a texture, and warnings of settings and
+    model."""
+    outputs = settings.outputs
+    old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
+    warnings = [compose("old-setting", setting=name) for name, is_set in old.items() if is_set]
+    if not outputs.textured or settings.texture.blend == "reference":
+        return None, warnings
+    try:
+        return model_layout(model), warnings
+    except NoLayout as reason:
+        return None, [*warnings, compose("no-texture-layout", reason=reason.message)]
+
+
+def paint_head(
+    layout: ModelLayout | None, mesh: Mesh, coloured: Texture, face_region: Bool[np.ndarray, " v"], settings: Settings
+) -> Atlas | None:
+    """Returns the head's texture; None where there is no layout, or no camera saw it."""
+    if layout is None or coloured.decision is None:
+        return None
+    region = np.flatnonzero(face_region)
+    wanted = settings.outputs.texture_size
+    size = texture_size(layout.layout, mesh, coloured.decision.views, region, wanted=wanted)
+    return paint_texture(layout.layout, mesh, coloured.colours, coloured.decision, size)

@@ -1,0 +1,38 @@
+"""Values for the vertices that have none, smooth over the mesh: each ring takes the mean of the ring before, and the
+filled part is then relaxed towards its neighbours' mean (the harmonic fill), the known vertices staying as they are."""
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int, Int32
+
+from pipeline.texturing.inpaint_kernels import LANES, by_rings, first_guess, relax
+
+RELAXATIONS = ((60, 1.7), (10, 1.0))  # sweeps and factor: over-relaxed, then plain, which calms what overshot
+
+
+def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int32[np.ndarray, " s"], Int32[np.ndarray, " e"]]:
+    """Returns adjacency of the vertices in compressed rows: starts (count + 1,) and indices, each pair once."""
+    along = np.roll(faces, -1, axis=1)
+    ends = np.concatenate([faces, along]).ravel(), np.concatenate([along, faces]).ravel()
+    pairs = sparse.csr_array((np.ones(len(ends[0]), bool), ends), shape=(count, count))  # adds up what is there twice
+    return pairs.indptr, pairs.indices
+
+
+def fill_unknown(
+    values: Float[np.ndarray, "v c"], known: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "v c"]:
+    """Returns ``values`` (four channels at most) with the unknown ones filled; parts of the mesh that know nothing take
+    the mean of the rest."""
+    out = values.astype(float)
+    if known.all() or not known.any():
+        return out
+    out[~known] = out[known].mean(axis=0)
+    starts, indices = neighbours(faces, len(values))
+    order = by_rings(starts, indices, known)
+    lanes = np.zeros((len(values), LANES), np.float32)
+    lanes[:, : values.shape[1]] = out
+    first_guess(lanes, starts, indices, order, known.copy())
+    for sweeps, factor in RELAXATIONS:
+        relax(lanes, starts, indices, order, sweeps, factor)
+    out[order] = lanes[order, : values.shape[1]]
+    return out

@@ -1,0 +1,42 @@
+"""The layout that belongs to a head model: made once, kept by its content, and mapped by every later process."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.compute.array_cache import cached_arrays
+from pipeline.head_model.model import HeadModel
+from pipeline.texturing.inpaint import neighbours
+from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
+from pipeline.texturing.neighbourhood import Neighbourhood
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelLayout:
+    """Holds of the model's full level: texture coordinates, and which vertices lie beside each other."""
+
+    layout: Layout
+    around: Neighbourhood
+
+
+def model_layout(model: HeadModel) -> ModelLayout:
+    """Returns the layout made from the mean head, so that texels of any two subjects correspond. Raises NoLayout for a
+    model whose surface is not one piece with one open border."""
+    faces = model.levels["full"].faces
+    mean = model.vertices(np.zeros(0))
+
+    def make() -> dict[str, np.ndarray]:
+        found = unwrap(mean, faces)
+        around = Neighbourhood.of(*neighbours(faces, len(mean)))
+        return {
+            "uv": found.uv,
+            "faces": found.faces.astype(np.int32),
+            "source": found.source.astype(np.int32),
+            "starts": around.starts,
+            "indices": around.indices,
+            "opposite": around.opposite,
+        }
+
+    kept = cached_arrays("uv-layout", (model.mean, faces), make, made_by=(unwrap, neighbours, Neighbourhood))
+    layout = Layout(kept["uv"], kept["faces"], kept["source"])
+    return ModelLayout(layout, Neighbourhood(kept["starts"], kept["indices"], kept["opposite"]))

@@ -1,0 +1,129 @@
+"""What a reduced mesh lost of a head's shape, as an image that turns its normals.
+
+Enters: the head, its layout, the layout reduced. Leaves: the reduced mesh with normals and tangents, and its normal
+map as glTF wants it: x along the tangent, +Y up in the image, z along the normal. Tangents are those of MikkTSpace
+(Mikkelsen, *Simulation of Wrinkled Surfaces Revisited*, 2008), which glTF prescribes and viewers interpolate: of each
+corner the direction in which u grows, laid onto the vertex' tangent plane, by the corner's angle.
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes-overview
+
+A texel shows the same place of the head that the texture shows there, so that shape and colour stay together.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+
+from pipeline.compute.threads import in_threads
+from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.texturing.layout.layout_image import spread_texels
+from pipeline.texturing.layout.reduced_layout import ReducedLayout
+from pipeline.texturing.layout.uv_unwrap import Layout
+from rig.mesh import Mesh
+
+BAND_ROWS = 64
+SIZE_PX = 1024  # 4.5 texels from a vertex of the full level to the next; the bumpy ball of the tests needs no more
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalMapped:
+    """Holds a reduced mesh, mm; its vertices are ``rows`` of the full one."""
+
+    mesh: Mesh
+    rows: Int[np.ndarray, " n"]
+    uv: Float[np.ndarray, "n 2"]
+    normals: Float[np.ndarray, "n 3"]
+    tangents: Float[np.ndarray, "n 4"]  # the last is the bitangent's sign, as in glTF
+    image: UInt8[np.ndarray, "s s 3"]
+
+
+def normal_mapped(
+    vertices: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    layout: Layout,
+    reduced: ReducedLayout,
+    size: int = SIZE_PX,
+) -> NormalMapped:
+    """Returns the head's full mesh (mm, unit normals) as a reduced one with its normal map."""
+    rows = layout.source[reduced.rows]
+    places, reduced_normals, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
+    tangents = vertex_tangents(places, reduced_normals, uv, reduced.faces)
+    sign = np.float32(tangents[0, 3])
+    fine = _image(layout.uv, layout.faces, normals[layout.source], size)
+    coarse = _image(uv, reduced.faces, np.concatenate([reduced_normals, tangents[:, :3]], axis=1), size)
+    turned = np.empty_like(fine)
+
+    def work(first: int, last: int) -> None:
+        for start in range(first * BAND_ROWS, min(last * BAND_ROWS, size), BAND_ROWS):
+            band = slice(start, start + BAND_ROWS)
+            turned[band] = _in_frame(_unit(fine[band]), _unit(coarse[band, :, 3:]), _unit(coarse[band, :, :3]), sign)
+
+    in_threads(-(-size // BAND_ROWS), work)
+    inside = np.asarray(np.isfinite(turned[:, :, 0]))
+    codes = np.where(inside[:, :, None], np.rint(127.5 + 127.5 * turned), 0.0).astype(np.float32)
+    image = np.clip(spread_texels(codes, inside), 0, 255).astype(np.uint8)
+    return NormalMapped(Mesh(places, reduced.faces), rows, uv, reduced_normals, tangents, image)
+
+
+def vertex_tangents(
+    vertices: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    uv: Float[np.ndarray, "n 2"],
+    faces: Int[np.ndarray, "f 3"],
+) -> Float[np.ndarray, "n 4"]:
+    """Returns MikkTSpace's tangents, of a layout whose faces all turn the same way; v points downwards."""
+    corners, flat = vertices[faces], uv[faces]
+    edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    (s, t), (p, q) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
+    area = s * q - t * p
+    along = (edge * q[:, None] - other * t[:, None]) * np.sign(area)[:, None]
+    total = np.zeros_like(vertices)
+    for k in range(3):
+        at, normal = corners[:, k], normals[faces[:, k]]
+        first, second = (_laid(corners[:, (k + i) % 3] - at, normal) for i in (1, 2))
+        angle = np.arccos(np.clip(np.einsum("fx,fx->f", first, second), -1.0, 1.0))
+        np.add.at(total, faces[:, k], angle[:, None] * _laid(along, normal))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    total = np.where(length > 1e-9, total, np.cross(normals, (0.0, 1.0, 0.0)))  # no face has an area there
+    # Bitangents point up in the image, against v: cross(n, t) does where the layout shows the surface from outside.
+    sign = -1.0 if np.median(area) > 0 else 1.0
+    return np.concatenate([_laid(total, normals), np.full((len(vertices), 1), sign)], axis=1)
+
+
+def _laid(directions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Unit vectors in the planes of the normals."""
+    return _unit(directions - np.einsum("nx,nx->n", directions, normals)[:, None] * normals)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def _image(
+    uv: Float[np.ndarray, "n 2"], faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, "n k"], size: int
+) -> Float32[np.ndarray, "s s k"]:
+    """Values of the vertices over the layout; NaN beside it."""
+    texels, ones = size * uv - 0.5, np.ones(len(uv))
+    _, shown = rasterise(texels, ones, faces, size, size)
+    return interpolate(shown, texels, ones, faces, values.astype(np.float32))
+
+
+def _in_frame(
+    wanted: Float32[np.ndarray, "h w 3"],
+    tangent: Float32[np.ndarray, "h w 3"],
+    normal: Float32[np.ndarray, "h w 3"],
+    sign: np.float32,
+) -> Float32[np.ndarray, "h w 3"]:
+    """The unit vectors whose shares of tangent, bitangent and normal give the wanted ones: interpolated, the frame is
+    no longer at right angles."""
+    lean = np.einsum("yxc,yxc->yx", tangent, normal)
+    bitangent = _unit(sign * np.cross(normal, tangent))
+    x, z = (np.einsum("yxc,yxc->yx", wanted, axis) for axis in (tangent, normal))
+    y = np.einsum("yxc,yxc->yx", wanted, bitangent)
+    return _unit(np.stack([(x - lean * z) / (1 - lean**2), y, (z - lean * x) / (1 - lean**2)], axis=2))
+
+
+def png(image: UInt8[np.ndarray, "s s 3"]) -> bytes:
+    """Returns the map as a file: no loss, which would be seen in highlights."""
+    return cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()

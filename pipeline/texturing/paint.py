@@ -1,0 +1,86 @@
+"""The texture image: every texel of the model's layout takes the photograph of its vertices' choice.
+
+A texel is a point of the fitted surface; its place in a photograph follows from those of its triangle's corners (lens
+included; edges are a few pixels), is read there with a sub-pixel window and gets the corners' correction
+(``pipeline.texturing.seam_levelling``). In triangles whose corners chose different photographs these are faded into each
+other. What no camera sees has the vertices' colours.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from pipeline.compute.threads import in_threads
+from pipeline.geometry.raster import camera_depths
+from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.texturing.decision import Decision
+from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
+from pipeline.texturing.paint_kernels import paint_rows
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+SIZES = (1024, 2048, 4096, 8192)
+COARSE = 512  # side of the small image that fills what no triangle covers
+BAND_ROWS = 64
+
+
+def paint_texture(
+    layout: Layout, mesh_world: Mesh, colours: UInt8[np.ndarray, "v 3"], decision: Decision, size: int
+) -> Atlas:
+    """Returns the image of a head, ``size`` texels wide and high.
+
+    Args:
+        layout: of the mesh's vertices.
+        mesh_world: the head.
+        colours: sRGB of its vertices, for what no camera sees and to pad with.
+        decision: the view of every vertex, and the photographs.
+        size: of the image.
+    """
+    stored = np.empty((size, size, 3), np.uint8)  # blue first: encoders take it as it is
+    cv2.resize(_coarse(layout, colours), (size, size), dst=stored, interpolation=cv2.INTER_NEAREST)
+    texels = size * layout.uv - 0.5
+    choice = decision.choice(colours)
+    corners = texels[layout.faces, 1]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+
+    def paint(first: int, last: int) -> None:
+        for band in range(first, last):
+            row = band * BAND_ROWS
+            which = np.flatnonzero((high >= row) & (low <= row + BAND_ROWS - 1))
+            paint_rows(stored, row, BAND_ROWS, which, texels, layout.faces, layout.source, decision.pictures, choice)
+
+    in_threads(size // BAND_ROWS, paint)
+    return Atlas(layout, stored[:, :, ::-1])
+
+
+def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
+    """The vertices' colours, small, blue first; texels beside the layout have the nearest one's."""
+    texels, ones = COARSE * layout.uv - 0.5, np.ones(len(layout.uv))
+    _, shown = rasterise(texels, ones, layout.faces, COARSE, COARSE)
+    values = np.ascontiguousarray(colours[layout.source, ::-1]).astype(np.float32)
+    image = interpolate(shown, texels, ones, layout.faces, values)
+    empty = (shown < 0).view(np.uint8)
+    _, labels = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL)
+    nearest = np.asarray(labels).astype(np.int32)
+    known = np.zeros((int(nearest.max()) + 1, 3), np.uint8)
+    known[nearest[shown >= 0]] = np.rint(image[shown >= 0])
+    return known[nearest]
+
+
+def texture_size(
+    layout: Layout, mesh_world: Mesh, views: Rig, region: Int[np.ndarray, " n"], *, wanted: int | None = None
+) -> int:
+    """Returns the side of the image (texels): the smallest whose texels on the face are no coarser than a pixel
+    there."""
+    if wanted is not None:
+        return wanted
+    inside = layout.faces[np.isin(layout.source[layout.faces], region).all(axis=1)]
+    sides = np.roll(inside, -1, axis=1)
+    length_mm = np.linalg.norm(
+        mesh_world.vertices[layout.source[inside]] - mesh_world.vertices[layout.source[sides]], axis=2
+    )
+    unit_mm = float(np.median(length_mm / np.linalg.norm(layout.uv[inside] - layout.uv[sides], axis=2)))
+    centre = mesh_world.vertices[region].mean(axis=0, keepdims=True)
+    pixel_mm = [float(camera_depths(camera, centre)[0]) / camera.intrinsics.fx for camera in views]
+    least = unit_mm / min(pixel_mm, default=unit_mm)
+    return next((size for size in SIZES if size >= least), SIZES[-1])

@@ -1,0 +1,257 @@
+"""Texture (section 4.5): one colour a vertex.
+
+Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour a vertex and how many images gave it.
+``blend = "reference"`` is the paper's: a vertex counts in an image if it projects inside the silhouette and nothing
+lies before it; its weight is the dot product of normal and viewing direction; its colour the weighted mean.
+
+The default departs from it, because real cameras differ and real edges are blurred: margins at contours and occluding
+edges (``pipeline.texturing.visibility``), photographs sharpened where there is detail, gain and offset of each camera
+(``pipeline.imaging.colour_balance``), a mean in linear light that gives little to what differs from the other views in
+any channel, be it brighter (a highlight moves with the camera) or darker (a shadow that only it sees), less weight for
+cameras that had to be raised or lowered much, and a smooth fill where no camera looks.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from pipeline.compute.threads import thread_count
+from pipeline.geometry.raster import camera_depths
+from pipeline.imaging.colour_balance import balance
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.settings import TextureSettings
+from pipeline.texturing.blind_patches import fill_unobserved_patches
+from pipeline.texturing.decision import Decision, pack_pictures
+from pipeline.texturing.inpaint import fill_unknown
+from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.paint_kernels import Pictures
+from pipeline.texturing.seam_levelling import level_views
+from pipeline.texturing.vertex_colours_kernels import blend_views
+from pipeline.texturing.view_selection import add_similar_views, select_views
+from pipeline.texturing.visibility import Sight, see_points, sharpened
+from pipeline.warnings import ReportWarning
+from rig.camera import Camera
+from rig.capture import Capture
+from rig.colour_space import srgb_from_linear
+from rig.mesh import Mesh
+from rig.messages.message import compose
+from rig.rig import Rig
+
+REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hidden: a pixel's slope on a steep cheek
+GREY = 0.22  # linear: what a head gets that no camera saw
+STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
+
+
+GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
+
+Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """Holds sRGB colours, the number of images behind each (0 = filled), and what was found of the cameras."""
+
+    colours: UInt8[np.ndarray, "v 3"]
+    views: UInt8[np.ndarray, " v"]
+    gains: Mapping[str, Rgb] = field(default_factory=dict)  # linear, by camera
+    offsets: Mapping[str, Rgb] = field(default_factory=dict)
+    filled: int = 0
+    decision: Decision | None = None  # where it was asked for
+    dim: Float32[np.ndarray, "v 3"] | None = None  # linear, of a dim view of each vertex; where it was asked for
+    warnings: tuple[ReportWarning, ...] = ()
+
+
+def texture(
+    mesh_world: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+    *,
+    settings: TextureSettings,
+    around: Neighbourhood | None = None,
+    dim_share: float | None = None,
+) -> Texture:
+    """Returns colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them. With
+    ``around``, the mesh's edges, a view is also chosen for every vertex; with ``dim_share``, the
+    colour below which that share of a vertex' weight lies is told, too."""
+    views = usable_views(capture, silhouettes, rig)
+    if settings.blend == "reference":
+        return _reference(mesh_world, normals, capture, silhouettes, views, depths)
+    if not len(views):
+        return _untextured(len(normals))
+
+    def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
+        name = camera.name
+        image = sharpened(capture.images[name], silhouettes[name].mask, settings)
+        points, silhouette = mesh_world.vertices, silhouettes[name]
+        sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
+        return sight, image
+
+    with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
+        found = list(pool.map(look, views))
+    weights, colours = _stacked([sight for sight, _ in found])
+    gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
+    if settings.balance:
+        gains, offsets = balance(weights, colours)
+    weights *= gain_confidence(gains)[:, None]
+    balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
+    agreed, seen = blend_views(weights, balanced, settings.outlier)
+    if not seen.any():
+        return _untextured(len(seen))
+    decision = None
+    if around is not None:
+        images = [image for _, image in found]
+        masks = {name: silhouettes[name].mask for name in views.names}
+        pictures = pack_pictures(
+            views, images, masks, gains, offsets, mesh_world=mesh_world, footprint_px=settings.footprint_px
+        )
+        decision = decide(views, weights, balanced, agreed, gains, pictures, around=around, settings=settings)
+        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, settings)
+    shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
+    by_camera = _by_name(views, gains)
+    filled = int(np.count_nonzero(seen == 0))
+    warnings = _gain_warnings(by_camera)
+    dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
+    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
+
+
+def underexposed_views(
+    weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"], share: float
+) -> Float32[np.ndarray, "v 3"]:
+    """Returns the colour of the view that is as bright as ``share`` of each vertex' weight; black where no view sees
+    it."""
+    order = np.argsort(np.where(weights > 0, colours.sum(axis=2), np.inf), axis=0)
+    passed = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
+    rank = np.argmax(passed >= share * passed[-1], axis=0)
+    chosen = np.take_along_axis(order, rank[None], axis=0)[0]
+    found = colours[chosen, np.arange(weights.shape[1])]
+    return np.where((passed[-1] > 0)[:, None], found, np.float32(0.0))
+
+
+def gain_confidence(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
+    """Returns the share that a camera's word has left: what had to be made much brighter brings its noise along, and a
+    dim view is often a shadowed one."""
+    return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
+
+
+def decide(
+    views: Rig,
+    weights: Float32[np.ndarray, "k v"],
+    balanced: Float32[np.ndarray, "k v 3"],
+    agreed: Float[np.ndarray, "v 3"],
+    gains: Float[np.ndarray, "k 3"],
+    pictures: Pictures,
+    *,
+    around: Neighbourhood,
+    settings: TextureSettings,
+) -> Decision:
+    """Returns a view for each vertex, and what levels the seams between them."""
+    chosen = settings.selection
+    codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
+    level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
+    fields = level_views(weights, codes, level_to, around, chosen.levelling)
+    detail = codes + fields[:, :, :3]
+    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around=around, settings=chosen)
+    slots, shares = add_similar_views(labels, options, quality, detail, weights, around=around, settings=chosen)
+    corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
+    return Decision(views, slots, shares, corrections, weights, pictures)
+
+
+def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
+    """Returns the cameras that may colour a head."""
+    return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
+
+
+def _stacked(sights: Sequence[Sight]) -> tuple[Float32[np.ndarray, "k v"], Float32[np.ndarray, "k v 3"]]:
+    return np.stack([sight.weights for sight in sights]), np.stack([sight.colours for sight in sights])
+
+
+def _by_name(rig: Rig, values: Float[np.ndarray, "k 3"]) -> dict[str, Rgb]:
+    return {name: (r, g, b) for name, (r, g, b) in zip(rig.names, values.tolist(), strict=True)}
+
+
+def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
+    return tuple(
+        compose("camera-gain", camera=name, factor=1 / min(gain))
+        for name, gain in gains.items()
+        if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
+    )
+
+
+def _untextured(count: int) -> Texture:
+    code = round(255 * float(srgb_from_linear(np.array(GREY))))
+    warning = compose("no-texture")
+    return Texture(np.full((count, 3), code, np.uint8), np.zeros(count, np.uint8), filled=count, warnings=(warning,))
+
+
+def _reference(
+    mesh: Mesh,
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+) -> Texture:
+    """Section 4.5 to the letter, in the images' own codes; vertices that no camera sees are filled."""
+    colours, weights, views = reference_colours(mesh.vertices, normals, capture, silhouettes, rig, depths)
+    known = weights > 0
+    if not known.any():
+        return _untextured(len(normals))
+    colours = fill_unknown(colours, known, mesh.faces)
+    return Texture(np.rint(colours).clip(0, 255).astype(np.uint8), views, filled=int(np.count_nonzero(~known)))
+
+
+def reference_colours(
+    points: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    capture: Capture,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
+    """Returns the paper's codes of points of a surface, the weight behind each (0: nobody sees it) and the number of
+    images."""
+    total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
+    views = np.zeros(len(normals), np.uint8)
+    for camera in rig:
+        pixels = camera.project(points)
+        seen = _visible(camera, points, pixels, depths[camera.name], silhouettes[camera.name])
+        towards = camera.centre_world - points
+        facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+        weight = np.where(seen, np.clip(facing, 0.0, None), 0.0)
+        total += weight[:, None] * _sampled(capture.images[camera.name], pixels)
+        weights += weight
+        views += weight > 0
+    return total / np.where(weights > 0, weights, 1.0)[:, None], weights, views
+
+
+def _visible(
+    camera: Camera,
+    vertices: Float[np.ndarray, "v 3"],
+    pixels: Float[np.ndarray, "v 2"],
+    depth: Float32[np.ndarray, "h w"],
+    silhouette: Silhouette,
+) -> Bool[np.ndarray, " v"]:
+    """Inside the silhouette, and nothing before the vertex."""
+    height, width = depth.shape
+    framed = np.logical_and(pixels >= 0, pixels <= (width - 1, height - 1)).all(axis=1)  # NaN is not
+    columns, rows = np.rint(np.where(framed.reshape(-1, 1), pixels, 0.0)).astype(int).T
+    free = camera_depths(camera, vertices) < depth[rows, columns] + REFERENCE_HIDDEN_MM
+    return framed & silhouette.mask[rows, columns] & free
+
+
+def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]) -> Float[np.ndarray, "v 3"]:
+    """Bilinear samples; the nearest border pixel outside the image."""
+    height, width = image.shape[:2]
+    safe = np.clip(np.nan_to_num(pixels), 0, (width - 1.001, height - 1.001))
+    low = safe.astype(int)
+    fx, fy = (safe - low).T[:, :, None]
+    x, y = low.T
+    top = image[y, x] * (1 - fx) + image[y, x + 1] * fx
+    bottom = image[y + 1, x] * (1 - fx) + image[y + 1, x + 1] * fx
+    return top * (1 - fy) + bottom * fy

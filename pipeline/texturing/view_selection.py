@@ -1,0 +1,112 @@
+"""Which photograph each part of the head takes its detail from.
+
+After Waechter, Moehrle and Goesele, *Let There Be Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): a
+label a vertex that minimises a data term (projected area and angle, visibility of the whole neighbourhood, how far a
+view's colour is from what the others say, be it a highlight or a shadow, and how strongly the camera had to be
+corrected) and a Potts term on the edges, dearest where the views disagree, so that seams keep out of eyes and lips.
+Labels sit at vertices in place of faces: in the ring of triangles at a seam two photographs are then faded into each
+other. Minimised by belief propagation (Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*,
+IJCV 2006), sweeping through the vertices there and back.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+
+from pipeline.settings import SelectionSettings
+from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.view_selection_kernels import (
+    NEVER,
+    best_candidates,
+    differences,
+    fill_slots,
+    propagate,
+    ring_quality,
+)
+
+CANDIDATES = 6  # views of a vertex that come into question; a seventh is hardly ever the best
+GAIN_COST = 1.0  # of a camera whose light was doubled or halved
+NOISE_CODES = 2.0  # disagreement that noise makes in the dark
+
+
+def select_views(
+    weights: Float32[np.ndarray, "k v"],
+    codes: Float32[np.ndarray, "k v 3"],
+    levelled: Float32[np.ndarray, "k v 3"],
+    agreed: Float32[np.ndarray, "v 3"],
+    gains: Float[np.ndarray, "k 3"],
+    *,
+    around: Neighbourhood,
+    settings: SelectionSettings,
+) -> tuple[Int32[np.ndarray, " v"], Int32[np.ndarray, "v c"], Float32[np.ndarray, "v c"]]:
+    """Returns a view for each vertex, -1 where none sees it; the views that came into question, and their quality.
+
+    Args:
+        weights: of the views by angle and distance, 0 = not seen.
+        codes: of every view, gains applied.
+        levelled: the same, after ``pipeline.texturing.seam_levelling``: beside a shadow's edge that helps nothing.
+        agreed: codes that the views agree on.
+        gains: of the cameras, which multiply to one.
+        around: the mesh's edges.
+        settings: of the selection.
+    """
+    quality = ring_quality(weights, around.starts, around.indices)
+    best = quality.max(axis=1, keepdims=True)
+    costs = 1.0 - quality / np.maximum(best, 1e-12)
+    off = np.maximum(_disagreement(codes, agreed, settings), _disagreement(levelled, agreed, settings))
+    costs += settings.outlier * off**2 / (1.0 + off**2)
+    costs += GAIN_COST * np.abs(np.log2(gains.mean(axis=1)))
+    costs = np.where(weights.T > 0, costs, NEVER).astype(np.float32)
+    views, candidates = best_candidates(costs, min(CANDIDATES, len(weights)))
+    share = np.where(weights.T > 0, quality, 0.0)
+    spread = (share * off).sum(axis=1) / np.maximum(share.sum(axis=1), 1e-12)
+    unlike = np.minimum(spread, 3.0)
+    penalty = settings.smoothness * (0.3 + 0.5 * (unlike[around.rows] + unlike[around.indices]))
+    chosen = propagate(
+        views, candidates, around.starts, around.indices, around.opposite, penalty.astype(np.float32), len(weights),
+        settings.sweeps,
+    )  # fmt: skip
+    found = np.take_along_axis(views, np.maximum(chosen, 0)[:, None], axis=1)[:, 0]
+    labels = np.where(chosen >= 0, found, -1).astype(np.int32)
+    return labels, views, np.where(views >= 0, np.take_along_axis(quality, np.maximum(views, 0), axis=1), 0.0)
+
+
+def _disagreement(
+    codes: Float32[np.ndarray, "k v 3"], agreed: Float32[np.ndarray, "v 3"], settings: SelectionSettings
+) -> Float32[np.ndarray, "v k"]:
+    """How far each view is from the others, by what is ordinary."""
+    off = (codes - agreed) / (settings.disagreement * agreed + NOISE_CODES)
+    return np.sqrt(np.einsum("kvc,kvc->vk", off, off) / 3.0)
+
+
+def add_similar_views(
+    labels: Int32[np.ndarray, " v"],
+    views: Int32[np.ndarray, "v c"],
+    quality: Float32[np.ndarray, "v c"],
+    detail: Float32[np.ndarray, "k v 3"],
+    weights: Float32[np.ndarray, "k v"],
+    *,
+    around: Neighbourhood,
+    settings: SelectionSettings,
+) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
+    """Returns the chosen views, and beside them others that differ from them by noise alone: their mean has less of it.
+    Where they differ by more, in eyes, brows and lips, blending would blur.
+
+    Args:
+        labels: the chosen view of each vertex, -1 = none.
+        views: those that come into question.
+        quality: of them.
+        detail: what levelled views show beyond what all agree on, codes.
+        weights: 0 where a view does not see a vertex.
+        around: the mesh's edges.
+        settings: of the selection.
+
+    Returns:
+        Views (-1: none) and shares, the chosen one first.
+    """
+    off = differences(labels, views, detail, weights, around.starts, around.indices)
+    informative = off[(off >= 0) & (views != labels[:, None])]
+    noise = max(float(np.median(informative)), 0.25) if len(informative) else 1.0
+    best = np.maximum(quality.max(axis=1, keepdims=True), 1e-12)
+    shares = (quality / best) * np.exp(-np.maximum(off / (settings.noise_factor * noise) - 1.0, 0.0))
+    shares = np.where((off >= 0) & (labels[:, None] >= 0), shares, 0.0).astype(np.float32)
+    return fill_slots(labels, views, shares, settings.views_most)

@@ -1,0 +1,190 @@
+"""Compiled loops of ``pipeline.texturing.view_selection`` and ``pipeline.texturing.seam_levelling``."""
+
+import numpy as np
+
+from pipeline.compute.jit import njit
+
+NEVER = np.float32(1e6)  # cost of a view that does not see a vertex
+RING_SHARE = 0.7  # of a view's quality that the neighbours decide: beside an occluding edge it soon sees something else
+
+
+@njit(cache=True, nogil=True)
+def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Quality of each view (k, v): its own weight, and the least of the neighbours', which ends beside occlusions."""
+    cameras, count = weights.shape
+    out = np.zeros((count, cameras), np.float32)
+    for v in range(count):
+        for k in range(cameras):
+            weight = weights[k, v]
+            if weight <= 0:
+                continue
+            least = weight
+            for e in range(starts[v], starts[v + 1]):
+                least = min(least, weights[k, indices[e]])
+            out[v, k] = weight * (1 - RING_SHARE) + least * RING_SHARE
+    return out
+
+
+@njit(cache=True, nogil=True)
+def best_candidates(costs: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """The ``most`` cheapest views of each vertex, cheapest first (-1 where there are fewer), and their costs."""
+    count, cameras = costs.shape
+    views = np.full((count, most), -1, np.int32)
+    found = np.full((count, most), NEVER, np.float32)
+    for v in range(count):
+        for k in range(cameras):
+            cost = costs[v, k]
+            if cost >= NEVER or cost >= found[v, most - 1]:
+                continue
+            place = most - 1
+            while place > 0 and found[v, place - 1] > cost:
+                found[v, place], views[v, place] = found[v, place - 1], views[v, place - 1]
+                place -= 1
+            found[v, place], views[v, place] = cost, k
+    return views, found
+
+
+@njit(cache=True, nogil=True)
+def propagate(
+    views: np.ndarray,
+    costs: np.ndarray,
+    starts: np.ndarray,
+    indices: np.ndarray,
+    opposite: np.ndarray,
+    penalty: np.ndarray,
+    cameras: int,
+    sweeps: int,
+) -> np.ndarray:
+    """Min-sum belief propagation with a Potts term; the place of each vertex's label among its candidates.
+
+    ``penalty`` is what a change of view costs along each directed edge, ``opposite`` the same edge the other way. A
+    message is kept at its edge, for the candidates of its receiver, less what it says of every other label.
+    """
+    count, most = views.shape
+    messages = np.zeros((len(indices), most), np.float32)  # of edge e = (v, w): what w tells v
+    belief, by_view = np.zeros(most, np.float32), np.full(cameras, NEVER, np.float32)
+    for sweep in range(sweeps):
+        for step in range(count):
+            v = step if sweep % 2 == 0 else count - 1 - step
+            for c in range(most):
+                belief[c] = costs[v, c]
+                for e in range(starts[v], starts[v + 1]):
+                    belief[c] += messages[e, c]
+            for e in range(starts[v], starts[v + 1]):
+                least = NEVER
+                for c in range(most):
+                    if views[v, c] >= 0:
+                        cost = belief[c] - messages[e, c]
+                        by_view[views[v, c]] = cost
+                        least = min(least, cost)
+                back, receiver = opposite[e], indices[e]
+                limit = least + penalty[e]
+                for c in range(most):
+                    label = views[receiver, c]
+                    cost = by_view[label] if label >= 0 else NEVER
+                    messages[back, c] = min(cost, limit) - limit
+            for c in range(most):
+                if views[v, c] >= 0:
+                    by_view[views[v, c]] = NEVER
+    chosen = np.full(count, -1, np.int32)
+    for v in range(count):
+        least = NEVER
+        for c in range(most):
+            if views[v, c] >= 0:
+                total = costs[v, c]
+                for e in range(starts[v], starts[v + 1]):
+                    total += messages[e, c]
+                if chosen[v] < 0 or total < least:
+                    least, chosen[v] = total, c
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def level_view(
+    aims: np.ndarray,
+    seen: np.ndarray,
+    starts: np.ndarray,
+    indices: np.ndarray,
+    strength: float,
+    sweeps: int,
+    factor: float,
+) -> None:
+    """Of one view: makes of ``aims`` (v, 4) what minimises ``|c_v - aim_v|^2 + strength |c_v - c_w|^2`` over the
+    vertices that are ``seen`` and their edges, by over-relaxed Gauss-Seidel. In place."""
+    rows = np.flatnonzero(seen)
+    fixed = aims.copy()
+    s, kept = np.float32(strength), np.float32(1.0 - factor)
+    for _ in range(sweeps):  # always forwards: there and back, over-relaxing gains nothing
+        for turn in range(len(rows)):
+            v = rows[turn]
+            a, b, c, total = fixed[v, 0], fixed[v, 1], fixed[v, 2], np.float32(1.0)
+            for e in range(starts[v], starts[v + 1]):
+                w = indices[e]
+                if seen[w]:
+                    a += s * aims[w, 0]
+                    b += s * aims[w, 1]
+                    c += s * aims[w, 2]
+                    total += s
+            move = np.float32(factor) / total
+            aims[v, 0] = kept * aims[v, 0] + move * a
+            aims[v, 1] = kept * aims[v, 1] + move * b
+            aims[v, 2] = kept * aims[v, 2] + move * c
+
+
+@njit(cache=True, nogil=True)
+def differences(
+    labels: np.ndarray, views: np.ndarray, detail: np.ndarray, weights: np.ndarray, starts: np.ndarray,
+    indices: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Mean square by which each candidate's detail (k, v, 3) differs from that of the chosen view, over a vertex and
+    its neighbours that both see; -1 for none."""
+    count, most = views.shape
+    out = np.full((count, most), np.float32(-1.0), np.float32)
+    for v in range(count):
+        chosen = labels[v]
+        if chosen < 0:
+            continue
+        for c in range(most):
+            k = views[v, c]
+            if k < 0:
+                continue
+            total, n = np.float32(0.0), 0
+            for e in range(starts[v] - 1, starts[v + 1]):
+                w = v if e < starts[v] else indices[e]
+                if weights[k, w] > 0 and weights[chosen, w] > 0:
+                    for channel in range(3):
+                        off = detail[k, w, channel] - detail[chosen, w, channel]
+                        total += off * off
+                    n += 3
+            out[v, c] = total / max(n, 1)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def fill_slots(
+    labels: np.ndarray, views: np.ndarray, shares: np.ndarray, slots: int
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """The chosen view and those of the largest shares beside it: views (v, slots), -1 = none, and shares that add up
+    to one."""
+    count, most = views.shape
+    found = np.full((count, slots), -1, np.int32)
+    weight = np.zeros((count, slots), np.float32)
+    for v in range(count):
+        if labels[v] < 0:
+            continue
+        found[v, 0], weight[v, 0] = labels[v], 1.0
+        for c in range(most):
+            share = shares[v, c]
+            if views[v, c] < 0 or views[v, c] == labels[v] or share <= weight[v, slots - 1] or share < 0.05:
+                continue
+            place = slots - 1
+            while place > 1 and weight[v, place - 1] < share:
+                found[v, place], weight[v, place] = found[v, place - 1], weight[v, place - 1]
+                place -= 1
+            found[v, place], weight[v, place] = views[v, c], share
+        total = np.float32(0.0)
+        for c in range(slots):
+            total += weight[v, c]
+        for c in range(slots):
+            weight[v, c] /= total
+    return found, weight

@@ -1,0 +1,107 @@
+"""Which point of a surface which camera sees, how well, and in what colour: the work of section 4.5, compiled.
+
+The paper asks for a projection inside the silhouette and no occlusion. Real edges are blurred and fits are not exact,
+so a margin is kept: to the contour (no background reaches the mesh), and to occluding edges of the head itself (no nose
+on the cheek behind it), where the nearest surface in a small window counts, less what the surface's own slope explains.
+A view beside an occluding edge, or at a flat angle, speaks only where there is no better one.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from pipeline.geometry.projection import project_points
+from pipeline.geometry.raster import camera_depths
+from pipeline.imaging.masks import box_around
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.settings import TextureSettings
+from pipeline.texturing.visibility_kernels import POOR, sample_colours, visibility_weights
+from rig.camera import Camera
+from rig.colour_space import linear_from_srgb
+
+LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
+CLIPS = tuple(LINEAR[[242, 254]])  # linear; noise and sharpening reach a little below the end of the scale
+UNSHARP_PX = 1.0  # sigma; 1.5 is 0.6 dB worse on a head of another renderer
+POWER_PX = 2.0  # sigma of the window in which detail is told from noise
+NOISE_MARGIN = 2.0  # by which the median power is multiplied: its own scatter in that window is a third
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """Holds one camera's view of every point: weight (0 = not seen) and linear colour (0 to 1)."""
+
+    weights: Float32[np.ndarray, " v"]
+    colours: Float32[np.ndarray, "v 3"]
+
+
+def see_points(
+    camera: Camera,
+    image: UInt8[np.ndarray, "h w 3"],
+    silhouette: Silhouette,
+    depth: Float32[np.ndarray, "h w"],
+    points: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    *,
+    settings: TextureSettings,
+) -> Sight:
+    """Returns what ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
+    weights = see_weights(camera, silhouette, depth, points, normals, settings)
+    pixels = project_points(camera, points)
+    colours = sample_colours(image, pixels, weights, LINEAR, settings.footprint_px)
+    return Sight(weights * unclipped(colours), colours)
+
+
+def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
+    """Returns 1 below the end of the scale, next to nothing at it: how much brighter a place is no camera says there,
+    and one that is exposed longer than the others makes it darker than it is. Where all are clipped it is white all the
+    same.
+    """
+    past = (colours.max(axis=1) - CLIPS[0]) / (CLIPS[1] - CLIPS[0])
+    return np.clip(1.0 - past, POOR, 1.0).astype(np.float32)
+
+
+def see_weights(
+    camera: Camera,
+    silhouette: Silhouette,
+    depth: Float32[np.ndarray, "h w"],
+    points: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "v 3"],
+    settings: TextureSettings,
+) -> Float32[np.ndarray, " v"]:
+    """Tells how well ``camera`` sees each point of a surface; 0 where it does not."""
+    pixels, depths = project_points(camera, points), camera_depths(camera, points)
+    towards = camera.centre_world - points
+    facing = np.einsum("vi,vi->v", normals, towards) / np.sqrt(np.einsum("vi,vi->v", towards, towards))
+    return visibility_weights(
+        pixels,
+        depths,
+        facing,
+        depth,
+        silhouette.distance,
+        1.0 / camera.intrinsics.fx,
+        (settings.contour_margin_px, settings.hidden_mm, settings.least_facing, settings.sharpness),
+    )
+
+
+def sharpened(
+    image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], settings: TextureSettings
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns the photograph with some of the lens's blur, and of the sampling window's, taken back where there is
+    detail.
+
+    An unsharp mask would lift noise with it, so that it is held back as a Wiener filter does: by the share of what it
+    would lift, over some pixels, that is more than noise. Most of a head is smooth: the median over it is noise.
+    """
+    box = box_around(inside, 0)
+    if not settings.sharpening or not inside[box].size:
+        return image
+    crop = image[box].astype(np.float32)
+    detail = crop - cv2.GaussianBlur(crop, (0, 0), UNSHARP_PX)
+    power = cv2.GaussianBlur((detail * detail) @ np.full(3, 1 / 3, np.float32), (0, 0), POWER_PX)
+    noise = NOISE_MARGIN * float(np.median(power[::4, ::4][inside[box][::4, ::4]]))
+    gain = settings.sharpening * np.clip(1 - noise / np.maximum(power, 1e-3), 0, 1)
+    out = image.copy()
+    out[box] = np.clip(crop + gain[:, :, None] * detail + 0.5, 0, 255)
+    return out

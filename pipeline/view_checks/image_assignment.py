@@ -1,0 +1,243 @@
+"""Every camera's own picture under its own name, before anything is measured in it.
+
+Enters: a capture as it is filed, and a way to segment it. Leaves: capture and silhouettes as they should be filed, and
+what was found. A plate that belongs to another camera's picture makes no mask of use, so that plates are matched to
+pictures first, by what they show beside the subject; then the pictures, with their plates, are matched to cameras
+(``pipeline.view_checks.camera_assignment``).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.triangulation import NoPoint, triangulate
+from pipeline.view_checks.camera_assignment import (
+    FITTING_MISFIT,
+    Assignment,
+    find_assignment,
+    own_misfit,
+    ring_messages,
+)
+from pipeline.view_checks.mask_edges import masks_alone_exchanged
+from pipeline.view_checks.rig_agreement import loose_outlines, wrong_rig
+from pipeline.warnings import ReportWarning
+from rig.capture import Capture, Features, reassign_images
+from rig.errors import EigenheadError
+from rig.messages.message import Message, compose
+from rig.rig import Rig
+
+PLATE_SEEN = (
+    0.6  # share of a picture that its plate explains, below which other plates are tried; 0.6 to 0.8 in good ones
+)
+PLATE_GAIN = 1.3  # how many times as much of each picture the other plates must explain; another's explains 0 to 0.5
+PLATE_COLUMNS = 64
+PLATE_TOLERANCE = 0.06  # of log level: 2 % of light drift, vignetting, and noise averaged over 16 x 16 pixels
+CLICK_PX, MAX_CLICK_MISFIT = 1.5, 50.0
+
+
+Segmentation = Callable[[Capture], dict[str, Silhouette]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageAssignment:
+    """Holds a capture and its silhouettes with every picture under its own camera; ``pictures`` and ``plates`` say, for
+    each camera that was given another's, the name under which its own is filed."""
+
+    capture: Capture
+    silhouettes: Mapping[str, Silhouette]
+    pictures: Mapping[str, str]
+    plates: Mapping[str, str]
+    warnings: tuple[ReportWarning, ...]
+
+
+class ExchangedPictures(EigenheadError):
+    """Reports pictures filed under other cameras' names, and no leave or not enough evidence to file them back."""
+
+    def __init__(self, found: Sequence[Message], *, doubtful: bool) -> None:
+        reason = compose("exchange-doubtful") if doubtful else compose("exchange-not-wanted")
+        super().__init__(compose("pictures-exchanged", exchange=found, reason=reason))
+
+
+class WrongRig(EigenheadError):
+    """Reports pictures that these cameras cannot have taken."""
+
+
+def assign_images(
+    capture: Capture, rig: Rig, segmented: Segmentation, *, exchanged: Literal["repair", "refuse"]
+) -> ImageAssignment:
+    """Segments a capture, and files exchanged pictures and plates back.
+
+    Args:
+        capture: as it was read.
+        rig: the cameras as calibrated.
+        segmented: the silhouettes of a capture; called again for every change of what is filed where.
+        exchanged: what to do about an exchange that is beyond doubt.
+
+    Raises:
+        ExchangedPictures: an exchange that may not be repaired, or is not sure enough to be.
+        WrongRig: no exchange explains that most cameras contradict the others.
+    """
+    plates = misplaced_plates(capture, rig)
+    if plates and exchanged == "refuse":
+        raise ExchangedPictures(ring_messages(plates, compose("what-plates")), doubtful=False)
+    capture = reassign_images(capture, plates=plates) if plates else capture
+    silhouettes = segmented(capture)
+    duplicates = duplicate_views(capture, silhouettes, rig)
+    distinct = {name: silhouette for name, silhouette in silhouettes.items() if name not in duplicates}
+    assignment = find_assignment(distinct, rig)
+    masks = assignment.pictures if _masks_alone(capture, silhouettes, assignment) else {}
+    what = compose("what-masks") if masks else compose("what-pictures")
+    if assignment.pictures and (exchanged == "refuse" or not assignment.overwhelming):
+        found = ring_messages(assignment.pictures, what)
+        raise ExchangedPictures(found, doubtful=not assignment.overwhelming)
+    wrong = None if assignment.pictures else wrong_rig(distinct, rig)
+    if wrong:
+        raise WrongRig(wrong)
+    pictures = {} if masks else assignment.pictures
+    if masks:
+        capture = reassign_images(capture, masks=masks)
+        silhouettes = segmented(capture)
+    elif pictures:
+        capture = _filed_back(capture, pictures, rig)
+        silhouettes = segmented(capture)
+        plates = _composed(plates, pictures)
+    warnings = _warnings(pictures, masks, plates, duplicates)
+    if not assignment.pictures and loose_outlines(distinct, rig):
+        warnings = (*warnings, compose("outlines-loose"))
+    return ImageAssignment(capture, _left_out(silhouettes, duplicates), pictures, plates, warnings)
+
+
+def _masks_alone(capture: Capture, silhouettes: Mapping[str, Silhouette], assignment: Assignment) -> bool:
+    """Whether ready masks alone are exchanged, for the photographs agree with them once they are filed back."""
+    names = assignment.pictures.keys()
+    return (
+        bool(names)
+        and names <= capture.masks.keys()
+        and masks_alone_exchanged(capture.images, silhouettes, assignment.pictures)
+    )
+
+
+def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
+    """Returns, for cameras whose clean plate is another camera's, the name under which their own is filed.
+
+    Asked only where pictures hardly look like their plates; a permutation is believed where every plate in it explains
+    clearly more of the picture that it is given to.
+    """
+    named = [name for name in rig.names if name in capture.images and capture.backgrounds.get(name)]
+    pictures = {name: _thumbnail(capture.images[name]) for name in named}
+    plates = {name: _thumbnail(capture.backgrounds[name][0]) for name in named}
+    doubtful = [name for name in named if _common_share(pictures[name], plates[name]) < PLATE_SEEN]
+    share = np.array([[_common_share(pictures[name], plates[other]) for other in doubtful] for name in doubtful])
+    if len(doubtful) < 2:
+        return {}
+    from scipy.optimize import linear_sum_assignment  # loads all of scipy.optimize, and plates are rarely exchanged
+
+    best = linear_sum_assignment(-share)[1]
+    moved = np.flatnonzero(best != np.arange(len(doubtful)))
+    clear = share[moved, best[moved]] > PLATE_GAIN * share[moved, moved]
+    return {doubtful[i]: doubtful[best[i]] for i in moved.tolist()} if clear.all() else {}
+
+
+def _thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]:
+    """Log levels at PLATE_COLUMNS columns."""
+    rows = max(1, round(image.shape[0] * PLATE_COLUMNS / image.shape[1]))
+    small = cv2.resize(image, (PLATE_COLUMNS, rows), interpolation=cv2.INTER_AREA)
+    return np.log(small.astype(np.float32) + 1.0)
+
+
+def _common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarray, "_ _ 3"]) -> float:
+    """Share of a picture that is the plate under another exposure."""
+    if picture.shape != plate.shape:
+        return 0.0
+    ratio = (picture - plate).reshape(-1, 3)
+    edges = np.arange(-1.5, 1.5, PLATE_TOLERANCE / 2)
+    exposure = [edges[int(np.argmax(np.histogram(channel, edges)[0]))] for channel in ratio.T]
+    return float((np.abs(ratio - exposure) < PLATE_TOLERANCE).all(axis=1).mean())
+
+
+def duplicate_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
+    """Returns cameras that hold, pixel for pixel, the picture of another one, and that other: noise never repeats.
+
+    The picture is left to the camera whose silhouette contradicts the others least, if any.
+    """
+    groups: list[list[str]] = []
+    for name in (name for name in rig.names if name in capture.images):
+        image = capture.images[name]
+        same = next((group for group in groups if _same(capture.images[group[0]], image)), None)
+        if same is not None:
+            same.append(name)
+        elif image.min() < image.max():  # a black picture is a fault of its own
+            groups.append([name])
+    found: dict[str, str] = {}
+    for group in groups:
+        if len(group) > 1:
+            others = {name: silhouettes[name] for name in silhouettes if name not in group}
+            misfit = {name: own_misfit({**others, name: silhouettes[name]}, rig).get(name, 1.0) for name in group}
+            owner = min(group, key=lambda name: misfit[name])
+            found |= {name: owner for name in group if name != owner}
+            if misfit[owner] > FITTING_MISFIT:
+                found[owner] = next(name for name in group if name != owner)
+    return found
+
+
+def _same(one: UInt8[np.ndarray, "_ _ 3"], two: UInt8[np.ndarray, "_ _ 3"]) -> bool:
+    step = (slice(None, None, 61), slice(None, None, 7))
+    return one.shape == two.shape and np.array_equal(one[step], two[step]) and np.array_equal(one, two)
+
+
+def _left_out(silhouettes: Mapping[str, Silhouette], names: Mapping[str, str]) -> dict[str, Silhouette]:
+    return {
+        name: replace(s, quality=replace(s.quality, usable=False)) if name in names else s
+        for name, s in silhouettes.items()
+    }
+
+
+def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[str, str]:
+    """Where each camera's plates are filed, plates having been matched to pictures before pictures to cameras."""
+    found = {}
+    for name in plates.keys() | pictures.keys():
+        picture = pictures.get(name, name)
+        found[name] = plates.get(picture, picture)
+    return {name: filed for name, filed in sorted(found.items()) if filed != name}
+
+
+def _filed_back(capture: Capture, pictures: Mapping[str, str], rig: Rig) -> Capture:
+    """Pictures and plates under their cameras. Points may have been picked in the pictures as they were filed, or
+    before: whichever contradicts itself less."""
+    moved = reassign_images(capture, pictures=pictures, plates=pictures, points=pictures)
+    kept = replace(moved, features=capture.features)
+    return min((moved, kept), key=lambda filed: _contradiction(filed.features, rig))
+
+
+def _contradiction(features: Features, rig: Rig) -> float:
+    """Misfit of all points that two views or more show."""
+    total = 0.0
+    for views in features.values():
+        known = {name: pixel for name, pixel in views.items() if name in rig}
+        if len(known) > 1:
+            try:
+                misfit = triangulate(known, rig, noise_px=CLICK_PX).misfit(CLICK_PX)
+            except NoPoint:
+                misfit = MAX_CLICK_MISFIT
+            total += min(misfit, MAX_CLICK_MISFIT)
+    return total
+
+
+def _warnings(
+    pictures: Mapping[str, str], masks: Mapping[str, str], plates: Mapping[str, str], duplicates: Mapping[str, str]
+) -> tuple[ReportWarning, ...]:
+    found = []
+    if pictures:
+        found.append(compose("cameras-exchanged", exchange=ring_messages(pictures, compose("what-pictures"))))
+    if masks:
+        found.append(compose("masks-exchanged", exchange=ring_messages(masks, compose("what-masks"))))
+    if plates and not pictures:
+        found.append(compose("plates-exchanged", exchange=ring_messages(plates, compose("what-plates"))))
+    for name, owner in duplicates.items():
+        found.append(compose("picture-duplicated", camera=name, owner=owner))
+    return tuple(found)

@@ -1,0 +1,120 @@
+"""Do ready masks follow what the photographs show? Nothing else tells that all masks of a capture are too large by as
+much, for such outlines agree with each other, or that masks lie under each other's names beside pictures that do not.
+
+Across an outline, the photograph's edge is where its brightness changes most. Averaged along the outline the change has
+a peak, as high as 2 to 10 times the mean where the mask is of this picture, and at most 2 where it is another's; where
+the peak lies beside the outline, the mask is too large or too small by as much.
+
+Enters: photographs and silhouettes. Leaves: the place and height of the peak, and what to say of it.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.warnings import ReportWarning
+from rig.image import ImageRgb
+from rig.messages.message import compose
+
+REACH = 0.06  # of a mask's size (root of its area), to both sides of the outline: 15 mm of a head
+STEADY_PX = 3.0  # blur under which the outline's direction is measured
+BLUR_PX = 1.5  # of the photograph, against noise
+MIN_SAMPLES, MAX_SAMPLES = 50, 2000  # of an outline
+FLAT_LEVELS = 5.0  # change across the whole reach below which a sample says little
+CLEAR = 2.0  # height of a peak that is an edge's: 2.1 and more in 69 true masks, 1.1 in the mean of others'
+CLEARER = 1.5  # than what lies at the outline itself
+MIN_OFF = 0.006  # of a mask's size: 3 px of 480, 1.6 mm of a head; true masks have 1 px at most, in hair
+OWN_GAIN = 1.5  # how much higher the peaks must be where masks are given to other pictures
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """``offset_px``: where the photograph's edge lies, outside the outline positive; ``height`` of the peak there, and
+    ``height_at_outline``, by the mean; ``size_px``: root of the mask's area."""
+
+    offset_px: float
+    height: float
+    height_at_outline: float
+    size_px: float
+
+    @property
+    def is_off(self) -> bool:
+        """Tells whether the edge is clear and lies beside the outline."""
+        clear = self.height >= max(CLEAR, CLEARER * self.height_at_outline)
+        return clear and abs(self.offset_px) >= MIN_OFF * self.size_px
+
+
+def edge_beside(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
+    """Returns the photograph's edge along an outline; None where too little of the outline is in the picture."""
+    size = float(np.sqrt(np.count_nonzero(silhouette.mask)))
+    reach = max(4, round(REACH * size))
+    pixels, normals = _outline(silhouette, reach)
+    if len(pixels) < MIN_SAMPLES:
+        return None
+    offsets = np.arange(-reach - 1, reach + 2, dtype=np.float32)
+    across = pixels[:, None] + offsets[:, None] * normals[:, None]
+    smooth = cv2.GaussianBlur(image, (0, 0), BLUR_PX).astype(np.float32)
+    seen = cv2.remap(smooth, across[..., 0], across[..., 1], cv2.INTER_LINEAR)
+    change = np.linalg.norm(seen[:, 2:] - seen[:, :-2], axis=-1)
+    share = change / (change.sum(axis=1, keepdims=True) + FLAT_LEVELS)
+    profile = share.mean(axis=0) * share.shape[1]
+    peak = int(np.argmax(profile))
+    return Edge(float(peak - reach), float(profile[peak]), float(profile[reach - 1 : reach + 2].max()), size)
+
+
+def _outline(silhouette: Silhouette, reach: int) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 2"]]:
+    """Pixels (x, y) of an outline, as far from the picture's border as is looked, and outward directions there."""
+    distance = silhouette.distance
+    height, width = distance.shape
+    rows, columns = np.nonzero(np.abs(distance) < 0.6)
+    inner = (columns > reach) & (columns < width - reach - 1) & (rows > reach) & (rows < height - reach - 1)
+    rows, columns = (of[inner][:: max(1, int(inner.sum()) // MAX_SAMPLES)] for of in (rows, columns))
+    steady = cv2.GaussianBlur(distance, (0, 0), STEADY_PX)
+    slope = [cv2.Sobel(steady, cv2.CV_32F, *way)[rows, columns] for way in ((1, 0), (0, 1))]
+    normals = np.stack(slope, axis=-1)
+    normals = normals / (np.linalg.norm(normals, axis=-1, keepdims=True) + np.float32(1e-6))
+    return np.stack([columns, rows], axis=-1).astype(np.float32), normals
+
+
+def masks_off_edges(
+    images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
+) -> list[ReportWarning]:
+    """Warns of ready masks most of which lie as far outside, or inside, of what the photographs show.
+
+    Args:
+        images: by camera.
+        silhouettes: by camera.
+        ready: cameras whose mask was given.
+    """
+    judged = [name for name in ready if name in images and name in silhouettes and silhouettes[name].quality.usable]
+    edges = [edge for name in judged if (edge := edge_beside(images[name], silhouettes[name])) is not None]
+    off = [edge.offset_px for edge in edges if edge.is_off]
+    middle = float(np.median(off)) if off else 0.0
+    alike = [offset for offset in off if offset * middle > 0]
+    if 2 * len(alike) <= len(edges):
+        return []
+    where = compose("outlines-outside") if middle < 0 else compose("outlines-inside")
+    return [compose("masks-off-edges", count=len(alike), all=len(judged), offset_px=abs(middle), where=where)]
+
+
+def masks_alone_exchanged(
+    images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], pictures: Mapping[str, str]
+) -> bool:
+    """Tells whether ready masks lie under other cameras' names, and the photographs under their own.
+
+    Args:
+        images: as they are filed.
+        silhouettes: of the masks, as they are filed.
+        pictures: for each camera that holds another's mask, the name under which its own is filed.
+    """
+    filed = [edge_beside(images[name], silhouettes[name]) for name in pictures]
+    moved = [edge_beside(images[name], silhouettes[owner]) for name, owner in pictures.items()]
+    heights = [[edge.height for edge in edges if edge is not None] for edges in (filed, moved)]
+    if not heights[0] or not heights[1]:
+        return False
+    before, after = (float(np.median(of)) for of in heights)
+    return after >= CLEAR and after > OWN_GAIN * before

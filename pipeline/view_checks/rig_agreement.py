@@ -1,0 +1,158 @@
+"""Are these the cameras that took the pictures? Asked of the silhouettes and the calibration, before the fit.
+
+Where most cameras contradict the others, other readings are tried: all pictures reflected about their principal points,
+as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 where they are
+square; poses that were written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
+sphere about the world's origin does not show by itself; and intrinsics of other pictures (``lens_reading``). The
+reading under which tangent planes touch both outlines of each pair is named. Where there is none, the calibration is
+another rig's, or of this one before it was rearranged; unless a good part of all planes meet closely nevertheless: then
+the masks are loose, with a shadow on the wall or hair that some of them miss.
+Where one camera alone contradicts the others, it is named.
+
+Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothing.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.tangency import outer_hull
+from pipeline.view_checks.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
+from pipeline.view_checks.lens_reading import find_lens_reading
+from rig.camera import Intrinsics
+from rig.messages.message import Message, compose
+from rig.plausibility import alternative_conventions
+from rig.rig import Rig
+
+MIN_CAMERAS = 4  # three have six planes at most: too few to refuse a capture by
+MIN_PLANES = 4  # of a camera whose word counts
+MIN_WRONG = 0.35  # median over the cameras of their mean misfit: 0.07 in a good capture, 0.62 and more in other rigs
+MAX_RIGHT = 0.25  # of a reading that is believed
+MAX_LENSES = 0.2  # of one in which focal lengths and principal points were sought: 0.01 to 0.15 where they are wrong
+LOOSE_QUARTER = 22e-4  # of the picture's width, that the better quarter of all planes misses at most in a right rig
+# whose masks are loose: 20e-4 with long hair in 8 to 24 views; 24e-4 and more in rigs of another arrangement
+LOOSE_BIMODAL, MAX_LOOSE_QUARTER = 0.28, 35e-4  # of the median miss: shadows spoil some planes and leave others whole,
+# 0.03 to 0.25 with shadows in all of 11 views; a wrong rig's misses have one spread, 0.34 and more
+MIN_MISPLACED = 0.6  # of one camera among good ones: 0.95 with its rotation transposed; good ones reach 0.25
+MISPLACED_AMONG = 5  # cameras; of four, one that is wrong leaves three, who have six planes at most
+
+Pixels = Float[np.ndarray, "_ 2"]
+Turn = Callable[[Pixels, Intrinsics], Pixels]
+
+
+def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
+    """Returns what is wrong with cameras and pictures as wholes, with the remedy; None where most cameras agree.
+
+    Args:
+        silhouettes: by camera; views without a usable mask are left out of the question.
+        rig: the cameras as calibrated.
+    """
+    seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
+    if len(seen) < MIN_CAMERAS:
+        return None
+    hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
+    if not _median_misfit(hulls, seen) >= MIN_WRONG:
+        return None
+    square = all(camera.intrinsics.width == camera.intrinsics.height for camera in seen)
+    conventions = (*_CONVENTIONS, *(_SQUARE_CONVENTIONS if square else ()))
+    found = [(_median_misfit(_read(hulls, seen, turn), seen), message) for message, turn in conventions]
+    for other, read, remedy in alternative_conventions(seen):
+        message = compose("other-convention", convention=other, remedy=remedy)
+        found.append((_median_misfit(hulls, read), message))
+    believed = [(misfit, message) for misfit, message in found if misfit <= MAX_RIGHT]
+    if believed:
+        return min(believed, key=lambda one: one[0])[1]
+    lenses = find_lens_reading(hulls, seen, lambda read: _judged_misfit(hulls, read))
+    if lenses.is_other and _judged_misfit(hulls, lenses.rig) <= MAX_LENSES:
+        return lenses.message()
+    return None if _are_loose(hulls, seen) else compose("other-rig")
+
+
+def _judged_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
+    misfit = _median_misfit(hulls, rig)
+    return misfit if np.isfinite(misfit) else 1.0
+
+
+def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
+    """Tells whether most outlines contradict the others, though these cameras took the pictures (``wrong_rig`` is
+    None)."""
+    seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
+    if len(seen) < MIN_CAMERAS:
+        return False
+    return _median_misfit([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen) >= MIN_WRONG
+
+
+def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
+    """Returns the one camera that contradicts all others, who agree without it: it was moved farther than a shift of
+    its picture tells (``camera_drift``), its pose is wrong in the file, or its mask is. None where there is none."""
+    seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
+    if len(seen) < MISPLACED_AMONG:
+        return None
+    errors_px = tangency_errors_px([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen)
+    misfit, planes = mean_misfit(errors_px), np.isfinite(errors_px).sum(axis=(1, 2))
+    worst = int(np.argmax(misfit))
+    if misfit[worst] < MIN_MISPLACED or planes[worst] < MIN_PLANES:
+        return None
+    others = np.delete(np.arange(len(seen)), worst)
+    agree = mean_misfit(errors_px[np.ix_(others, others)]).max() <= FITTING_MISFIT
+    return seen.names[worst] if agree else None
+
+
+def _median_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
+    """Median over the cameras of the mean robust misfit of their planes (0 to 1); NaN where too few planes speak."""
+    errors_px = tangency_errors_px(hulls, rig)
+    speaking = np.isfinite(errors_px).sum(axis=(1, 2)) >= MIN_PLANES
+    return float(np.median(mean_misfit(errors_px)[speaking])) if speaking.sum() >= MIN_CAMERAS else np.nan
+
+
+def _are_loose(hulls: Sequence[Pixels], rig: Rig) -> bool:
+    """Whether so many planes meet closely as they do in the rig that took the pictures alone, whatever the masks."""
+    errors_px = tangency_errors_px(hulls, rig)
+    widths = np.array([camera.intrinsics.width for camera in rig], float)
+    shares = np.abs(errors_px) / (np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0))[..., None]
+    quarter, half = np.nanquantile(shares, (0.25, 0.5))
+    return bool(quarter <= LOOSE_QUARTER or quarter <= min(LOOSE_BIMODAL * half, MAX_LOOSE_QUARTER))
+
+
+def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:
+    return [turn(hull, camera.intrinsics) for hull, camera in zip(hulls, rig, strict=True)]
+
+
+def _flipped_across(pixels: Pixels, k: Intrinsics) -> Pixels:
+    return np.stack([k.width - 1.0 - pixels[:, 0], pixels[:, 1]], axis=1)
+
+
+def _mirrored_across(pixels: Pixels, k: Intrinsics) -> Pixels:
+    return np.stack([2.0 * k.cx - pixels[:, 0], pixels[:, 1]], axis=1)
+
+
+def _mirrored_down(pixels: Pixels, k: Intrinsics) -> Pixels:
+    return np.stack([pixels[:, 0], 2.0 * k.cy - pixels[:, 1]], axis=1)
+
+
+def _turned_round(pixels: Pixels, k: Intrinsics) -> Pixels:
+    return (k.width - 1.0, k.height - 1.0) - pixels
+
+
+def _turned_back(pixels: Pixels, k: Intrinsics) -> Pixels:
+    """By 90 degrees clockwise."""
+    return np.stack([k.height - 1.0 - pixels[:, 1], pixels[:, 0]], axis=1)
+
+
+def _turned_on(pixels: Pixels, k: Intrinsics) -> Pixels:
+    """By 90 degrees anticlockwise."""
+    return np.stack([pixels[:, 1], k.width - 1.0 - pixels[:, 0]], axis=1)
+
+
+_CONVENTIONS: tuple[tuple[Message, Turn], ...] = (
+    (compose("rig-mirrored"), _mirrored_across),
+    (compose("rig-mirrored"), _mirrored_down),
+    (compose("pictures-flipped"), _flipped_across),
+    (compose("pictures-turned", turn=compose("turn-180")), _turned_round),
+)
+_SQUARE_CONVENTIONS: tuple[tuple[Message, Turn], ...] = (
+    (compose("pictures-turned", turn=compose("turn-90-anticlockwise")), _turned_back),
+    (compose("pictures-turned", turn=compose("turn-90-clockwise")), _turned_on),
+)

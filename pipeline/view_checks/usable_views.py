@@ -1,0 +1,117 @@
+"""Which views of a capture take part, and what is said of the others: all that can be known before a fit.
+
+Enters: a capture, its rig, and a way to segment it. Leaves: every picture under its own camera, silhouettes of which
+those that may not be believed are marked, and the warnings that say why. ``reconstruct`` begins with it; ``eigenhead
+check`` asks nothing else.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.view_checks.camera_drift import find_drift
+from pipeline.view_checks.head_size import judge_head_size
+from pipeline.view_checks.image_assignment import assign_images
+from pipeline.view_checks.mask_edges import masks_off_edges
+from pipeline.view_checks.rig_agreement import misplaced_camera
+from pipeline.warnings import ReportWarning
+from rig.capture import Capture
+from rig.errors import EigenheadError
+from rig.messages.message import compose
+from rig.rig import Rig
+
+MIN_VIEWS = 3
+
+
+class TooFewViews(EigenheadError):
+    """Reports that there are not enough usable silhouettes."""
+
+    def __init__(self, silhouettes: Mapping[str, Silhouette], capture: Capture) -> None:
+        poor = {name: s.quality.warnings for name, s in silhouettes.items() if not s.quality.usable}
+        reasons = [
+            compose("view-reasons", camera=name, reasons=why) if why else compose("view-unusable", camera=name)
+            for name, why in poor.items()
+        ]
+        if capture.masks:
+            remedy = compose("advice-correct-masks")
+        elif capture.backgrounds:
+            remedy = compose("advice-new-plates")
+        else:
+            remedy = compose("advice-supply-plates")
+        usable, every = len(silhouettes) - len(poor), len(silhouettes)
+        super().__init__(
+            compose("too-few-views", usable=usable, all=every, needed=MIN_VIEWS, reasons=reasons, remedy=remedy)
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UsableViews:
+    """Holds a capture with every picture under its own camera and its silhouettes; those that take no part are not
+    usable. ``pictures``: for each camera that was given another's picture, the name under which its own is filed."""
+
+    capture: Capture
+    silhouettes: Mapping[str, Silhouette]
+    pictures: Mapping[str, str]
+    warnings: tuple[ReportWarning, ...]
+
+
+def usable_views(
+    capture: Capture,
+    rig: Rig,
+    segmented: Callable[[Capture], dict[str, Silhouette]],
+    *,
+    exchanged: Literal["repair", "refuse"],
+) -> UsableViews:
+    """Segments a capture, files exchanged pictures back, and leaves out what contradicts the other views.
+
+    Args:
+        capture: as it was read.
+        rig: the cameras as calibrated.
+        segmented: the silhouettes of a capture.
+        exchanged: what to do about an exchange of pictures that is beyond doubt.
+
+    Raises:
+        ExchangedPictures, WrongRig: of ``assign_images``.
+        WrongScale: of ``judge_head_size``.
+        TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are of use.
+    """
+    assigned = assign_images(capture, rig, segmented, exchanged=exchanged)
+    if sum(silhouette.quality.usable for silhouette in assigned.silhouettes.values()) < MIN_VIEWS:
+        raise TooFewViews(assigned.silhouettes, capture)
+    silhouettes, moved = without_moved_cameras(assigned.silhouettes, rig)
+    size = judge_head_size(silhouettes, rig)
+    given_masks = [name for name in rig.names if name in assigned.capture.masks]
+    beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
+    warnings = (*assigned.warnings, *view_warnings(silhouettes), *moved, *size, *beside, *capture.remarks)
+    return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
+
+
+def without_moved_cameras(
+    silhouettes: Mapping[str, Silhouette], rig: Rig
+) -> tuple[dict[str, Silhouette], list[ReportWarning]]:
+    """Leaves out the views of cameras that no longer stand where they were calibrated; each is named, and so are those
+    whose mask may be loose instead."""
+    kept, warnings = dict(silhouettes), []
+    for drift in find_drift(silhouettes, rig):
+        if drift.moved:
+            quality = replace(silhouettes[drift.camera].quality, usable=False)
+            kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
+        warnings.append(drift.warning())
+    misplaced = misplaced_camera(kept, rig)
+    if misplaced is not None:
+        kept[misplaced] = replace(kept[misplaced], quality=replace(kept[misplaced].quality, usable=False))
+        warnings.append(compose("camera-moved", finding=compose("camera-misplaced", camera=misplaced)))
+    return kept, warnings
+
+
+def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
+    """Returns what the views' qualities say, as warnings of the report."""
+    found = []
+    for name, silhouette in silhouettes.items():
+        for remark in silhouette.quality.warnings:
+            located = compose("located", where=name, fault=remark)
+            usable = silhouette.quality.usable
+            found.append(compose("view", remark=located) if usable else compose("view-left-out", remark=located))
+        found += [compose("mask-doubtful", camera=name, remark=remark) for remark in silhouette.quality.doubts]
+    return found

@@ -1,0 +1,112 @@
+"""Spoilt triangles are found as a plain test of every pair finds them, and heads come out clean of them: planted folds,
+sheets pushed through each other, random heads that make random faces under hostile displacements."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
+
+from pipeline.detail.nodes import solving_nodes
+from pipeline.detail.smooth_field import smooth_field
+from pipeline.detail.untangling import (
+    head_topology,
+    spoilt_faces,
+    topology_of,
+    turned_faces,
+    untangled,
+    untangled_head,
+)
+from pipeline.fusion.crossings import crossing_faces
+from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model_basis import model_basis
+from pipeline.settings import Settings
+from rig.mesh import face_normals, vertex_normals
+from tests.support.subdivided_spheres import subdivided_sphere
+
+SEEDS_A_TEST = 10  # a slow test has five minutes, also beside others
+EXPRESSIONS = 5  # at once, each up to its full weight
+HOSTILE_MM, LENGTH_MM = 1.5, 5.0  # standard deviation of a displacement along the normals, twice what the fine stage
+# takes for likely, and over which it fades, the fine stage's own
+
+
+def test_turned_and_folded_triangles_are_those_that_a_plain_test_finds() -> None:
+    vertices, faces, _ = subdivided_sphere()
+    shaken = vertices + np.random.default_rng(0).normal(0.0, 0.8, vertices.shape)
+    normals, mean = face_normals(shaken, faces), vertex_normals(shaken, faces)
+    expected = (normals * mean[faces].mean(axis=1)).sum(axis=1) <= 0.0
+    unit = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    at_edge: dict[tuple[int, int], int] = {}
+    for f, (a, b, c) in enumerate(faces.tolist()):
+        for edge in ((a, b), (b, c), (c, a)):
+            key = (min(edge), max(edge))
+            other = at_edge.setdefault(key, f)
+            if other != f and unit[f] @ unit[other] < np.cos(np.radians(100.0)):
+                expected[[f, other]] = True
+    assert 20 < expected.sum() < len(faces) / 2
+    topology = topology_of(faces, len(vertices))
+    np.testing.assert_array_equal(turned_faces(shaken, topology), expected)
+    chosen = np.zeros(len(faces), bool)
+    chosen[1000:1400] = True
+    found = turned_faces(shaken, topology, chosen)
+    np.testing.assert_array_equal(found[chosen], expected[chosen])
+    assert not found[~expected].any()
+
+
+def test_a_clean_surface_is_left_as_it_is() -> None:
+    vertices, faces, _ = subdivided_sphere()
+    moved = vertices * (1.0 + 0.02 * np.sin(vertices[:, :1] / 20.0))
+    np.testing.assert_array_equal(untangled(moved, topology_of(faces, len(moved))), moved)
+
+
+def test_a_dent_that_comes_out_behind_is_taken_back_and_the_rest_stays() -> None:
+    vertices, faces, _ = subdivided_sphere()
+    away = np.linalg.norm(vertices[:, :2], axis=1)
+    pushed = vertices.copy()
+    top = (away < 12.0) & (vertices[:, 2] > 0)
+    pushed[top] += (3.1, 1.7, -170.0)  # through the opposite side, 10 mm beyond it
+    topology = topology_of(faces, len(pushed))
+    assert crossing_faces(pushed, faces).sum() > 50
+    clean = untangled(pushed, topology)
+    assert not spoilt_faces(clean, topology).any()
+    far = np.abs(vertices[:, 2]) < 40.0
+    np.testing.assert_array_equal(clean[far], pushed[far])
+
+
+@pytest.fixture(scope="module")
+def wide_model() -> HeadModel:
+    return model_basis(load_model(), Settings())  # eigenheads, kernel and expressions
+
+
+def check_clean(model: HeadModel, seed: int) -> None:
+    """A random head with a random face, as a fit has it; then under a displacement that knows no surface."""
+    rng = np.random.default_rng(seed)
+    coefficients = np.clip(rng.standard_normal(len(model.modes)), -2.5, 2.5)
+    coefficients[model.posed] = 0.0
+    coefficients[rng.choice(model.posed, EXPRESSIONS, replace=False)] = rng.uniform(0.0, 1.0, EXPRESSIONS)
+    fitted, faces = model.vertices(coefficients), model.levels["full"].faces
+    fine = solving_nodes(model).fine
+    field = smooth_field(fine.shape @ fitted, fine.faces, LENGTH_MM)
+    white = np.sqrt(field.mass / field.precision_scale) * rng.standard_normal(len(field.mass))
+    unit = splu(sparse.csc_array(field.operator), permc_spec="MMD_AT_PLUS_A").solve(white)
+    hostile = fitted + HOSTILE_MM * (fine.operator @ unit)[:, None] * vertex_normals(fitted, faces)
+    for vertices in (fitted, hostile):
+        mesh, deviation_mm = untangled_head(model, vertices, np.full(len(vertices), 0.3))
+        stored = mesh.vertices.astype(np.float32).astype(float)
+        assert not spoilt_faces(stored, head_topology(model)).any(), seed
+        moved_mm = np.linalg.norm(mesh.vertices - vertices, axis=1)
+        np.testing.assert_allclose(deviation_mm, np.sqrt(0.3**2 + moved_mm**2))
+        assert (moved_mm == 0.0).mean() > 0.5, seed  # spots, not the head
+
+
+def test_the_mean_head_and_a_few_random_ones_come_out_clean(wide_model: HeadModel) -> None:
+    mean = wide_model.vertices(np.zeros(0))
+    assert spoilt_faces(mean, head_topology(wide_model)).any()  # its lips touch
+    assert not spoilt_faces(untangled(mean, head_topology(wide_model)), head_topology(wide_model)).any()
+    check_clean(wide_model, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(1, 201, SEEDS_A_TEST))
+def test_two_hundred_random_heads_and_expressions_come_out_clean(wide_model: HeadModel, first: int) -> None:
+    for seed in range(first, first + SEEDS_A_TEST):
+        check_clean(wide_model, seed)

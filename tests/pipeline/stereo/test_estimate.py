@@ -1,0 +1,90 @@
+"""The dense stage's depth: planted balls are found to what the noise allows, hidden and blank ones are not made up."""
+
+import os
+
+import numpy as np
+import pytest
+
+from pipeline.settings import DenseSettings
+from pipeline.stereo.depth_map import DepthMap, points_world
+from pipeline.stereo.estimate import estimate_depth
+from rig.camera import Distortion
+from rig.rig import Rig
+from tests.pipeline.stereo.ray_scene import Ball, fan, first_hit, shoot
+
+pytestmark = pytest.mark.slow
+
+
+def quiet(stage: str, fraction: float) -> None:
+    assert stage == "dense"
+    assert 0.0 <= fraction <= 1.0
+
+
+def estimate(rig: Rig, balls: tuple[Ball, ...]) -> tuple[DepthMap, ...]:
+    images, silhouettes = shoot(rig, balls)
+    return estimate_depth(images, silhouettes, rig, None, DenseSettings(), report=quiet)
+
+
+def depth_errors(depth_map: DepthMap, balls: tuple[Ball, ...]) -> np.ndarray:
+    """Error along the ray of every known pixel, mm; not finite where the ray misses."""
+    row, column = np.nonzero(depth_map.known)
+    true, _ = first_hit(depth_map.camera, np.stack([column, row], axis=1).astype(float), balls)
+    return np.linalg.norm(points_world(depth_map) - depth_map.camera.centre_world, axis=1) - true
+
+
+def test_ball_is_found_to_the_noise_of_its_texture() -> None:
+    # A pixel is 1 mm; matches are good to 0.1 px, neighbours 25 degrees apart: 0.1 / tan 25 = 0.21 mm a pair. The outer
+    # views share half of what they see with others, at 50 degrees and more the ball is too flat to compare.
+    rig, balls = fan(5, 25.0, Distortion(k1=-0.05, p1=0.001)), (Ball(),)
+    maps = estimate(rig, balls)
+    assert [each.camera.name for each in maps] == list(rig.names)
+    for each in maps:
+        error = depth_errors(each, balls)
+        assert np.isfinite(error).all()
+        assert np.median(np.abs(error)) < 0.21
+        assert np.mean(np.abs(error) < 2.0) > 0.97
+        assert each.known.sum() > 0.45 * (each.mask > 0.5).sum()
+        outward = points_world(each) / balls[0].radius
+        assert np.median((outward * each.normal[each.known]).sum(axis=1)) > np.cos(np.radians(5.0))
+
+
+def test_nothing_is_told_where_nothing_is_known() -> None:
+    for each in estimate(fan(3, 20.0), (Ball(),)):
+        unknown = ~each.known
+        assert (each.depth_mm[unknown] == 0.0).all()
+        assert (each.normal[unknown] == 0.0).all()
+        assert (each.views[unknown] == 0).all()
+        assert (each.views[each.known] >= 2).all()
+        assert np.isfinite(each.deviation_mm[each.known]).all()
+
+
+def test_ball_before_another_hides_it() -> None:
+    # What the small ball hides from a view must not be taken for its surface, nor the small one for the large one's.
+    balls = (Ball(), Ball(centre=(15.0, 5.0, 95.0), radius=22.0))
+    for each in estimate(fan(5, 18.0), balls):
+        error = depth_errors(each, balls)
+        assert np.mean(np.abs(error) < 2.0) > 0.95
+
+
+def test_blank_ball_is_met_with_silence() -> None:
+    for each in estimate(fan(4, 20.0), (Ball(contrast=0.0),)):
+        assert each.known.sum() < 0.03 * (each.mask > 0.5).sum()
+
+
+def test_result_does_not_depend_on_the_number_of_threads() -> None:
+    rig, balls = fan(3, 20.0), (Ball(),)
+    many = estimate(rig, balls)
+    cores = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {min(cores)})
+        one = estimate(rig, balls)
+    finally:
+        os.sched_setaffinity(0, cores)
+    for a, b in zip(many, one, strict=True):
+        assert a.depth_mm.tobytes() == b.depth_mm.tobytes()
+        assert a.deviation_mm.tobytes() == b.deviation_mm.tobytes()
+
+
+def test_views_without_a_neighbour_know_nothing() -> None:
+    rig, balls = fan(3, 80.0), (Ball(),)  # 80 degrees apart
+    assert not any(each.known.any() for each in estimate(rig, balls))

@@ -1,0 +1,82 @@
+"""The layout against the theorem that it rests on, and as every later process finds it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.head_model.model import load_model
+from pipeline.texturing.layout import model_layout as kept
+from pipeline.texturing.layout.model_layout import model_layout
+from pipeline.texturing.layout.uv_unwrap import Layout, NoLayout, unwrap
+from rig.mesh import Mesh
+from tests.support.scenes import ellipsoid
+
+
+def areas(layout: Layout) -> np.ndarray:
+    a, b, c = (layout.uv[layout.faces[:, k]] for k in range(3))
+    return 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+
+
+@pytest.fixture(scope="module")
+def head() -> tuple[Mesh, np.ndarray, Layout]:
+    model = load_model()
+    full = model.levels["full"]
+    mesh = Mesh(model.vertices(np.zeros(0)), full.faces)
+    return mesh, full.face_region, model_layout(model).layout
+
+
+def test_no_two_triangles_of_the_layout_lie_over_each_other(head: tuple[Mesh, np.ndarray, Layout]) -> None:
+    mesh, _, layout = head
+    np.testing.assert_array_equal(layout.source[layout.faces], mesh.faces)
+    found = areas(layout)
+    assert (found < 0).all()  # v points downwards: the surface is seen from outside, and no triangle is flipped
+    # Triangles of one orientation whose areas add up to that of their common outline cannot overlap.
+    edges = np.concatenate([layout.faces[:, [0, 1]], layout.faces[:, [1, 2]], layout.faces[:, [2, 0]]])
+    known = {(a, b) for a, b in edges.tolist()}
+    border = np.array([(a, b) for a, b in known if (b, a) not in known])
+    (x0, y0), (x1, y1) = layout.uv[border[:, 0]].T, layout.uv[border[:, 1]].T
+    assert found.sum() == pytest.approx(0.5 * (x0 * y1 - x1 * y0).sum(), rel=1e-9)
+    assert layout.uv.min() > 0
+    assert layout.uv.max() < 1
+
+
+def test_the_face_is_upright_in_the_middle_and_evenly_resolved(head: tuple[Mesh, np.ndarray, Layout]) -> None:
+    mesh, face, layout = head
+    landmarks = load_model().landmarks
+    at = {name: layout.uv[row] for name, row in landmarks.items()}  # none of them is on the cut
+    assert at["nasion"][1] < at["pronasale"][1] < at["gnathion"][1]
+    assert at["exocanthion_right"][0] < at["pronasale"][0] < at["exocanthion_left"][0]
+    assert abs(at["pronasale"][0] - 0.5) < 0.05
+    corners = mesh.vertices[mesh.faces]
+    surface = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    mm_per_texel = np.sqrt(surface / np.abs(areas(layout))) / 1024
+    inside = face[mesh.faces].all(axis=1)
+    assert mm_per_texel[inside].max() < 0.5  # a pixel of the default rig is 0.55 mm on the head
+    assert np.ptp(np.quantile(mm_per_texel, (0.01, 0.99))) < 0.5 * np.median(mm_per_texel)
+
+
+def test_a_surface_without_one_open_border_has_no_layout() -> None:
+    closed = ellipsoid(3)
+    with pytest.raises(NoLayout):
+        unwrap(closed.vertices, closed.faces)
+
+
+def test_the_layout_is_made_once_for_a_model(
+    head: tuple[Mesh, np.ndarray, Layout], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made = model_layout(load_model())
+
+    def never(*_: object) -> Layout:
+        raise AssertionError("it was made again")
+
+    monkeypatch.setattr(kept, "unwrap", never)
+    never.__module__ = unwrap.__module__  # the file's name says which module made it
+    again = model_layout(load_model())
+    np.testing.assert_array_equal(again.layout.uv, made.layout.uv)
+    around = again.around
+    np.testing.assert_array_equal(around.rows[around.opposite], around.indices)
+    np.testing.assert_array_equal(around.indices[around.opposite], around.rows)
+    monkeypatch.setenv("EIGENHEAD_CACHE", str(tmp_path))
+    with pytest.raises(AssertionError, match="made again"):
+        model_layout(load_model())

@@ -1,0 +1,234 @@
+"""Colours against a pattern that is a formula, photographed by a ray tracer that shares no code with the pipeline."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import scipy.sparse
+import scipy.sparse.linalg
+
+from pipeline.geometry.raster import depth_map, depth_maps
+from pipeline.imaging.colour_balance import balance
+from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
+from pipeline.settings import TextureSettings
+from pipeline.texturing.inpaint import fill_unknown
+from pipeline.texturing.vertex_colours import Texture, texture
+from pipeline.texturing.visibility import sharpened
+from rig.capture import Capture
+from rig.colour_space import srgb_from_linear
+from rig.mesh import Mesh
+from rig.render.renderer import Renderer
+from tests.support.photographs import SCREEN, Shot, shoot, trace
+from tests.support.scenes import ellipsoid, fan
+
+EXPOSURES = np.array([0.8, 1.2, 0.9, 1.1, 1.2, 0.8, 1.0])[:, None] * np.array([1.0, 0.98, 1.03])
+
+
+def colour(shot: Shot, **settings) -> Texture:
+    chosen = TextureSettings(**settings)
+    return texture(
+        shot.mesh,
+        shot.mesh.normals(),
+        shot.capture,
+        shot.silhouettes,
+        shot.rig,
+        depth_maps(shot.rig, shot.mesh),
+        settings=chosen,
+    )
+
+
+def psnr(found: Texture, shot: Shot, where: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / ((found.colours[where] - shot.truth[where]) ** 2).mean()))
+
+
+@pytest.fixture(scope="module")
+def even() -> Shot:
+    return shoot()
+
+
+@pytest.fixture(scope="module")
+def uneven() -> Shot:
+    return shoot(EXPOSURES)
+
+
+@pytest.fixture(scope="module")
+def even_colours(even: Shot) -> Texture:
+    return colour(even)
+
+
+@pytest.fixture(scope="module")
+def uneven_colours(uneven: Shot) -> Texture:
+    return colour(uneven)
+
+
+def test_the_default_is_better_than_the_papers_mean_where_exposures_differ(
+    uneven: Shot, uneven_colours: Texture
+) -> None:
+    found, reference = uneven_colours, colour(uneven, blend="reference")
+    visible = (found.views > 0) & (reference.views > 0)
+    assert visible.mean() > 0.6
+    assert psnr(found, uneven, visible) > psnr(reference, uneven, visible) + 3.0
+
+
+def test_it_is_never_worse_where_they_do_not(even: Shot, even_colours: Texture) -> None:
+    found, reference = even_colours, colour(even, blend="reference")
+    visible = (found.views > 0) & (reference.views > 0)
+    assert psnr(found, even, visible) > psnr(reference, even, visible)
+    # 1.5 % noise is 3.8 codes; some three views and four pixels each leave 3.8 / sqrt(3) / 1.5 = 1.5 codes: 44 dB.
+    assert psnr(found, even, visible) > 38
+
+
+def test_gains_are_found(uneven_colours: Texture) -> None:
+    found = np.array(list(uneven_colours.gains.values()))
+    wanted = 1 / EXPOSURES
+    wanted /= np.exp(np.log(wanted).mean(axis=0))
+    np.testing.assert_allclose(found, wanted, rtol=0.015)
+
+
+def test_no_background_reaches_the_mesh(even: Shot, even_colours: Texture) -> None:
+    found = even_colours
+    screen = 255 * srgb_from_linear(np.array(SCREEN))
+    # On the way from the truth to the screen's green: how far, as a share?
+    way = screen - even.truth
+    share = ((found.colours - even.truth) * way).sum(axis=1) / (way * way).sum(axis=1)
+    assert share[found.views > 0].max() < 0.1
+
+
+def test_hidden_surfaces_take_no_colour_from_what_hides_them() -> None:
+    # A red plate stands between the camera in the middle and the ellipsoid: what is behind it must stay blue.
+    rig = fan(640, 480, (0,))
+    camera, body = rig.cameras[0], ellipsoid(4)
+    towards = camera.centre_world / np.linalg.norm(camera.centre_world)
+    right = np.cross([0.0, 1.0, 0.0], towards)
+    up = np.cross(towards, right)
+    steps = np.linspace(-25, 25, 26)
+    plate = np.stack([170 * towards + x * right + y * up for y in steps for x in steps])
+    corner = (np.arange(25)[:, None] * 26 + np.arange(25)).ravel()
+    square = np.concatenate(
+        [np.stack([corner, corner + 1, corner + 27], 1), np.stack([corner, corner + 27, corner + 26], 1)]
+    )
+    count = len(body.vertices)
+    mesh = Mesh(np.concatenate([body.vertices, plate]), np.concatenate([body.faces, square + count]).astype(np.int32))
+    depth, seen = depth_map(camera, mesh.vertices, mesh.faces)
+    linear = np.where((seen >= len(body.faces))[:, :, None], (0.8, 0.05, 0.05), (0.05, 0.1, 0.6))
+    image = np.rint(255 * srgb_from_linear(np.where(np.isfinite(depth)[:, :, None], linear, 0.3))).astype(np.uint8)
+    silhouette = silhouette_from_mask(np.isfinite(depth))
+    capture = Capture({"cam00": image})
+    found = texture(
+        mesh, mesh.normals(), capture, {"cam00": silhouette}, rig, {"cam00": depth}, settings=TextureSettings()
+    )
+    lit = found.views[:count] > 0
+    assert lit.sum() > 500
+    assert (found.colours[:count][lit][:, 0] < 80).all()
+    pixels = camera.project(mesh.vertices)
+    behind = depth[np.rint(pixels[:count, 1]).astype(int), np.rint(pixels[:count, 0]).astype(int)] < 1080
+    assert (found.views[:count][behind] == 0).all()
+
+
+def test_highlights_count_less_than_what_the_other_views_say() -> None:
+    shot = shoot(gloss=0.5)
+    robust, plain = colour(shot), colour(shot, outlier=1e6)
+    visible = robust.views >= 3
+    assert psnr(robust, shot, visible) > psnr(plain, shot, visible) + 0.5
+
+
+def test_vertices_that_no_camera_sees_are_marked_and_filled_between_their_neighbours(even_colours: Texture) -> None:
+    found = even_colours
+    hidden = found.views == 0
+    assert found.filled == hidden.sum() > 100
+    # Harmonic: no filled value lies outside the range of the known ones.
+    for channel in range(3):
+        known = found.colours[~hidden, channel]
+        assert known.min() <= found.colours[hidden, channel].min()
+        assert found.colours[hidden, channel].max() <= known.max()
+
+
+def test_a_view_that_is_not_usable_gives_no_colour(even: Shot) -> None:
+    bad = {name: replace(s, quality=ViewQuality(usable=name != "cam03")) for name, s in even.silhouettes.items()}
+    images = {**even.capture.images, "cam03": np.zeros_like(even.capture.images["cam03"])}
+    found = colour(replace(even, silhouettes=bad, capture=replace(even.capture, images=images)))
+    assert "cam03" not in found.gains
+    assert psnr(found, even, found.views > 0) > 36
+
+
+def test_a_head_that_nobody_sees_is_grey_and_says_so(even: Shot) -> None:
+    bad = {name: replace(s, quality=ViewQuality(usable=False)) for name, s in even.silhouettes.items()}
+    found = colour(replace(even, silhouettes=bad))
+    assert (found.views == 0).all()
+    assert found.filled == len(found.views)
+    assert found.warnings[0].code == "no-texture"
+    assert (np.ptp(found.colours, axis=0) == 0).all()
+
+
+def test_a_strongly_different_exposure_is_named() -> None:
+    gains = np.ones((7, 3))
+    gains[2] = 0.4
+    warnings = colour(shoot(gains)).warnings
+    assert [w.code for w in warnings] == ["camera-gain"]
+    assert "cam02" in warnings[0].text
+
+
+def test_sharpening_takes_back_blur_where_there_is_detail_and_lifts_no_noise() -> None:
+    rng = np.random.default_rng(5)
+    truth = np.full((240, 320, 3), 120.0)
+    truth[:, :160][:, ::16] = truth[:, 1:160][:, ::16] = 40.0  # two dark pixels in sixteen, like lashes
+    blurred = cv2.GaussianBlur(truth, (0, 0), 0.7) + rng.normal(0, 3, truth.shape)
+    image = np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
+    found = sharpened(image, np.ones((240, 320), bool), TextureSettings()).astype(float)
+    lines, flat = np.s_[10:-10, 10:150], np.s_[10:-10, 180:-10]
+    before, after = (np.abs(picture[lines] - truth[lines]).mean() for picture in (image, found))
+    assert after < 0.8 * before
+    # Twice the median of the noise's own power is held back, so that only its largest bursts are lifted.
+    assert found[flat].std() < 1.1 * image[flat].std()
+
+
+def test_balance_finds_planted_gains_and_offsets() -> None:
+    rng = np.random.default_rng(2)
+    truth = rng.uniform(0.05, 0.6, (4000, 3))
+    gains = np.exp(rng.normal(0, 0.2, (6, 3)))
+    offsets = rng.normal(0, 0.003, (6, 3))
+    seen = (truth - offsets[:, None]) / gains[:, None] + rng.normal(0, 0.002, (6, 4000, 3))
+    weights = (rng.random((6, 4000)) < 0.5).astype(np.float32)
+    found, shift = balance(weights, seen.astype(np.float32))
+    level = np.exp(np.log(gains).mean(axis=0))
+    # The prior holds half of an offset back: 0.0015 of 0.3 is half a percent, 1.5 % at three standard deviations.
+    np.testing.assert_allclose(found, gains / level, rtol=0.02)
+    assert np.abs(found[:, None] * seen + shift[:, None] - truth / level).max() < 0.03
+
+
+def test_the_fill_solves_laplaces_equation_on_the_mesh() -> None:
+    mesh = ellipsoid(3)
+    rng = np.random.default_rng(0)
+    known = mesh.vertices[:, 2] > 20
+    values = rng.uniform(0, 1, (len(known), 2))
+    found = fill_unknown(values, known, mesh.faces)
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    graph = scipy.sparse.coo_array((np.ones(len(edges)), edges.T), shape=(len(known),) * 2)
+    graph = (graph + graph.T).tocsr()
+    laplacian = (scipy.sparse.diags_array(graph.sum(axis=1)) - graph).tocsr()
+    unknown = np.flatnonzero(~known)
+    right = -(laplacian[unknown][:, np.flatnonzero(known)] @ values[known])
+    solved = scipy.sparse.linalg.spsolve(laplacian[unknown][:, unknown].tocsc(), right)
+    np.testing.assert_array_equal(found[known], values[known])
+    assert np.abs(found[unknown] - solved).max() < 0.02
+
+
+@pytest.mark.gl
+def test_the_compiled_depth_maps_are_the_renderers(renderer: Renderer) -> None:
+    rig, mesh = fan(), ellipsoid()
+    drawn = renderer.depth(rig, mesh.vertices, mesh.faces)
+    for camera in rig:
+        ours = depth_map(camera, mesh.vertices, mesh.faces)[0]
+        both = np.isfinite(ours) & np.isfinite(drawn[camera.name])
+        assert np.count_nonzero(np.isfinite(ours) ^ np.isfinite(drawn[camera.name])) < 0.01 * both.sum()
+        difference = np.abs(ours[both] - drawn[camera.name][both])
+        assert np.percentile(difference, 99) < 0.2  # a pixel at the rim may show the next triangle
+        assert np.median(difference) < 0.01
+
+
+def test_the_tracer_and_the_mesh_agree() -> None:
+    camera = fan(640, 480).cameras[2]
+    mesh = ellipsoid()
+    _, mask = trace(camera, 0.0)
+    assert np.count_nonzero(mask ^ np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])) < 0.01 * mask.sum()

@@ -1,0 +1,139 @@
+"""Rigs that did not take the pictures, planted: each is named with its remedy, and the rig that did is left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.head_model.model import load_model
+from pipeline.imaging.silhouette import silhouette_from_mask
+from pipeline.research.subjects import off_by
+from pipeline.view_checks.rig_agreement import misplaced_camera, wrong_rig
+from rig.geometry import RigidTransform, rotation_from_vector
+from rig.plausibility import rig_faults
+from rig.rig import Rig
+from rig.studio.scene.layout import ARRANGEMENTS_DEG, HEIGHT, WIDTH, arrangement, default_layout
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture(scope="module")
+def seen(renderer):
+    """A rig that is off by what a calibration leaves, and a bare head's true masks and silhouettes."""
+    rig, model = default_layout().scaled(0.5), load_model()
+    vertices = model.vertices(0.8 * np.random.default_rng(2).standard_normal(60))
+    with renderer.silhouette_set(rig, model.levels["full"].faces) as drawn:
+        masks = drawn.masks(vertices + (10.0, -15.0, 5.0))
+    return off_by(rig, 0.06, np.random.default_rng(0)), masks, silhouettes(masks)
+
+
+def silhouettes(masks):
+    return {name: silhouette_from_mask(np.ascontiguousarray(mask)) for name, mask in masks.items()}
+
+
+def reflected(rig, axis):
+    """The rig in a left-handed world, its rotations made proper by the same axis of the cameras."""
+    mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
+
+    def pose(of):
+        return RigidTransform(mirror @ of.rotation @ mirror, mirror @ of.translation)
+
+    return Rig(tuple(replace(camera, camera_from_world=pose(camera.camera_from_world)) for camera in rig))
+
+
+def test_the_rig_that_took_the_pictures_is_left_alone(seen):
+    rig, _, of_all = seen
+    rng = np.random.default_rng(5)
+    assert wrong_rig(of_all, rig) is None
+    for count in range(3, 11):
+        assert wrong_rig(of_all, rig.subset(rng.choice(rig.names, count, replace=False))) is None
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_mirrored_rig_is_named(seen, axis):
+    rig, _, of_all = seen
+    found = wrong_rig(of_all, reflected(rig, axis))
+    assert found is not None
+    assert found.text.startswith("the rig is mirrored")
+    assert "write it right-handed" in found.text
+
+
+def test_rotations_that_are_transposed_are_named_where_the_cameras_look_at_the_origin(seen):
+    """Such a rig looks at one point in either reading: only the outlines can tell."""
+    _, _, of_all = seen
+    rig = default_layout().scaled(0.5)
+
+    def pose(of):
+        return RigidTransform(of.rotation.T, of.translation)
+
+    written = Rig(tuple(replace(camera, camera_from_world=pose(camera.camera_from_world)) for camera in rig))
+    assert rig_faults(written) == []
+    found = wrong_rig(of_all, written)
+    assert found is not None
+    assert "camera_from_world holds the rotation transposed" in found.text
+    assert "transpose each rotation" in found.text
+
+
+def test_one_camera_far_from_its_place_is_named_and_no_good_one(seen):
+    rig, _, of_all = seen
+    rng = np.random.default_rng(8)
+    assert misplaced_camera(of_all, rig) is None
+    for count in range(5, 11):
+        assert misplaced_camera(of_all, rig.subset(rng.choice(rig.names, count, replace=False))) is None
+    for name in ("cam01", "cam04", "cam09"):
+        for degrees in (15.0, 180.0):  # a shift of its picture tells turns of a few degrees
+            turn = rotation_from_vector(np.radians(degrees) * np.array([0.0, 0.0, 1.0]))
+            changed = [
+                replace(c, camera_from_world=RigidTransform(turn, np.zeros(3)) @ c.camera_from_world)
+                if c.name == name
+                else c
+                for c in rig
+            ]
+            assert misplaced_camera(of_all, Rig(tuple(changed))) == name
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda mask: mask[:, ::-1], "flipped left to right"),
+        (lambda mask: mask[::-1, ::-1], "turned by 180 degrees"),
+    ],
+)
+def test_pictures_that_are_all_turned_alike_are_named(seen, change, word):
+    rig, masks, _ = seen
+    assert word in str(wrong_rig(silhouettes({name: change(mask) for name, mask in masks.items()}), rig))
+
+
+@pytest.mark.parametrize(("quarters", "word"), [(1, "90 degrees anticlockwise"), (3, "90 degrees clockwise")])
+def test_square_pictures_turned_by_90_degrees_are_named(seen, quarters, word):
+    """Others are refused when they are read: their sides are exchanged."""
+    rig, masks, _ = seen
+    beside, height = (WIDTH - HEIGHT) // 4, HEIGHT // 2
+    lenses = [replace(c.intrinsics, width=height, cx=c.intrinsics.cx - beside) for c in rig]
+    square = Rig(tuple(replace(camera, intrinsics=lens) for camera, lens in zip(rig, lenses, strict=True)))
+    cropped = {name: mask[:, beside:-beside] for name, mask in masks.items()}
+    assert wrong_rig(silhouettes(cropped), square) is None
+    turned = {name: np.rot90(mask, quarters) for name, mask in cropped.items()}  # anticlockwise
+    assert word in str(wrong_rig(silhouettes(turned), square))
+
+
+def test_the_calibration_of_another_rig_is_named(seen):
+    _, _, of_all = seen
+    for name in ARRANGEMENTS_DEG:
+        found = wrong_rig(of_all, arrangement(name).scaled(0.5))
+        assert found is not None
+        assert "is of another rig" in found.text
+        assert "calibrate it again" in found.text
+
+
+def test_principal_points_of_the_whole_picture_are_named_where_it_was_cropped(seen):
+    rig, _, of_all = seen
+    changed = [lensed(c, cx=c.intrinsics.cx + 60, cy=c.intrinsics.cy + 40) for c in rig]
+    found = wrong_rig(of_all, Rig(tuple(changed)))
+    assert found is not None
+    moved = next(change for change in found.parameters["changes"] if change.code == "principal-points-moved")
+    assert (moved.parameters["right_px"], moved.parameters["down_px"]) == pytest.approx((-60, -40), abs=12)
+
+
+def lensed(camera, **changes):
+    return replace(camera, intrinsics=replace(camera.intrinsics, **changes))

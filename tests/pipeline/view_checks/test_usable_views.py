@@ -1,0 +1,104 @@
+"""What is known of the views before a fit: too few, a camera that moved, remarks of the reader."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibration.scene.rig_scale import times
+from pipeline.head_model.model import load_model
+from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.segmentation.segment import _mask_quality
+from pipeline.settings import SegmentationSettings
+from pipeline.view_checks.head_size import WrongScale
+from pipeline.view_checks.usable_views import TooFewViews, UsableViews, usable_views
+from rig.capture import Capture
+from rig.geometry import RigidTransform, rotation_from_vector
+from rig.messages.message import compose
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from tests.support.silhouette_subjects import dressed_head
+
+pytestmark = pytest.mark.gl
+Seen = tuple[Rig, dict[str, Silhouette]]
+
+
+@pytest.fixture(scope="module")
+def seen(renderer: Renderer) -> Seen:
+    rig = default_layout().scaled(0.5)
+    vertices, faces, pose = dressed_head(load_model(), rig, np.random.default_rng(2), 60)
+    with renderer.silhouette_set(rig, faces) as drawn:
+        masks = drawn.masks(pose.apply(vertices))
+    return rig, {name: silhouette_from_mask(mask) for name, mask in masks.items()}
+
+
+def judged(rig: Rig, silhouettes: dict[str, Silhouette], capture: Capture | None = None) -> UsableViews:
+    return usable_views(capture or Capture({}), rig, lambda shot: silhouettes, exchanged="repair")
+
+
+def test_good_views_all_take_part_and_remarks_of_the_reader_are_passed_on(seen: Seen) -> None:
+    rig, silhouettes = seen
+    found = judged(rig, silhouettes, Capture({}, remarks=(compose("unknown-key", remark="the key x is not read"),)))
+    assert all(silhouette.quality.usable for silhouette in found.silhouettes.values())
+    assert [(warning.code, warning.text) for warning in found.warnings] == [("unknown-key", "the key x is not read")]
+
+
+def test_a_camera_that_was_turned_takes_no_part(seen: Seen) -> None:
+    rig, silhouettes = seen
+    turn = RigidTransform(rotation_from_vector(np.radians([0.0, 0.5, 0.0])), np.zeros(3))
+    cameras = [
+        replace(c, camera_from_world=turn @ c.camera_from_world) if c.name == "cam03" else c for c in rig
+    ]  # fmt: skip
+    found = judged(Rig(tuple(cameras)), silhouettes)
+    assert [name for name, silhouette in found.silhouettes.items() if not silhouette.quality.usable] == ["cam03"]
+    assert [warning.code for warning in found.warnings] == ["camera-moved"]
+
+
+def test_two_views_are_too_few_and_each_lost_one_is_named(seen: Seen) -> None:
+    rig, silhouettes = seen
+    lost = {
+        name: s if name in rig.names[:2] else replace(s, quality=replace(s.quality, usable=False))
+        for name, s in silhouettes.items()
+    }
+    with pytest.raises(TooFewViews, match=r"only 2 of 11 .* cam10"):
+        judged(rig, lost)
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"),
+    [("masks", "Correct these masks"), ("backgrounds", "Take new clean plates"), ("nothing", "Supply clean plates")],
+)
+def test_the_remedy_is_for_what_was_given(seen: Seen, kind: str, remedy: str) -> None:
+    rig, silhouettes = seen
+    lost = {name: replace(s, quality=replace(s.quality, usable=False)) for name, s in silhouettes.items()}
+    captures = {
+        "masks": Capture({}, masks={name: s.mask for name, s in silhouettes.items()}),
+        "backgrounds": Capture({}, backgrounds={name: (np.zeros((4, 4, 3), np.uint8),) for name in silhouettes}),
+        "nothing": Capture({}),
+    }
+    with pytest.raises(TooFewViews) as refused:
+        judged(rig, lost, captures[kind])
+    assert remedy in str(refused.value)
+    assert kind != "masks" or "or supply masks/" not in str(refused.value)
+
+
+def test_a_rig_in_another_unit_is_refused_before_a_fit(seen: Seen) -> None:
+    rig, silhouettes = seen
+    with pytest.raises(WrongScale, match=r"about 3\.\d times as large as a head"):
+        judged(times(rig, 3.3), silhouettes)
+
+
+def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
+    rows, columns = np.indices((120, 160))
+    bust = (np.hypot(columns - 80, rows - 55) < 25) | ((rows > 85) & (np.abs(columns - 80) < 55))
+    settings = SegmentationSettings()
+    for turns, side in ((0, "top"), (1, "left"), (2, "bottom"), (3, "right")):
+        for cut in (False, True):
+            mask = np.roll(bust, -40, axis=0) if cut else bust
+            mask[-40:] |= cut & bust[-1]
+            quality = _mask_quality(np.ascontiguousarray(np.rot90(mask, turns)), settings)
+            assert [warning.text for warning in quality.warnings if "cut off" in warning.text] == (
+                [f"the head is cut off at the {side} of the image: move the camera back or "
+                 f"{'tilt it up' if side == 'top' else 'turn it'}"] if cut else []
+            )  # fmt: skip
