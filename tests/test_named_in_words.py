@@ -76,7 +76,7 @@ def test_what_docstrings_and_comments_name_exists() -> None:
         ("rig.mesh.Mosh", False),
         ("rig.mash", False),
         ("rig.studio.scene", True),
-        ("fitting/photo/refine.py", True),
+        ("photometric_fit/refine.py", True),
         ("photo/consistency_of_views.py", False),
         ("RigidTransform", True),
         ("RigidTransformation", False),

@@ -1,9 +1,9 @@
 """What the rims of a head say of the cameras: the model fitted to one capture, everything but the cameras taken out.
 
-With the cameras held, the contour solver (section 4.4, ``pipeline.contour_fit.contour``) finds shape and pose. The normal
-equations there, over (shape, pose, cameras), are reduced to the cameras by the Schur complement, so that a head which
-could be another one says no more than it knows. Captures of several subjects add up: heads are their own, cameras the
-same.
+With the cameras held, the contour solver (section 4.4, ``pipeline.contour_fit.contour``) finds shape and pose. The
+normal equations there, over (shape, pose, cameras), are reduced to the cameras by the Schur complement, so that a head
+which could be another one says no more than it knows. Captures of several subjects add up: heads are their own, cameras
+the same.
 """
 
 from collections.abc import Mapping, Sequence

@@ -3,7 +3,7 @@
 ``kernels.txt`` beside this file has a line for each: module and function, then the types of the arguments. First come
 those of a job without the dense stage (``--detail photo --surface head``), after an empty line those that it adds.
 ``float32[2C]`` is a two-dimensional array in C order (A: any strides), with ``r`` behind it one that is not written to;
-``4*float64`` is a tuple, ``dense.matching_kernels:Sight{float64[2C];int64}`` a named one. The list is recorded, not
+``4*float64`` is a tuple, ``stereo.matching_kernels:Sight{float64[2C];int64}`` a named one. The list is recorded, not
 thought out: ``python -m tests.support.kernel_recorder`` writes it from jobs that it runs, and a test runs a job and
 fails where the list lacks a loop.
 
@@ -24,7 +24,7 @@ from numba.core.dispatcher import Dispatcher
 from pipeline.compute.jit import KeptFunction, code_size
 
 LIST = Path(__file__).with_name("kernels.txt")
-PACKAGE = __package__ or "pipeline"  # "eigenhead.pipeline" in the wheel
+PACKAGE = (__package__ or "pipeline.compute").removesuffix(".compute")  # "eigenhead.pipeline" in the wheel
 _ARRAY = re.compile(r"(\w+)\[(\d)([CFA])\](r?)")
 _TUPLE = re.compile(r"(\d+)\*(\w+)")
 _NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")
@@ -34,7 +34,7 @@ _NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")
 class Kernel:
     """Holds one compiled loop for one set of argument types."""
 
-    place: str  # "fitting.rim_kernels:see", relative to this package
+    place: str  # "contour_fit.rim_kernels:see", relative to this package
     arguments: tuple[str, ...]
 
     @classmethod

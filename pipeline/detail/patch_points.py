@@ -1,10 +1,9 @@
 """The photographs once more, on the displaced head: what windows of dense matching flatten, patches of the surface say.
 
 Dense windows are planes; they see curved skin too flat and too deep (``pipeline.stereo.window_bias``). A patch of the
-displaced head itself (``fitting.photo.patches``) has its shape already, so that all its views are warped rightly, and
-so are the cameras' corrections that the fit found. So patches say the last tenths of a millimetre, narrower ones than
-those that the fit was solved with, wherever they match; dense points carry on beside them.
-"""
+displaced head itself (``pipeline.photometric_fit.patches``) has its shape already, so that all its views are warped
+rightly, and so are the cameras' corrections that the fit found. So patches say the last tenths of a millimetre,
+narrower ones than those that the fit was solved with, wherever they match; dense points carry on beside them. """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,8 +1,8 @@
 """Which patches of the face lie under hair: its surface is not the head's, yet photographs see it sharply.
 
-The part maps (``pipeline.part_labels.labelling``) say of every pixel how probably it shows hair; a patch is hair's where most of
-what the views see of it is, and where it is about to be: its window reaches into the hair, which stands off the skin.
-"""
+The part maps (``pipeline.part_labels.labelling``) say of every pixel how probably it shows hair; a patch is hair's
+where most of what the views see of it is, and where it is about to be: its window reaches into the hair, which stands
+off the skin. """
 
 from collections.abc import Mapping, Sequence
 

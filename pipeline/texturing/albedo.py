@@ -1,9 +1,9 @@
 """Albedo: the texture with its light taken off.
 
 Enters: the head, its photograph-like texture, linear colours of all views. Leaves: the light
-(``pipeline.texturing.light``) and an image in the texture's layout of what the skin itself reflects. Highlights move with
-the camera, so that of each vertex' views a dim one tells what is matt; the texture is multiplied, in linear light, by
-the factor of its vertices from texture to matt colour by shading, which keeps every texel's detail.
+(``pipeline.texturing.light``) and an image in the texture's layout of what the skin itself reflects. Highlights move
+with the camera, so that of each vertex' views a dim one tells what is matt; the texture is multiplied, in linear light,
+by the factor of its vertices from texture to matt colour by shading, which keeps every texel's detail.
 """
 
 from dataclasses import dataclass

@@ -2,8 +2,8 @@
 
 A texel is a point of the fitted surface; its place in a photograph follows from those of its triangle's corners (lens
 included; edges are a few pixels), is read there with a sub-pixel window and gets the corners' correction
-(``pipeline.texturing.seam_levelling``). In triangles whose corners chose different photographs these are faded into each
-other. What no camera sees has the vertices' colours.
+(``pipeline.texturing.seam_levelling``). In triangles whose corners chose different photographs these are faded into
+each other. What no camera sees has the vertices' colours.
 """
 
 import cv2

@@ -4,7 +4,7 @@ Waechter et al. (2014, section 4.3, after Lempitsky and Ivanov 2007) look for sm
 sides of every seam agree; those are determined but for what all views have wrong together. Here the correction of each
 view is the smooth field that brings it to the colour on which all views agree, wherever it sees the head (screened
 Poisson equation): a view with a shadow or a shine keeps no tint far from a seam either, and any views may be faded into
-each other. What is left at a seam, noise and detail, is faded over one ring of triangles (``pipeline.texturing.paint``).
+each other. What is left at a seam (noise, detail) is faded over one ring of triangles (``pipeline.texturing.paint``).
 
 Corrections are in sRGB codes: neither dark creases nor bright skin then take more than their share.
 """

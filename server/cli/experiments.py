@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from rig.errors import EigenheadError
+from rig.messages.message import compose
 from server.cli.answers import Json, answer, chosen, progress_bar
 
 app = typer.Typer(rich_markup_mode=None)
@@ -57,7 +59,8 @@ def experiments(
     ] = None,
     json_out: Json = False,
 ) -> None:
-    """Repeat the paper's experiments, and ours."""
+    """Repeat the paper's experiments, and ours. Needs a checkout: a wheel does not carry them."""
+    check_research()
     if name == "real":
         _experiment_real(folders or [], model, front, outlines, out, json_out)
         return
@@ -74,6 +77,14 @@ def experiments(
         )
     lines = found.pop("lines", None)
     answer(found, json_out, lines or [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
+
+
+def check_research() -> None:
+    """Raises EigenheadError where this is a wheel, which carries no research."""
+    try:
+        from pipeline import research  # noqa: F401
+    except ImportError:
+        raise EigenheadError(compose("research-not-carried")) from None
 
 
 def _experiment_real(

@@ -35,10 +35,11 @@ SUFFIX = ".silhouettes"
 ROOMS = (
     ".",
     "faces",
+    "geometry",
     "imaging",
     "multiview",
-    "silhouettes",
-    "silhouettes/without_plates",
+    "segmentation",
+    "segmentation/without_plates",
 )  # of the pipeline: what silhouettes come from
 QUICK = 1  # zlib's fastest level: 35 MB become 4.7 MB in 0.2 s, and no level gets below 4
 

@@ -1,5 +1,6 @@
-"""What a first job would wait for, made ahead: the compiled loops of ``pipeline.compute.kernel_list``, in processes over all
-cores. Set-up does it (``eigenhead prepare``), and a command that finds something missing does it before its work."""
+"""Makes ahead what a first job would wait for: the compiled loops of ``pipeline.compute.kernel_list``, in processes
+over all cores. Set-up does it (``eigenhead prepare``), and a command that finds something missing does it before its
+work."""
 
 import errno
 import logging

@@ -1,7 +1,7 @@
 """Which compiled loops jobs call, and with which types.
 
-python -m tests.support.kernel_recorder pipeline/compute/kernels.txt CAPTURE... writes the list from jobs on captures: first
-without the dense stage, then as by default.
+python -m tests.support.kernel_recorder pipeline/compute/kernels.txt CAPTURE... writes the list from jobs on captures:
+first without the dense stage, then as by default.
 """
 
 import sys

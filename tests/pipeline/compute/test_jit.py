@@ -13,7 +13,7 @@ import pytest
 from pipeline.compute import jit as compiled
 from pipeline.compute.jit import function_digest, njit
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SCALE = 2.0
 
 

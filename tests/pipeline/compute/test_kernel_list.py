@@ -35,7 +35,7 @@ def test_every_line_names_a_loop_and_its_types() -> None:
         ("4*float64", types.UniTuple(types.float64, 4)),
         ("float32[2C]", types.Array(types.float32, 2, "C")),
         (
-            "dense.surface.vote_kernels:Pixels{" + ";".join(["float32[1C]"] * len(Pixels._fields)) + "}",
+            "fusion.vote_kernels:Pixels{" + ";".join(["float32[1C]"] * len(Pixels._fields)) + "}",
             types.NamedUniTuple(types.Array(types.float32, 1, "C"), len(Pixels._fields), Pixels),
         ),
         ("bool[3A]r", types.Array(types.boolean, 3, "A", readonly=True)),

@@ -73,7 +73,7 @@ def test_an_error_of_any_slice_reaches_the_caller(monkeypatch: pytest.MonkeyPatc
 
 def test_no_stage_has_a_number_of_threads_of_its_own() -> None:
     """Every pool of the pipeline is as large as EIGENHEAD_THREADS says, but for writing, which waits for the disk."""
-    root = Path(__file__).resolve().parents[2] / "pipeline"
+    root = Path(__file__).resolve().parents[3] / "pipeline"
     pools = {path.relative_to(root).as_posix(): path.read_text() for path in root.rglob("*.py")}
     sizes = {name: set(re.findall(r"with ThreadPoolExecutor\((.*?)\) as", text)) for name, text in pools.items()}
     odd = {name: found - {"thread_count()"} for name, found in sizes.items() if found - {"thread_count()"}}

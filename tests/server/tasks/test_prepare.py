@@ -20,7 +20,7 @@ from server.tasks.prepare import prepare_kernels
 from tests.support.disks import small_disk
 
 LINES = (
-    "dense.surface.grid_kernels:grown bool[3C]",
+    "fusion.grid_kernels:grown bool[3C]",
     "texture.vertex_colours_kernels:blend_views float32[2C] float32[3C] float64",
 )
 
