@@ -3,7 +3,7 @@
 Dense windows are planes; they see curved skin too flat and too deep (``pipeline.stereo.window_bias``). A patch of the
 displaced head itself (``pipeline.photometric_fit.patches``) has its shape already, so that all its views are warped
 rightly, and so are the cameras' corrections that the fit found. So patches say the last tenths of a millimetre,
-narrower ones than those that the fit was solved with, wherever they match; dense points carry on beside them. """
+narrower ones than those that the fit was solved with, wherever they match; dense points carry on beside them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

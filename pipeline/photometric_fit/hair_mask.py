@@ -2,7 +2,7 @@
 
 The part maps (``pipeline.part_labels.labelling``) say of every pixel how probably it shows hair; a patch is hair's
 where most of what the views see of it is, and where it is about to be: its window reaches into the hair, which stands
-off the skin. """
+off the skin."""
 
 from collections.abc import Mapping, Sequence
 

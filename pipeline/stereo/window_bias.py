@@ -3,7 +3,7 @@
 They lie a little too deep all over, and they take a curved surface for flatter than it is: what stands out (the bridge
 of the nose, the lips) is cut off, what lies back is filled. To first order that is ``share`` times the height of the
 surface's own mean, over a window of 2.5 mm, above it. How large both are, ``pipeline.detail.depth_bias`` measures on
-the very capture. """
+the very capture."""
 
 from dataclasses import dataclass
 

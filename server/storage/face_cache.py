@@ -18,7 +18,7 @@ import cv2
 from rig.atomic_write import write_atomically
 from server.storage.code_digest import code_digest
 
-ROOMS = ("alignment", "eigenheads", "eigenheads/correspondence", "faces", "multiview")
+ROOMS = ("alignment", "faces", "geometry", "head_model", "multiview")
 SUFFIX = ".faces.json"
 
 PixelsOfPoints = dict[str, dict[str, list[float]]]  # by landmark and camera, as features.json has them
