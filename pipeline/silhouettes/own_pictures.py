@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 from pipeline.diagnostics import ReportWarning
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.camera_assignment import (
+    CAMERAS_LEAST,
     FITTING_MISFIT,
     Assignment,
     find_assignment,
@@ -28,6 +29,7 @@ from pipeline.multiview.triangulation import NoPoint, triangulate
 from pipeline.silhouettes.mask_edges import masks_alone_exchanged
 from rig.capture import Capture, Features, reassign_images
 from rig.errors import EigenheadError
+from rig.formats.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -63,6 +65,14 @@ class ExchangedPictures(EigenheadError):
         super().__init__(compose("pictures-exchanged", exchange=found, reason=reason))
 
 
+class SamePictures(EigenheadError):
+    """So many cameras hold one picture that too few are left."""
+
+    def __init__(self, duplicates: Mapping[str, str], count: int) -> None:
+        names = some_of(sorted({*duplicates, *duplicates.values()}))
+        super().__init__(compose("pictures-the-same", count=len(duplicates), all=count, names=names))
+
+
 class WrongRig(EigenheadError):
     """Pictures that these cameras cannot have taken."""
 
@@ -80,6 +90,7 @@ def own_pictures(
 
     Raises:
         ExchangedPictures: an exchange that may not be repaired, or is not sure enough to be.
+        SamePictures: fewer than three pictures are different.
         WrongRig: no exchange explains that most cameras contradict the others.
     """
     plates = misplaced_plates(capture, rig)
@@ -88,6 +99,8 @@ def own_pictures(
     capture = reassign_images(capture, plates=plates) if plates else capture
     silhouettes = segmented(capture)
     duplicates = duplicate_views(capture, silhouettes, rig)
+    if len(silhouettes) - len(duplicates) < CAMERAS_LEAST <= len(silhouettes):
+        raise SamePictures(duplicates, len(silhouettes))
     distinct = {name: silhouette for name, silhouette in silhouettes.items() if name not in duplicates}
     assignment = find_assignment(distinct, rig)
     masks = assignment.pictures if _masks_alone(capture, silhouettes, assignment) else {}

@@ -18,7 +18,8 @@ from pipeline.silhouettes.mask_edges import masks_off_edges
 from pipeline.silhouettes.own_pictures import own_pictures
 from rig.capture import Capture
 from rig.errors import EigenheadError
-from rig.messages.message import compose
+from rig.formats.fault_groups import say_once
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 VIEWS_LEAST = 3
@@ -30,8 +31,9 @@ class TooFewViews(EigenheadError):
     def __init__(self, silhouettes: Mapping[str, Silhouette], capture: Capture) -> None:
         poor = {name: s.quality.warnings for name, s in silhouettes.items() if not s.quality.usable}
         reasons = [
-            compose("view-reasons", camera=name, reasons=why) if why else compose("view-unusable", camera=name)
+            compose("view-reasons", camera=name, reasons=[reason]) if reason else compose("view-unusable", camera=name)
             for name, why in poor.items()
+            for reason in why or (None,)
         ]
         if capture.masks:
             remedy = compose("advice-correct-masks")
@@ -39,9 +41,10 @@ class TooFewViews(EigenheadError):
             remedy = compose("advice-new-plates")
         else:
             remedy = compose("advice-supply-plates")
+        told = say_once(reasons, silhouettes, named_most=len(silhouettes))
         usable, every = len(silhouettes) - len(poor), len(silhouettes)
         super().__init__(
-            compose("too-few-views", usable=usable, all=every, needed=VIEWS_LEAST, reasons=reasons, remedy=remedy)
+            compose("too-few-views", usable=usable, all=every, needed=VIEWS_LEAST, reasons=told, remedy=remedy)
         )
 
 
@@ -105,12 +108,26 @@ def without_moved_cameras(
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
-    """What the views' qualities say, as warnings of the report."""
-    found = []
+    """What the views' qualities say, as warnings of the report; what is true of many views is one of them."""
+    told: dict[str, list[Message]] = {"view-left-out": [], "view": [], "mask-doubtful": []}
     for name, silhouette in silhouettes.items():
-        for remark in silhouette.quality.warnings:
-            located = compose("located", where=name, fault=remark)
-            usable = silhouette.quality.usable
-            found.append(compose("view", remark=located) if usable else compose("view-left-out", remark=located))
-        found += [compose("mask-doubtful", camera=name, remark=remark) for remark in silhouette.quality.doubts]
-    return found
+        code = "view" if silhouette.quality.usable else "view-left-out"
+        told[code] += [compose("located", where=name, fault=remark) for remark in silhouette.quality.warnings]
+        told["mask-doubtful"] += [compose("located", where=name, fault=doubt) for doubt in silhouette.quality.doubts]
+    once = {code: say_once(remarks, silhouettes, named_most=len(silhouettes)) for code, remarks in told.items()}
+    found = [compose("view-left-out", remark=remark) for remark in once["view-left-out"]]
+    found += [compose("view", remark=remark) for remark in once["view"]]
+    return found + [_doubt(remark) for remark in once["mask-doubtful"]]
+
+
+def _doubt(remark: Message) -> ReportWarning:
+    """Of one view, or, where it is true of many, of the first with the number of the others."""
+    located = remark if remark.code == "located" else remark.parameters["fault"]
+    assert isinstance(located, Message)
+    camera, fault = str(located.parameters["where"]), located.parameters["fault"]
+    if located is remark:
+        return compose("mask-doubtful", camera=camera, remark=fault)
+    count, names = remark.parameters["count"], remark.parameters["names"]
+    return compose(
+        "mask-doubtful", camera=camera, remark=compose("same-of-more", fault=fault, count=count, names=names)
+    )

@@ -67,6 +67,7 @@ TEMPLATES = {
     "setting-no-object": "{where} is no object",
     "pictures-exchanged": "{exchange}; {reason}. File every picture under the name of the camera that took it",
     "picture-duplicated": "{camera} holds the same picture as {owner} and is left out: look what became of its own",
+    "pictures-the-same": "{count} of {all} cameras hold no picture of their own, but another's, pixel for pixel ({names}): look how the pictures were fetched or copied, and give each camera its own",
     "neither-plate-nor-mask": "{camera} has neither a clean plate nor a mask: record one of them",
     "outline-guessed": "found without a clean plate, and {share:.0%} of its outline is a guess: give its clean plate or mask",
     "head-cut-off-at-top": "the head is cut off at the {side:word} of the image: move the camera back or tilt it up",

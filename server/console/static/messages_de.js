@@ -391,6 +391,7 @@ export default {
   "setting-no-object": "{where} ist kein Objekt",
   "pictures-exchanged": "{exchange}; {reason}. Jedes Bild unter dem Namen der Kamera ablegen, die es aufnahm",
   "picture-duplicated": "{camera} enthält dasselbe Bild wie {owner} und wird weggelassen: nachsehen, was aus dem eigenen wurde",
+  "pictures-the-same": "{count} von {all} Kameras haben kein eigenes Bild, sondern Pixel für Pixel das einer anderen ({names}): nachsehen, wie die Bilder geholt oder kopiert wurden, und jeder Kamera ihr eigenes geben",
   "neither-plate-nor-mask": "{camera} hat weder Leerbild noch Maske: eines davon aufnehmen",
   "outline-guessed": "ohne Leerbild gefunden, und {share:.0%} des Umrisses ist geraten: Leerbild oder Maske geben",
   "head-cut-off-at-top": "der Kopf ist abgeschnitten ({side:word}): Kamera zurückstellen oder nach oben neigen",

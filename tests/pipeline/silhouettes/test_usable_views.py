@@ -10,8 +10,9 @@ from pipeline.eigenheads.model import load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.multiview.head_size import WrongScale
 from pipeline.settings import SegmentationSettings
+from pipeline.silhouettes.own_pictures import SamePictures
 from pipeline.silhouettes.segment import _mask_quality
-from pipeline.silhouettes.usable_views import TooFewViews, UsableViews, usable_views
+from pipeline.silhouettes.usable_views import TooFewViews, UsableViews, usable_views, view_warnings
 from rig.capture import Capture
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.messages.message import compose
@@ -63,6 +64,32 @@ def test_two_views_are_too_few_and_each_lost_one_is_named(seen: Seen) -> None:
     }
     with pytest.raises(TooFewViews, match=r"only 2 of 11 .* cam10"):
         judged(rig, lost)
+
+
+def test_what_is_true_of_many_views_is_said_once(seen: Seen) -> None:
+    rig, silhouettes = seen
+    weak = [compose("outline-weak", share=0.31 + 0.01 * k) for k in range(len(rig))]
+    told = {
+        name: replace(s, quality=replace(s.quality, warnings=(weak[k],), usable=k < 2))
+        for k, (name, s) in enumerate(silhouettes.items())
+    }
+    with pytest.raises(TooFewViews) as refused:
+        judged(rig, told)
+    assert str(refused.value).count("hardly differs from the background") == 1
+    assert "the same is true of 8 more (cam03, " in str(refused.value)
+    warnings = view_warnings(told)
+    assert [warning.code for warning in warnings] == ["view-left-out", "view", "view"]
+    doubts = {name: replace(s, quality=replace(s.quality, doubts=(weak[0],))) for name, s in silhouettes.items()}
+    (doubt,) = view_warnings(doubts)
+    assert doubt.text.startswith("cam00: 31% of the contour")
+    assert "the same is true of 10 more (cam01, " in doubt.text
+
+
+def test_one_picture_in_all_cameras_is_named_as_such(seen: Seen) -> None:
+    rig, silhouettes = seen
+    picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    with pytest.raises(SamePictures, match=r"of 11 cameras hold no picture of their own.*give each camera its own"):
+        judged(rig, silhouettes, Capture(dict.fromkeys(rig.names, picture)))
 
 
 @pytest.mark.parametrize(
