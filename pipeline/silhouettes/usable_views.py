@@ -83,7 +83,7 @@ def usable_views(
     if sum(silhouette.quality.usable for silhouette in own.silhouettes.values()) < VIEWS_LEAST:
         raise TooFewViews(own.silhouettes, capture)
     silhouettes, moved = without_moved_cameras(own.silhouettes, rig)
-    size = judge_head_size(silhouettes, rig)
+    size = judge_head_size(silhouettes, rig, masks_given=bool(own.capture.masks))
     beside = masks_off_edges(own.capture.images, silhouettes, [name for name in rig.names if name in own.capture.masks])
     warnings = (*own.warnings, *view_warnings(silhouettes), *moved, *size, *beside, *capture.remarks)
     return UsableViews(own.capture, silhouettes, own.pictures, warnings)

@@ -151,6 +151,7 @@ TEMPLATES = {
     "much-hair": "much hair or a hat",
     "small-child": "a small child",
     "advice-known-length": "give a known length (scale.json beside the cameras), or check the board's square size and the unit of the translations",
+    "advice-whole-masks": "give masks of the whole head with hair and neck, if these hold the face alone; or else a known length (scale.json beside the cameras), and check the unit of the translations",
     "head-scale-off": "the head came out at {scale:.3f} of the size that its shape says: check the board's square size and the unit of the translations",
     "outlines-unexplained": "the fitted head explains hardly any outline: in {poor} of {views} views its contour lies {off_mm:.0f} mm (median) from the subject's. Check that cameras and masks are of these pictures and to scale, name the camera that the subject faces (--front), or give feature points",
     "outlines-loose": "most outlines contradict each other by more than these cameras explain: look at the overlays for a shadow on the wall, or hair that some masks miss; where the masks are tight, calibrate again",

@@ -591,6 +591,7 @@ export default {
   "much-hair": "viel Haar oder ein Hut",
   "small-child": "ein kleines Kind",
   "advice-known-length": "eine bekannte Länge geben (scale.json neben den Kameras) oder Feldgröße der Tafel und Einheit der Verschiebungen prüfen",
+  "advice-whole-masks": "Masken des ganzen Kopfs mit Haar und Hals geben, falls diese nur das Gesicht enthalten; sonst eine bekannte Länge (scale.json neben den Kameras), und die Einheit der Verschiebungen prüfen",
   "head-scale-off": "der Kopf hat {scale:.3f} der Größe, die seine Form verlangt: Feldgröße der Tafel und Einheit der Verschiebungen prüfen",
   "outlines-unexplained": "der angepasste Kopf erklärt kaum einen Umriss: in {poor} von {views} Ansichten liegt seine Kontur {off_mm:.0f} mm (Median) von der der Person. Prüfen, ob Kameras und Masken zu diesen Bildern gehören und der Maßstab stimmt, die Kamera nennen, der die Person zugewandt ist (--front), oder Merkmale setzen",
   "outlines-loose": "die meisten Umrisse widersprechen einander mehr, als diese Kameras erklären: in den Überlagerungen nach einem Schatten an der Wand sehen oder nach Haar, das in manchen Masken fehlt; sind die Masken eng, neu kalibrieren",

@@ -116,6 +116,13 @@ def test_a_rig_in_another_unit_is_refused_before_a_fit(seen: Seen) -> None:
         judged(times(rig, 3.3), silhouettes)
 
 
+def test_masks_that_may_hold_the_face_alone_are_thought_of_before_the_unit(seen: Seen) -> None:
+    rig, silhouettes = seen
+    masked = Capture({}, masks={name: s.mask for name, s in silhouettes.items()})
+    with pytest.raises(WrongScale, match="masks of the whole head with hair and neck"):
+        judged(times(rig, 0.4), silhouettes, masked)
+
+
 def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
     rows, columns = np.indices((120, 160))
     bust = (np.hypot(columns - 80, rows - 55) < 25) | ((rows > 85) & (np.abs(columns - 80) < 55))
