@@ -56,18 +56,22 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float |
 class WrongScale(EigenheadError):
     """Reports outlines of a head that no head has the size of: the unit of the cameras is not millimetres."""
 
-    def __init__(self, diameter_mm: float) -> None:
-        message = compose("size-refused", size=_size_told(diameter_mm), remedy=compose("advice-known-length"))
-        super().__init__(message)
+    def __init__(self, diameter_mm: float, *, masks_given: bool = False) -> None:
+        part = masks_given and diameter_mm < HEAD_MM
+        remedy = compose("advice-whole-masks") if part else compose("advice-known-length")
+        super().__init__(compose("size-refused", size=_size_told(diameter_mm), remedy=remedy))
 
 
-def judge_head_size(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[ReportWarning]:
-    """Warns of a head that is larger or smaller than most; raises WrongScale for one that nobody has."""
+def judge_head_size(
+    silhouettes: Mapping[str, Silhouette], rig: Rig, *, masks_given: bool = False
+) -> list[ReportWarning]:
+    """Warns of a head that is larger or smaller than most; raises WrongScale for one that nobody has. ``masks_given``:
+    they may show less than a head."""
     diameter = head_diameter_mm(silhouettes, rig)
     if diameter is None:
         return []
     if not REFUSED_MM[0] < diameter < REFUSED_MM[1]:
-        raise WrongScale(diameter)
+        raise WrongScale(diameter, masks_given=masks_given)
     if not WARNED_MM[0] < diameter < WARNED_MM[1]:
         return [compose("scale-implausible", finding=_outline_size(diameter))]
     return []

@@ -18,6 +18,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.triangulation import NoPoint, triangulate
 from pipeline.view_checks.camera_assignment import (
     FITTING_MISFIT,
+    MIN_CAMERAS,
     Assignment,
     find_assignment,
     own_misfit,
@@ -28,6 +29,7 @@ from pipeline.view_checks.rig_agreement import loose_outlines, wrong_rig
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture, Features, reassign_images
 from rig.errors import EigenheadError
+from rig.formats.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -63,6 +65,14 @@ class ExchangedPictures(EigenheadError):
         super().__init__(compose("pictures-exchanged", exchange=found, reason=reason))
 
 
+class SamePictures(EigenheadError):
+    """So many cameras hold one picture that too few are left."""
+
+    def __init__(self, duplicates: Mapping[str, str], count: int) -> None:
+        names = some_of(sorted({*duplicates, *duplicates.values()}))
+        super().__init__(compose("pictures-the-same", count=len(duplicates), all=count, names=names))
+
+
 class WrongRig(EigenheadError):
     """Reports pictures that these cameras cannot have taken."""
 
@@ -80,6 +90,7 @@ def assign_images(
 
     Raises:
         ExchangedPictures: an exchange that may not be repaired, or is not sure enough to be.
+        SamePictures: fewer than three pictures are different.
         WrongRig: no exchange explains that most cameras contradict the others.
     """
     plates = misplaced_plates(capture, rig)
@@ -88,6 +99,8 @@ def assign_images(
     capture = reassign_images(capture, plates=plates) if plates else capture
     silhouettes = segmented(capture)
     duplicates = duplicate_views(capture, silhouettes, rig)
+    if len(silhouettes) - len(duplicates) < MIN_CAMERAS <= len(silhouettes):
+        raise SamePictures(duplicates, len(silhouettes))
     distinct = {name: silhouette for name, silhouette in silhouettes.items() if name not in duplicates}
     assignment = find_assignment(distinct, rig)
     masks = assignment.pictures if _masks_alone(capture, silhouettes, assignment) else {}

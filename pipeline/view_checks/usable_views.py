@@ -18,7 +18,8 @@ from pipeline.view_checks.rig_agreement import misplaced_camera
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
 from rig.errors import EigenheadError
-from rig.messages.message import compose
+from rig.formats.fault_groups import say_once
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 MIN_VIEWS = 3
@@ -30,8 +31,9 @@ class TooFewViews(EigenheadError):
     def __init__(self, silhouettes: Mapping[str, Silhouette], capture: Capture) -> None:
         poor = {name: s.quality.warnings for name, s in silhouettes.items() if not s.quality.usable}
         reasons = [
-            compose("view-reasons", camera=name, reasons=why) if why else compose("view-unusable", camera=name)
+            compose("view-reasons", camera=name, reasons=[reason]) if reason else compose("view-unusable", camera=name)
             for name, why in poor.items()
+            for reason in why or (None,)
         ]
         if capture.masks:
             remedy = compose("advice-correct-masks")
@@ -39,9 +41,10 @@ class TooFewViews(EigenheadError):
             remedy = compose("advice-new-plates")
         else:
             remedy = compose("advice-supply-plates")
+        said = say_once(reasons, silhouettes, named_most=len(silhouettes))
         usable, every = len(silhouettes) - len(poor), len(silhouettes)
         super().__init__(
-            compose("too-few-views", usable=usable, all=every, needed=MIN_VIEWS, reasons=reasons, remedy=remedy)
+            compose("too-few-views", usable=usable, all=every, needed=MIN_VIEWS, reasons=said, remedy=remedy)
         )
 
 
@@ -80,7 +83,7 @@ def usable_views(
     if sum(silhouette.quality.usable for silhouette in assigned.silhouettes.values()) < MIN_VIEWS:
         raise TooFewViews(assigned.silhouettes, capture)
     silhouettes, moved = without_moved_cameras(assigned.silhouettes, rig)
-    size = judge_head_size(silhouettes, rig)
+    size = judge_head_size(silhouettes, rig, masks_given=bool(assigned.capture.masks))
     given_masks = [name for name in rig.names if name in assigned.capture.masks]
     beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
     warnings = (*assigned.warnings, *view_warnings(silhouettes), *moved, *size, *beside, *capture.remarks)
@@ -106,12 +109,32 @@ def without_moved_cameras(
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
-    """Returns what the views' qualities say, as warnings of the report."""
-    found = []
+    """Returns what the views' qualities say, as warnings of the report; what is true of many views is one of them."""
+    remarks_by_code: dict[str, list[Message]] = {"view-left-out": [], "view": [], "mask-doubtful": []}
     for name, silhouette in silhouettes.items():
-        for remark in silhouette.quality.warnings:
-            located = compose("located", where=name, fault=remark)
-            usable = silhouette.quality.usable
-            found.append(compose("view", remark=located) if usable else compose("view-left-out", remark=located))
-        found += [compose("mask-doubtful", camera=name, remark=remark) for remark in silhouette.quality.doubts]
-    return found
+        code = "view" if silhouette.quality.usable else "view-left-out"
+        remarks_by_code[code] += [
+            compose("located", where=name, fault=remark) for remark in silhouette.quality.warnings
+        ]
+        remarks_by_code["mask-doubtful"] += [
+            compose("located", where=name, fault=doubt) for doubt in silhouette.quality.doubts
+        ]
+    once = {
+        code: say_once(remarks, silhouettes, named_most=len(silhouettes)) for code, remarks in remarks_by_code.items()
+    }
+    found = [compose("view-left-out", remark=remark) for remark in once["view-left-out"]]
+    found += [compose("view", remark=remark) for remark in once["view"]]
+    return found + [_doubt(remark) for remark in once["mask-doubtful"]]
+
+
+def _doubt(remark: Message) -> ReportWarning:
+    """Of one view, or, where it is true of many, of the first with the number of the others."""
+    located = remark if remark.code == "located" else remark.parameters["fault"]
+    assert isinstance(located, Message)
+    camera, fault = str(located.parameters["where"]), located.parameters["fault"]
+    if located is remark:
+        return compose("mask-doubtful", camera=camera, remark=fault)
+    count, names = remark.parameters["count"], remark.parameters["names"]
+    return compose(
+        "mask-doubtful", camera=camera, remark=compose("same-of-more", fault=fault, count=count, names=names)
+    )

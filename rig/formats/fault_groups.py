@@ -7,10 +7,11 @@ from rig.messages.message import Message, compose, message_of
 
 NAMED_MOST = 4  # cameras or keys that one sentence names
 SAME_LEAST = 3  # faults that differ in names alone, from which on they are one cause
-MEASURED = re.compile(r"(?<![\w.])-?\d+\.\d+(?:e[+-]?\d+)?(?![\w.])")  # not a size in pixels, which tells cameras apart
+MEASURED = re.compile(r"(?<![\w.])-?(?:\d+\.\d+(?:e[+-]?\d+)?(?![\w.])|\d+(?=%))")
+# no size in pixels, which tells cameras apart
 
 
-def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Message]:
+def say_once(faults: Sequence[Message | str], names: Iterable[str], *, named_most: int = NAMED_MOST) -> list[Message]:
     """Returns faults that differ only in the names of cameras and of their files, and in what was measured of each, as
     one sentence that names the first and how many others there are."""
     ordered = sorted(set(names), key=len, reverse=True)
@@ -27,7 +28,9 @@ def say_once(faults: Sequence[Message | str], names: Iterable[str]) -> list[Mess
             grouped += group
             continue
         others = dict.fromkeys(found[1] for fault in group[1:] if (found := name.search(fault.text)))
-        grouped.append(compose("same-of-more", fault=group[0], count=len(group) - 1, names=some_of([*others])))
+        grouped.append(
+            compose("same-of-more", fault=group[0], count=len(group) - 1, names=some_of([*others], named_most))
+        )
     return grouped
 
 

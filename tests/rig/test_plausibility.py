@@ -92,8 +92,8 @@ def test_principal_points_that_nobody_gave_are_named_once():
     assert fault.code == "principal-points-missing"
 
 
-@pytest.mark.parametrize(("factor", "named"), [(2.0, "2 times"), (0.5, "0.5 times"), (0.25, "0.25 times")])
-def test_intrinsics_of_pictures_of_another_size_are_named_with_the_factor(factor, named):
+@pytest.mark.parametrize(("factor", "size_share"), [(2.0, "2 times"), (0.5, "0.5 times"), (0.25, "0.25 times")])
+def test_intrinsics_of_pictures_of_another_size_are_named_with_the_factor(factor, size_share):
     rig = default_layout()
     keys = ("fx", "fy", "cx", "cy")
     other = [
@@ -101,7 +101,7 @@ def test_intrinsics_of_pictures_of_another_size_are_named_with_the_factor(factor
         for c in rig
     ]
     (fault,) = rig_faults(Rig(tuple(other)))
-    assert fault.text.startswith(f"the intrinsics are of pictures {named} as large")
+    assert fault.text.startswith(f"the intrinsics are of pictures {size_share} as large")
     assert f"by {1 / factor:g}," in fault.text
 
 

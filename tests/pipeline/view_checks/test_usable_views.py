@@ -11,7 +11,8 @@ from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.segmentation.segment import _mask_quality
 from pipeline.settings import SegmentationSettings
 from pipeline.view_checks.head_size import WrongScale
-from pipeline.view_checks.usable_views import TooFewViews, UsableViews, usable_views
+from pipeline.view_checks.image_assignment import SamePictures
+from pipeline.view_checks.usable_views import TooFewViews, UsableViews, usable_views, view_warnings
 from rig.capture import Capture
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.messages.message import compose
@@ -65,6 +66,32 @@ def test_two_views_are_too_few_and_each_lost_one_is_named(seen: Seen) -> None:
         judged(rig, lost)
 
 
+def test_what_is_true_of_many_views_is_said_once(seen: Seen) -> None:
+    rig, silhouettes = seen
+    weak = [compose("outline-weak", share=0.31 + 0.01 * k) for k in range(len(rig))]
+    told = {
+        name: replace(s, quality=replace(s.quality, warnings=(weak[k],), usable=k < 2))
+        for k, (name, s) in enumerate(silhouettes.items())
+    }
+    with pytest.raises(TooFewViews) as refused:
+        judged(rig, told)
+    assert str(refused.value).count("hardly differs from the background") == 1
+    assert "the same is true of 8 more (cam03, " in str(refused.value)
+    warnings = view_warnings(told)
+    assert [warning.code for warning in warnings] == ["view-left-out", "view", "view"]
+    doubts = {name: replace(s, quality=replace(s.quality, doubts=(weak[0],))) for name, s in silhouettes.items()}
+    (doubt,) = view_warnings(doubts)
+    assert doubt.text.startswith("cam00: 31% of the contour")
+    assert "the same is true of 10 more (cam01, " in doubt.text
+
+
+def test_one_picture_in_all_cameras_is_named_as_such(seen: Seen) -> None:
+    rig, silhouettes = seen
+    picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    with pytest.raises(SamePictures, match=r"of 11 cameras hold no picture of their own.*give each camera its own"):
+        judged(rig, silhouettes, Capture(dict.fromkeys(rig.names, picture)))
+
+
 @pytest.mark.parametrize(
     ("kind", "remedy"),
     [("masks", "Correct these masks"), ("backgrounds", "Take new clean plates"), ("nothing", "Supply clean plates")],
@@ -87,6 +114,13 @@ def test_a_rig_in_another_unit_is_refused_before_a_fit(seen: Seen) -> None:
     rig, silhouettes = seen
     with pytest.raises(WrongScale, match=r"about 3\.\d times as large as a head"):
         judged(times(rig, 3.3), silhouettes)
+
+
+def test_masks_that_may_hold_the_face_alone_are_thought_of_before_the_unit(seen: Seen) -> None:
+    rig, silhouettes = seen
+    masked = Capture({}, masks={name: s.mask for name, s in silhouettes.items()})
+    with pytest.raises(WrongScale, match="masks of the whole head with hair and neck"):
+        judged(times(rig, 0.4), silhouettes, masked)
 
 
 def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
