@@ -24,7 +24,7 @@ from numba.core.dispatcher import Dispatcher
 from pipeline.compute.jit import KeptFunction, code_size
 
 LIST = Path(__file__).with_name("kernels.txt")
-PACKAGE = (__package__ or "pipeline.compute").removesuffix(".compute")  # "eigenhead.pipeline" in the wheel
+PACKAGE = (__package__ or "").rpartition(".")[0] or "pipeline"  # "eigenhead.pipeline" in the wheel
 _ARRAY = re.compile(r"(\w+)\[(\d)([CFA])\](r?)")
 _TUPLE = re.compile(r"(\d+)\*(\w+)")
 _NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")

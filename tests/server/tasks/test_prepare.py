@@ -21,7 +21,7 @@ from tests.support.disks import small_disk
 
 LINES = (
     "fusion.grid_kernels:grown bool[3C]",
-    "texture.vertex_colours_kernels:blend_views float32[2C] float32[3C] float64",
+    "texturing.vertex_colours_kernels:blend_views float32[2C] float32[3C] float64",
 )
 
 
