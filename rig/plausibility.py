@@ -73,7 +73,8 @@ def _principal_point_faults(rig: Rig) -> list[Message]:
     share = float(np.median(shares))
     if share <= 0.0 or abs(np.log(share)) < OTHER_SIZE or np.abs(shares / share - 1.0).max() > SIZE_SPREAD:
         return []
-    return [compose("intrinsics-of-other-size", share=share, factor=1.0 / share)]
+    told_share = float(f"{share:.2g}")  # principal points are not exactly in the middle
+    return [compose("intrinsics-of-other-size", share=told_share, factor=1.0 / told_share)]
 
 
 def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:

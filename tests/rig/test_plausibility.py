@@ -92,7 +92,7 @@ def test_principal_points_that_nobody_gave_are_named_once():
     assert fault.code == "principal-points-missing"
 
 
-@pytest.mark.parametrize(("factor", "size_share"), [(2.0, "2 times"), (0.5, "0.5 times"), (0.25, "0.25 times")])
+@pytest.mark.parametrize(("factor", "size_share"), [(2.0, "2.00 times"), (0.5, "0.50 times"), (0.25, "0.25 times")])
 def test_intrinsics_of_pictures_of_another_size_are_named_with_the_factor(factor, size_share):
     rig = default_layout()
     keys = ("fx", "fy", "cx", "cy")
@@ -102,7 +102,7 @@ def test_intrinsics_of_pictures_of_another_size_are_named_with_the_factor(factor
     ]
     (fault,) = rig_faults(Rig(tuple(other)))
     assert fault.text.startswith(f"the intrinsics are of pictures {size_share} as large")
-    assert f"by {1 / factor:g}," in fault.text
+    assert f"by {1 / factor:.2f}," in fault.text
 
 
 def test_a_focal_length_in_mm_is_named_and_not_its_lens():

@@ -111,7 +111,7 @@ TEMPLATES = {
     "picture-undecodable": "is no picture that can be decoded",
     "focal-length-absurd": "{camera}: a focal length of {focal_px:g} px is absurd for {size} pixels: of one in mm give mm times the picture's width in px, divided by the sensor's in mm",
     "principal-points-missing": "every principal point (cx, cy) is 0, the corner of the picture: give those of the calibration, in px; they lie near the middle, (width - 1) / 2 and (height - 1) / 2",
-    "intrinsics-of-other-size": "the intrinsics are of pictures {share:.2g} times as large as these, by their principal points: multiply fx, fy, cx and cy by {factor:.2g}, or give the pictures that were calibrated",
+    "intrinsics-of-other-size": "the intrinsics are of pictures {share:.2f} times as large as these, by their principal points: multiply fx, fy, cx and cy by {factor:.2f}, or give the pictures that were calibrated",
     "lens-unmet": "no ray meets {share:.0%} of its middle",
     "lens-shapeless": "it bends it out of all shape",
     "lens-absurd": "{camera}: the lens is absurd ({coefficients}; {what}): calibrate it again",

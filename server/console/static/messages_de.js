@@ -734,7 +734,7 @@ export default {
   "picture-undecodable": "ist kein lesbares Bild",
   "focal-length-absurd": "{camera}: Eine Brennweite von {focal_px:g} px ist unsinnig für {size} Pixel: von einer in mm die mm mal die Breite des Bildes in px geben, geteilt durch die des Sensors in mm",
   "principal-points-missing": "jeder Hauptpunkt (cx, cy) ist 0, die Ecke des Bildes: die der Kalibrierung in px geben; sie liegen nahe der Mitte, (width - 1) / 2 und (height - 1) / 2",
-  "intrinsics-of-other-size": "die inneren Parameter gehören zu Bildern, die nach ihren Hauptpunkten {share:.2g}-mal so groß sind wie diese: fx, fy, cx und cy mit {factor:.2g} malnehmen oder die kalibrierten Bilder geben",
+  "intrinsics-of-other-size": "die inneren Parameter gehören zu Bildern, die nach ihren Hauptpunkten {share:.2f}-mal so groß sind wie diese: fx, fy, cx und cy mit {factor:.2f} malnehmen oder die kalibrierten Bilder geben",
   "lens-unmet": "kein Strahl trifft {share:.0%} seiner Mitte",
   "lens-shapeless": "es verbiegt sie bis zur Unkenntlichkeit",
   "lens-absurd": "{camera}: Das Objektiv ist unsinnig ({coefficients}; {what}): neu kalibrieren",

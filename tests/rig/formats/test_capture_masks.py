@@ -51,7 +51,7 @@ def test_soft_masks_keep_their_greys_and_are_written_with_them(folder: Path, tmp
 
 def test_specks_apart_from_the_subject_are_taken_away_and_told(folder: Path) -> None:
     specked = BUST.astype(np.uint8) * np.uint8(255)
-    specked[3:6, 2:5] = 255
+    specked[3:7, 2:5] = 255
     specked[20, 60] = 255
     write(folder, "b", specked)
     capture, _ = read_capture(folder)
