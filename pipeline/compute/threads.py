@@ -6,18 +6,21 @@ a third of a fit.
 """
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from pipeline.compute.trace import Trace, active_trace, name_of
 from rig.errors import WrongVariable
 from rig.messages.message import compose
 
 THREADS, MAX_THREADS = "EIGENHEAD_THREADS", 512
 Result = TypeVar("Result")
-SLICES = 8  # of a loop: enough that threads end together
+SLICES = 8  # of a loop, at least: enough that threads end together
+TRACED_THREADS = 16  # for how many threads a trace of one cuts its loops
 
 
 def thread_count() -> int:
@@ -31,44 +34,112 @@ def thread_count() -> int:
     return int(requested)
 
 
+def slice_count(threads: int) -> int:
+    """Returns into how many slices a loop falls, at most: a power of two, so that more threads cut the same slices
+    finer."""
+    return max(SLICES, 1 << (2 * threads - 1).bit_length())
+
+
 def in_threads(count: int, work: Callable[[int, int], None]) -> None:
     """Runs ``work(first, last)`` over slices of ``range(count)``; for compiled loops that let go of the interpreter.
 
-    The caller takes slices like everyone else. A helper that has not begun when they are gone (all busy, or left behind
-    by a fork) is called off, so that nobody waits for it.
+    What comes out may not depend on how the range is cut. The caller takes slices like everyone else. A helper that has
+    not begun when they are gone (all busy, or left behind by a fork) is called off, so that nobody waits for it.
     """
-    threads = thread_count()
-    if threads == 1:
+    threads, trace = thread_count(), active_trace()
+    if trace is not None:
+        _traced(trace, count, work, name_of(work), threads)
+    elif threads == 1:
         work(0, count)
-        return
-    parts = max(1, min(SLICES, count))
-    slices = list(pairwise(count * k // parts for k in range(parts + 1)))[::-1]
-
-    def take() -> None:
-        while slices:
-            try:
-                first, last = slices.pop()
-            except IndexError:  # another was quicker
-                return
-            work(first, last)
-
-    helpers = [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
-    take()
-    for helper in helpers:
-        if not helper.cancel():
-            helper.result()
+    else:
+        _share(cut(count, slice_count(threads)), work, threads)
 
 
 def map_in_threads(work: Callable[[int], Result], count: int) -> list[Result]:
-    """Returns ``work(k)`` of every k below ``count``, in order; shared out as by ``in_threads``."""
+    """Returns ``work(k)`` of every k below ``count``, in order; shared out as by ``in_threads``, one at a time."""
     found: dict[int, Result] = {}
 
     def take(first: int, last: int) -> None:
         for k in range(first, last):
             found[k] = work(k)
 
-    in_threads(count, take)
+    threads, trace = thread_count(), active_trace()
+    if trace is not None:
+        _traced(trace, count, take, name_of(work), threads, single=True)
+    else:
+        _share(cut(count, count), take, threads)
     return [found[k] for k in range(count)]
+
+
+def cut(count: int, parts: int) -> list[tuple[int, int]]:
+    """Returns ``range(count)`` cut into so many slices, or into ones of one; one empty slice of an empty range."""
+    parts = max(1, min(parts, count))
+    return list(pairwise(count * k // parts for k in range(parts + 1)))
+
+
+def _share(slices: list[tuple[int, int]], work: Callable[[int, int], None], threads: int) -> None:
+    left = slices[::-1]
+
+    def take() -> None:
+        while left:
+            try:
+                first, last = left.pop()
+            except IndexError:  # another was quicker
+                return
+            work(first, last)
+
+    helpers = [_pool(threads - 1).submit(take) for _ in range(min(threads, len(slices)) - 1)]
+    take()
+    for helper in helpers:
+        if not helper.cancel():
+            helper.result()
+
+
+def _traced(
+    trace: Trace, count: int, work: Callable[[int, int], None], name: str, threads: int, *, single: bool = False
+) -> None:
+    """Runs a loop with spans of it and its slices; one thread cuts it as finely as many would, so that the trace tells
+    what they would have."""
+    loop = trace.new_loop()
+    parts = count if single else slice_count(threads if threads > 1 else TRACED_THREADS)
+
+    def timed(first: int, last: int) -> None:
+        with trace.span("slice", name, loop=loop, first=first, last=last):
+            work(first, last)
+
+    with trace.span("loop", name, loop=loop, count=count, single=single):
+        _share(cut(count, parts), timed, threads)
+
+
+@contextmanager
+def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
+    """Holds a pool of threads for the block, as many as share a loop unless it is said how many; its tasks are single
+    slices of a loop in the trace."""
+    threads, trace = threads or thread_count(), active_trace()
+    if trace is None:
+        with ThreadPoolExecutor(threads) as pool:
+            yield pool
+        return
+    loop = trace.new_loop()
+    with trace.span("loop", "task_pool", loop=loop, count=0, single=True), TracedPool(threads, trace, loop) as pool:
+        yield pool
+
+
+class TracedPool(ThreadPoolExecutor):
+    """Records each task as a slice of one loop."""
+
+    def __init__(self, threads: int, trace: Trace, loop: int) -> None:
+        super().__init__(threads, thread_name_prefix="tasks")
+        self._trace, self._loop = trace, loop
+
+    def submit(self, function: Callable[..., Result], /, *arguments: Any, **options: Any) -> Future[Result]:
+        """Hands a task over, in its span."""
+
+        def timed() -> Result:
+            with self._trace.span("slice", name_of(function), loop=self._loop):
+                return function(*arguments, **options)
+
+        return super().submit(timed)
 
 
 @cache

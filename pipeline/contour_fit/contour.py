@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.head_problem import started_problem
 from pipeline.contour_fit.noise_model import is_hairless, with_clutter_of_start, with_misfit
@@ -71,6 +72,7 @@ def fit_contour(
     return finish(solve_contour(model, world_from_head, silhouettes, rig, settings, features=features, report=report))
 
 
+@traced
 def solve_contour(
     model: HeadModel,
     world_from_head: Similarity,

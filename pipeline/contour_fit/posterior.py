@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
 from pipeline.head_model.gaussian_process import SCALES
 from pipeline.head_model.model import HeadModel
@@ -33,6 +34,7 @@ RELIEF_OF_OUTLINES = 2.0  # times what photographs add to a head: outlines show 
 EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance ratio
 
 
+@traced
 def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
     """Returns the fit with the covariance that follows from a prior whose variance is estimated from the fit itself.
 
@@ -71,6 +73,7 @@ def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
     return float(np.clip((fit.coefficients[modes] ** 2).sum() / determined, *VARIANCE_RANGE))
 
 
+@traced
 def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
     """Returns the standard deviation (mm) of every full-level vertex along its normal; zero where the fit has no
     covariance.

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from pipeline.compute.threads import thread_count
+from pipeline.compute.trace import traced
 from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE
 from pipeline.part_labels.codes import Part, codes_from_channels
@@ -22,6 +23,7 @@ EVERY = 4  # vertices of the head stand for the others
 TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage compares no others (angle_widest_deg)
 
 
+@traced
 def dense_points(
     depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh, settings: FineSettings
 ) -> SurfacePoints:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipeline.compute.trace import traced
 from pipeline.detail.association import associate, interpolated
 from pipeline.detail.surface_points import SurfacePoints
 from pipeline.estimation.robust import Cauchy
@@ -33,6 +34,7 @@ class OnFace:
     windowed_mm: Float[np.ndarray, " n"]
 
 
+@traced
 def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
     """Returns the points of skin near the fitted head's ``face`` (mm, world frame)."""
     vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()

@@ -16,6 +16,7 @@ import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse.linalg import splu
 
+from pipeline.compute.trace import traced
 from pipeline.detail.smooth_field import smooth_field
 from pipeline.head_model.model import HeadModel
 from rig.mesh import vertex_normals
@@ -91,6 +92,7 @@ def eye_fissure(model: HeadModel, side: str) -> Fissure:
     return Fissure(float(np.linalg.norm(chord)), off @ along, off @ above, front)
 
 
+@traced
 def measure_eye_appearance(
     model: HeadModel,
     vertices: Float[np.ndarray, "v 3"],

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.association import Associated, associate, interpolated
 from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
@@ -72,6 +73,7 @@ class DeformedSurface:
     lids: Mapping[str, float] = field(default_factory=dict)  # how far each eye is closed, where the model blinks
 
 
+@traced
 def refine_to_surface(
     fit: Fit,
     model: HeadModel,

@@ -16,6 +16,7 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 from scipy.sparse.linalg import SuperLU, splu
 
+from pipeline.compute.trace import traced
 from pipeline.detail.nodes import NodeMesh
 from pipeline.detail.smooth_field import SmoothField
 from pipeline.head_model.subdivision import row_count
@@ -82,6 +83,7 @@ class Posterior:
         return self.factor.solve(prior + self.rows.T @ noise)
 
 
+@traced
 def solve_field(field: SmoothField, directions: Directions, observed: Observed) -> Posterior:
     """Returns the field's posterior.
 

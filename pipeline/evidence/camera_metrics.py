@@ -1,14 +1,13 @@
 """How well a fitted head explains every camera: the figures of the report."""
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.problem import level_topology
 from pipeline.contour_fit.rim import find_rim, pack_views
@@ -83,7 +82,7 @@ def camera_figures(
             outside_rms_px=_rms(np.maximum(residual, 0.0), length) if spoke else None,
         )
 
-    with ThreadPoolExecutor(thread_count()) as pool:  # distance transforms release the interpreter lock
+    with task_pool() as pool:  # distance transforms release the interpreter lock
         return dict(zip(rig.names, pool.map(figures_of, range(len(rig)), rig), strict=True))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.compute.threads import map_in_threads
+from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction_kernels import BLOCK, mark_contradicted
 from pipeline.fusion.view_stack import ViewStack
 from pipeline.fusion.vote_kernels import OUTLINE
@@ -20,6 +21,7 @@ WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyo
 SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 
 
+@traced
 def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
     """Returns the views without the outlines that others contradict, and by view the share of its crop that was."""
 

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.threads import in_threads
+from pipeline.compute.trace import traced
 from pipeline.fusion.crossing_kernels import crossing_triangles, triangle_boxes
 from pipeline.fusion.grid_kernels import grown
 from pipeline.geometry.cells import sorted_into_cells
@@ -70,6 +71,7 @@ def _near(boxes: Float[np.ndarray, "f 6"], active: Bool[np.ndarray, " f"]) -> Bo
     return grown(taken)[tuple(cell.T)]
 
 
+@traced
 def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh, int]:
     """Returns the mesh without self-intersections, and how many of its vertices moved; with all vertices in their
     ``safe`` places it has none."""
@@ -91,6 +93,7 @@ def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh,
     return Mesh(vertices, faces), int(moved.sum())
 
 
+@traced
 def without_coincidences(mesh: Mesh) -> Mesh:
     """Moves vertices that lie at one place, to the precision of a file, towards their own neighbours: a program that
     merges vertices by place would join sheets there, and find the surface open."""

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 
+from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences, without_crossings
 from pipeline.fusion.net_kernels import component_of, compose_well
@@ -115,6 +116,7 @@ def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) 
             yield compose("mask-contradicted", camera=name, share=share)
 
 
+@traced
 def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
     """Returns the subject's piece of the zero level, and places of its vertices at which it cannot cross itself: the
     corners of the cubes about the inner nodes."""

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int32, Int64, UInt8
 
 from pipeline.compute.threads import in_threads
+from pipeline.compute.trace import traced
 from pipeline.fusion.refinement_kernels import measure, smooth_offsets
 from pipeline.fusion.view_stack import ViewStack
 from rig.mesh import Mesh, vertex_normals
@@ -29,6 +30,7 @@ class Measured:
     views: UInt8[np.ndarray, " v"]
 
 
+@traced
 def refine_vertices(mesh_world: Mesh, views: ViewStack, step_mm: float) -> tuple[Mesh, Measured]:
     """Returns the mesh with its vertices moved along their normals, and what the views say of the result."""
     starts, indices = neighbours(mesh_world.faces, len(mesh_world.vertices))

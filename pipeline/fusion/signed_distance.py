@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.compute.threads import in_threads
+from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
 from pipeline.fusion.grid import Grid, everywhere, marked_box, refined, whole_box
 from pipeline.fusion.prior import distance_to_head
@@ -107,6 +108,7 @@ def votes_at(grid: Grid, views: ViewStack) -> Votes:
     return Votes(value, weight, bound)
 
 
+@traced
 def solve(depth_maps: Sequence[DepthMap], views: ViewStack, head_world: Mesh | None, spacing_mm: float) -> Level:
     """Returns the field about the surface, on a grid of ``spacing_mm``."""
     halvings = 1

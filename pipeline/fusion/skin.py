@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 
+from pipeline.compute.trace import traced
 from pipeline.fusion.refinement import neighbours
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh
@@ -31,6 +32,7 @@ def part_of(head_world: Mesh, measured: Bool[np.ndarray, " v"]) -> Mesh:
     return Mesh(head_world.vertices, head_world.faces[measured[head_world.faces].all(axis=1)])
 
 
+@traced
 def drawn_to_skin(
     mesh_world: Mesh, skin: Float[np.ndarray, " v"], head_skin_world: Mesh, deviation_mm: Float[np.ndarray, " v"]
 ) -> Mesh:

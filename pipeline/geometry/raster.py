@@ -6,13 +6,12 @@ two. Vertices are projected exactly, lens distortion included; between them tria
 head of 48,000 vertices (edges of 2 to 5 px) bends by less than 0.001 px.
 """
 
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
+from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from rig.camera import Camera
@@ -35,9 +34,10 @@ def depth_map(
     )
 
 
+@traced
 def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
     """Returns what every camera of a rig sees of a mesh: camera z (mm) at each pixel, inf beside it."""
-    with ThreadPoolExecutor(thread_count()) as pool:  # compiled code releases the interpreter lock
+    with task_pool() as pool:  # compiled code releases the interpreter lock
         found = pool.map(lambda camera: depth_map(camera, mesh_world.vertices, mesh_world.faces)[0], rig)
         return dict(zip(rig.names, found, strict=True))
 

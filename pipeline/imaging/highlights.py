@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from pipeline.compute.threads import map_in_threads
+from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import interpolate, rasterise
@@ -72,6 +73,7 @@ class Excess:
     known: Bool[np.ndarray, "k v"]  # where enough views see the place
 
 
+@traced
 def without_highlights(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]],
     silhouettes: Mapping[str, Silhouette],

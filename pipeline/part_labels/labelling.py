@@ -11,14 +11,13 @@ A cap is told from hair only where it looks like the clothes below; both hide sk
 """
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.appearance_cells import Cells, head_guide, make_cells
 from pipeline.part_labels.codes import CHANNELS
@@ -108,7 +107,7 @@ def classify_parts(
         name = view.camera.name
         return PartMap(name, upsample_guided(view, mask, probabilities, images[name], masks[name], settings))
 
-    with ThreadPoolExecutor(thread_count()) as pool:  # OpenCV and numpy release the interpreter lock
+    with task_pool() as pool:  # OpenCV and numpy release the interpreter lock
         found = list(pool.map(one, cells, inside, rows))
     report("parts", 1.0)
     return {each.camera: each for each in found}

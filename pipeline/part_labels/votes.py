@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 
+from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
 from pipeline.part_labels.codes import Part, codes_from_channels
 from pipeline.part_labels.labelling import PartMap
@@ -33,6 +34,7 @@ class PartVotes:
     probability: Float[np.ndarray, "g 3"]
 
 
+@traced
 def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig: Rig) -> PartVotes | None:
     """Returns the votes of all known pixels.
 

@@ -7,14 +7,13 @@ The variance of a place is that of a shift between two signals of correlation rh
 so that texture, noise, defocus and grazing views all show in it. Gain and offset of a camera drop out.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
 from pipeline.contour_fit.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.contour_fit.rim import Views
 from pipeline.geometry.projection import project_points
@@ -111,7 +110,7 @@ def visibility_of(
         ends[:, seen] = here, further - here
         return facing, ends[0], ends[1]
 
-    with ThreadPoolExecutor(thread_count()) as pool:
+    with task_pool() as pool:
         facing, pixel, along = zip(*pool.map(one, range(len(cameras))), strict=True)
     return SampleVisibility(
         cameras, head_world.vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along)

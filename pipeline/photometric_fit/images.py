@@ -1,14 +1,13 @@
 """The photographs as photo-consistency reads them: grey, with their noise, blurred to the size that is asked for."""
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.compute.threads import map_in_threads, thread_count
+from pipeline.compute.threads import map_in_threads, task_pool
 from pipeline.contour_fit.rim import Views
 from pipeline.imaging.grey import LUMINANCE, noise_level
 
@@ -63,6 +62,6 @@ def blurred(
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
     """Returns all images, blurred, in one row, and the noise that is left: white noise falls by 2 sqrt(pi) sigma."""
     sigma = np.maximum(sigma_px, MIN_BLUR_PX)
-    with ThreadPoolExecutor(thread_count()) as pool:
+    with task_pool() as pool:
         smooth = pool.map(lambda i, s: cv2.GaussianBlur(i, (0, 0), s).ravel(), photographs.grey, sigma.tolist())
         return np.concatenate(list(smooth)), photographs.noise / (2.0 * np.sqrt(np.pi) * sigma)

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.compute.array_cache import cached_arrays
+from pipeline.compute.trace import traced
 from pipeline.contour_fit.contour import ContourSolution, run_stage
 from pipeline.contour_fit.problem import PhotoEvidence, Stage, StageEvidence, State, SurfaceObservations, widened
 from pipeline.contour_fit.surface_term import surface_residual
@@ -43,6 +44,7 @@ MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's o
 # variance badly, all of them together well. So 95 % intervals hold 91 to 98 % of a scan and four draws
 
 
+@traced
 def refine_with_photographs(
     solved: ContourSolution,
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],

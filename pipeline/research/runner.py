@@ -26,6 +26,7 @@ from pipeline.research.paper.robustness import robustness
 from pipeline.research.paper.views import views
 from pipeline.research.people.expressions import expressions
 from pipeline.research.people.people import people
+from pipeline.research.speed.scaling import JobCommand, scaling
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
 from pipeline.research.surface.relief import relief
@@ -61,7 +62,8 @@ class Options:
 
     ``simplex``: how many subjects of a table the simplex fits too; ``captures``: whether those of the shared folder
     count beside the studio's heads; ``openmvs``: that peer's programs. Of people and
-    relief ``folders`` are the captures, of people ``only`` says which of its rows, ``detail`` how deep.
+    relief ``folders`` are the captures, of people ``only`` says which of its rows, ``detail`` how deep; scaling runs
+    ``job`` on the ``folders``.
     """
 
     simplex: int | None = None
@@ -70,6 +72,7 @@ class Options:
     folders: tuple[Path, ...] = ()
     only: tuple[str, ...] = ()
     detail: str | None = None
+    job: JobCommand | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,6 +250,16 @@ def _relief(task: Task) -> Outcome:
         )
 
 
+def _scaling(task: Task) -> Outcome:
+    if task.options.job is None:
+        raise InputError("scaling", ["runs jobs of the command line, and there is none"])
+    captures = list(task.options.folders) or [task.shared / "captures" / "scan-a"]
+    missing = [str(path) for path in captures if not path.exists()]
+    if missing:
+        raise InputError(", ".join(missing), ["is not at hand: name captures, or --shared"])
+    return scaling(captures, command=task.options.job, report=task.report, folder=task.folder)
+
+
 def _templates(task: Task) -> Outcome:
     count = {"draws": task.subjects} if task.subjects else {}
     facekit = _facekit(task.shared)
@@ -287,6 +300,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "texture": _texture,
     "light": _drawn(light),
     "templates": _templates,
+    "scaling": _scaling,
 }
 
 

@@ -7,13 +7,12 @@ https://jfly.uni-koeln.de/color/); a dark rim keeps them readable on any image.
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
 from pipeline.geometry.raster import picture
 from pipeline.imaging.contour_distance import chamfer
 from pipeline.imaging.masks import box_around
@@ -114,7 +113,7 @@ def turntable(
         drawn = picture(camera, mesh_head.vertices, mesh_head.faces, colours, PAPER)
         return np.asarray(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA), np.uint8)
 
-    with ThreadPoolExecutor(thread_count()) as pool:  # the rasteriser releases the interpreter lock
+    with task_pool() as pool:  # the rasteriser releases the interpreter lock
         return list(pool.map(draw, np.radians(AZIMUTHS_DEG)))
 
 

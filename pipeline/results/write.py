@@ -12,11 +12,11 @@ Files of the same input, model, settings and version are the same bytes, report.
 """
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
+from pipeline.compute.threads import task_pool
 from pipeline.results.head_files import write_head
 from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
@@ -43,7 +43,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
     temporary name first. Raises OSError where the disk is full."""
     capture = reassign_images(capture, pictures=result.views.assignment)
     head, blendshape_rig = head_mesh(result), result.evidence.blendshape_rig
-    with ThreadPoolExecutor(max_workers=THREADS) as pool:
+    with task_pool(THREADS) as pool:
         jobs = [
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),

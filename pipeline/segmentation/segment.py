@@ -9,14 +9,13 @@ False where it would hurt a fit, and ``quality.warnings`` say why. Operator mask
 """
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
 from pipeline.imaging.contour_distance import distance_to_level
 from pipeline.imaging.masks import dilated, eroded
 from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from_mask
@@ -56,7 +55,7 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
     if blind:
         raise InputError("capture", [compose("neither-plate-nor-mask", camera=name) for name in blind])
     silhouettes: dict[str, Silhouette] = {}
-    with ThreadPoolExecutor(thread_count()) as pool:  # cv2 and the compiled kernels release the interpreter lock
+    with task_pool() as pool:  # cv2 and the compiled kernels release the interpreter lock
         from_masks = {
             name: pool.submit(_operators, capture.masks[name], capture.soft_masks.get(name), settings)
             for name in rig.names & capture.masks.keys()
@@ -113,7 +112,7 @@ def _searched(
     found = decide_without_plates(
         capture.images, rig, settings, head=head, report=lambda share: report("segmentation", 0.8 * share)
     )
-    with ThreadPoolExecutor(thread_count()) as pool:
+    with task_pool() as pool:
         jobs = {n: pool.submit(_refined, capture.images[n], one, settings) for n, one in found.decisions.items()}
         jobs |= {n: pool.submit(_as_cut, share, settings) for n, share in found.shares.items()}
         silhouettes = {name: _doubted(jobs[name].result(), settings) for name in rig.names}

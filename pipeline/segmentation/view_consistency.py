@@ -12,14 +12,14 @@ the others: mask of theirs behind which it alone leaves nothing. True masks cont
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
+from pipeline.compute.trace import traced
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import depth_of, hull_extent
 from pipeline.settings import SegmentationSettings
@@ -66,10 +66,11 @@ def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRI
         depth = np.where(inside, silhouettes[camera.name].distance[at[:, 1], at[:, 0]], -np.inf)
         return where, radius, inside, depth > radius, depth
 
-    with ThreadPoolExecutor(thread_count()) as pool:  # NumPy releases the interpreter lock
+    with task_pool() as pool:  # NumPy releases the interpreter lock
         return Votes(*(np.array(values) for values in zip(*pool.map(vote, rig), strict=True)))
 
 
+@traced
 def judge_agreement(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
@@ -92,7 +93,7 @@ def judge_agreement(
     votes = cast_votes(silhouettes, believed)
     judged = dict(silhouettes)
     masks = [silhouettes[name].mask for name in trusted]
-    with ThreadPoolExecutor(thread_count()) as pool:
+    with task_pool() as pool:
         shares = [*pool.map(lambda k: _shares(votes, k, masks[k]), range(len(trusted)))]
         suspects = [k for k, (_, missing) in enumerate(shares) if missing > settings.missing_share_warned]
         contradicted = dict(zip(suspects, pool.map(lambda k: _contradicted(votes, k, masks), suspects), strict=True))

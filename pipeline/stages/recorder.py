@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Concatenate, Generic, ParamSpec, TypeVar
 
+from pipeline.compute.trace import span
 from pipeline.stages.context import ReconstructionContext
 from pipeline.warnings import ReportWarning
 from rig.progress import Progress
@@ -60,7 +61,8 @@ class Recorder:
     def __call__(self, stage: Stage[P, T], context: ReconstructionContext, *products: P.args, **options: P.kwargs) -> T:
         self._progress(stage.name, 0.0)
         began = time.perf_counter()
-        staged = stage(context.within_stage(stage.name), *products, **options)
+        with span("stage", stage.name):
+            staged = stage(context.within_stage(stage.name), *products, **options)
         self._seconds[stage.name] = self._seconds.get(stage.name, 0.0) + time.perf_counter() - began
         self._warnings += staged.warnings
         return staged.product

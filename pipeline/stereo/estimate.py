@@ -16,6 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import UInt8
 
+from pipeline.compute.trace import traced
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import hull_extent
 from pipeline.settings import DenseSettings
@@ -42,6 +43,7 @@ ROUNDS = (2, 2, 1)  # of least squares
 DONE = {2: 0.4, 1: 0.6, 0: 0.95}  # share of the work, by level
 
 
+@traced
 def estimate_depth(
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
     silhouettes: Mapping[str, Silhouette],

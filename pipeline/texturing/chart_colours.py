@@ -7,14 +7,13 @@ mean of those that did: the balance of the views levels the rest.
 """
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
 from pipeline.imaging.chart_plates import charts_in
 from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal
 from pipeline.texturing.light import BAND_FACTORS, Light, harmonics
@@ -39,7 +38,7 @@ class ChartColours:
 
 def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
     """Returns what the charts in all clean plates say of the cameras; a warning where none is found."""
-    with ThreadPoolExecutor(thread_count()) as pool:
+    with task_pool() as pool:
         charts = pool.map(charts_in, [capture.backgrounds.get(name, ()) for name in rig.names])
         return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
 
@@ -63,7 +62,7 @@ def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
         correction = colours.cameras.get(name)
         return in_true_colours(capture.images[name], mean if correction is None else correction.matrix)
 
-    with ThreadPoolExecutor(thread_count()) as pool:
+    with task_pool() as pool:
         return replace(capture, images=dict(zip(capture.images, pool.map(corrected, capture.images), strict=True)))
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Bool
 
+from pipeline.compute.trace import traced
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
 from pipeline.texturing.layout.model_layout import ModelLayout, model_layout
@@ -28,6 +29,7 @@ def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | Non
         return None, [*warnings, compose("no-texture-layout", reason=reason.message)]
 
 
+@traced
 def paint_head(
     layout: ModelLayout | None, mesh: Mesh, coloured: Texture, face_region: Bool[np.ndarray, " v"], settings: Settings
 ) -> Atlas | None:

@@ -12,13 +12,13 @@ cameras that had to be raised or lowered much, and a smooth fill where no camera
 """
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
+from pipeline.compute.trace import traced
 from pipeline.geometry.raster import camera_depths
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
@@ -64,6 +64,7 @@ class Texture:
     warnings: tuple[ReportWarning, ...] = ()
 
 
+@traced
 def texture(
     mesh_world: Mesh,
     normals: Float[np.ndarray, "v 3"],
@@ -92,7 +93,7 @@ def texture(
         sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
         return sight, image
 
-    with ThreadPoolExecutor(thread_count()) as pool:  # the compiled kernels release the interpreter lock
+    with task_pool() as pool:  # the compiled kernels release the interpreter lock
         found = list(pool.map(look, views))
     weights, colours = _stacked([sight for sight, _ in found])
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))

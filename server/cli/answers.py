@@ -25,15 +25,15 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 class CannotWrite(EigenheadError):
     """An output that cannot be written, found before the work."""
 
-    def __init__(self, path: Path, error: OSError) -> None:
-        super().__init__(f"{path} cannot be written ({error.strerror or error}); name another place with --out")
+    def __init__(self, path: Path, error: OSError, option: str = "--out") -> None:
+        super().__init__(f"{path} cannot be written ({error.strerror or error}); name another place with {option}")
 
 
 class SpoilsCapture(EigenheadError):
     """An output that would be read as a part of its own input from then on."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(f"{path} lies where the capture's own pictures do; name another place with --out")
+    def __init__(self, path: Path, option: str = "--out") -> None:
+        super().__init__(f"{path} lies where the capture's own pictures do; name another place with {option}")
 
 
 class Overwrites(EigenheadError):
@@ -136,7 +136,7 @@ def wrong_usage(option: str) -> Iterator[None]:
         raise typer.BadParameter("; ".join(texts_of(error.faults)), param_hint=option) from error
 
 
-def prepare_file(path: Path, *, overwrite: bool = True) -> None:
+def prepare_file(path: Path, *, overwrite: bool = True, option: str = "--out") -> None:
     """Makes the folder of an output file and tries whether it can be written, before the work that it takes.
 
     Raises CannotWrite, and Overwrites where the file is there and shall stay."""
@@ -149,7 +149,7 @@ def prepare_file(path: Path, *, overwrite: bool = True) -> None:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        raise CannotWrite(path, error) from error
+        raise CannotWrite(path, error, option) from error
 
 
 def prepare_folder(path: Path) -> None:

@@ -1,13 +1,17 @@
 """The command that repeats the paper's experiments, and runs ours."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 from server.cli.answers import Json, answer, chosen, progress_bar
+from server.processes import python_command, python_environment
+
+if TYPE_CHECKING:
+    from pipeline.research.speed.scaling import JobCommand
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -23,7 +27,7 @@ def experiments(
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
             "exchanges, false-alarms, posterior, views, repeat, relief, span, detail, hidden, expressions, visible, "
-            "people, planted, surfaces, texture, light, templates or real."
+            "people, planted, surfaces, texture, light, templates, scaling or real."
         ),
     ],
     *,
@@ -31,7 +35,7 @@ def experiments(
         list[Path] | None,
         typer.Argument(
             help="real: captures, or photographs alone, of more views than are used. people: captures with a truth "
-            "beside them, relief: any captures; those of --shared by default."
+            "beside them, relief: any captures; those of --shared by default. scaling: captures, scan-a by default."
         ),
     ] = None,
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
@@ -64,13 +68,13 @@ def experiments(
     if name == "real":
         _experiment_real(folders or [], model, front, outlines, out, json_out)
         return
-    if folders and name not in ("people", "relief"):
-        raise typer.BadParameter("only real, people and relief take folders", param_hint="FOLDERS")
+    if folders and name not in ("people", "relief", "scaling"):
+        raise typer.BadParameter("only real, people, relief and scaling take folders", param_hint="FOLDERS")
     if (only or detail) and name != "people":
         raise typer.BadParameter("only people takes it", param_hint="--only" if only else "--detail")
     from pipeline.research.runner import Options, run_experiment
 
-    options = Options(simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail)
+    options = Options(simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail, _job_command())
     with progress_bar() as report:
         found = run_experiment(
             name, model=model, subjects=subjects, shared=shared, folder=out, report=report, options=options
@@ -85,6 +89,12 @@ def check_research() -> None:
         from pipeline import research  # noqa: F401
     except ImportError:
         raise EigenheadError(compose("research-not-carried")) from None
+
+
+def _job_command() -> "JobCommand":
+    from pipeline.research.speed.scaling import JobCommand
+
+    return JobCommand(python_command("cli", "reconstruct"), python_environment())
 
 
 def _experiment_real(

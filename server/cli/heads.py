@@ -113,6 +113,14 @@ def reconstruct(
         ),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write there what ran on which thread when, for Perfetto or chrome://tracing.",
+            metavar="FILE",
+            dir_okay=False,
+        ),
+    ] = None,
     data: Data = None,
     json_out: Json = False,
 ) -> None:
@@ -128,7 +136,7 @@ def reconstruct(
     options = {"outputs": outputs or None, "texture": {"chart": True} if chart else None}
     document = settings_document(settings, method=method, front=front, detail=detail, **options)
     with progress_bar() as report:
-        written = reconstruct_locally(capture, out, model=model, settings=document, report=report)
+        written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
     for warning in written["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
     names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # as they should be looked at

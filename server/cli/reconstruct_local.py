@@ -6,10 +6,11 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rig.atomic_write import write_atomically
 from rig.formats.capture_folder import capture_root
 from rig.formats.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
-from server.cli.answers import CannotWrite, SpoilsCapture
+from server.cli.answers import CannotWrite, SpoilsCapture, prepare_file
 from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
 from server.tasks.child import WorkerContext
@@ -22,11 +23,18 @@ if TYPE_CHECKING:
 
 
 def reconstruct_locally(
-    capture: Path, out: Path, *, model: str | None, settings: Mapping[str, object], report: Progress
+    capture: Path,
+    out: Path,
+    *,
+    model: str | None,
+    settings: Mapping[str, object],
+    report: Progress,
+    trace: Path | None = None,
 ) -> "ReportDocument":
     """Reconstructs a capture folder or archive into ``out`` and returns report.json; cameras and masks that had to be
     found are kept in ``out``, whatever comes after. What can be wrong with settings, model, template,
-    capture and ``out`` is found before anything heavy is loaded."""
+    capture, ``out`` and ``trace`` is found before anything heavy is loaded. In ``trace`` is what ran when, also of
+    a job that failed."""
     from pipeline.settings import settings_from_document
     from pipeline.templates.header import check_template
 
@@ -34,7 +42,10 @@ def reconstruct_locally(
     chosen = settings_from_document(settings)
     check_template(chosen.outputs.template, model or "default")
     _check_apart(out, capture)
-    with _result_folder(out) as fresh, folder_of(capture) as folder:
+    if trace is not None:
+        _check_apart(trace.parent, capture, "--trace")
+        prepare_file(trace, option="--trace")
+    with _traced(trace), _result_folder(out) as fresh, folder_of(capture) as folder:
         _reconstruct_folder(folder, fresh, kept=out, model=model, chosen=chosen, report=report)
         document = json.loads((fresh / "report.json").read_text(encoding="utf-8"))
     return document
@@ -59,7 +70,7 @@ def _reconstruct_folder(
     durations.learn(chosen, progress.finish())
 
 
-def _check_apart(out: Path, capture: Path) -> None:
+def _check_apart(out: Path, capture: Path, option: str = "--out") -> None:
     """Raises SpoilsCapture where the pictures of a result would be taken for the capture's."""
     from server.tasks.photographs import photographs_alone
 
@@ -70,7 +81,24 @@ def _check_apart(out: Path, capture: Path) -> None:
     pictures += [picture_folder(root)] if photographs_alone(root) else []  # any folder there is a camera's
     beside_root = place.is_relative_to(whole) and not place.is_relative_to(root)  # which is told by being alone
     if place == root or beside_root or any(place.is_relative_to(folder) for folder in pictures):
-        raise SpoilsCapture(out)
+        raise SpoilsCapture(out, option)
+
+
+@contextmanager
+def _traced(path: Path | None) -> Iterator[None]:
+    """Records the block, and writes what ran in it to ``path``, however it ends."""
+    if path is None:
+        yield
+        return
+    from pipeline.compute.threads import thread_count
+    from pipeline.compute.trace import Trace, recorded
+
+    trace = Trace()
+    try:
+        with recorded(trace):
+            yield
+    finally:
+        write_atomically(path, trace.encoded(threads=thread_count()))
 
 
 @contextmanager

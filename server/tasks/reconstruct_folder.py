@@ -45,12 +45,15 @@ def reconstruct_folder(
     whatever comes after; ``preparation`` is told of what comes before the first stage: cameras, loops.
 
     Raises what the pipeline raises, and OSError for a full disk."""
+    from pipeline.compute.trace import span
     from server.tasks.photographs import keep_masks, read_or_calibrate
     from server.tasks.prepare import prepare_kernels
 
-    prepared = read_or_calibrate(folder, kept, front=chosen.front, report=preparation)
+    with span("stage", "read"):
+        prepared = read_or_calibrate(folder, kept, front=chosen.front, report=preparation)
     kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
-    context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))
+    with span("stage", "compiling"):
+        context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))
     from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
@@ -60,9 +63,10 @@ def reconstruct_folder(
 
     report("read", 0.0)
     name = model or "default"
-    head_model = context.keep(f"model {name}", lambda: load_model(name))
-    template = load_template(chosen.outputs.template, head_model)
-    renderer = context.keep("renderer", Renderer.create)
+    with span("stage", "read"):
+        head_model = context.keep(f"model {name}", lambda: load_model(name))
+        template = load_template(chosen.outputs.template, head_model)
+        renderer = context.keep("renderer", Renderer.create)
     segment = partial(keep_masks, kept)
     reconstruction = ReconstructionContext(
         prepared.capture, prepared.rig, head_model, chosen, renderer, report, segment
@@ -70,7 +74,8 @@ def reconstruct_folder(
     done = reconstruct(reconstruction)
     done = replace(done, warnings=(*prepared.warnings, *done.warnings))
     report("write", 0.0)
-    write_result(out, done, prepared.capture, template)
+    with span("stage", "write"):
+        write_result(out, done, prepared.capture, template)
 
 
 def reconstruct_beside(

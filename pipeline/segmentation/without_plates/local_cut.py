@@ -6,14 +6,13 @@ are asked again: what is left of the surroundings in one, another view's edge de
 """
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import task_pool
 from pipeline.imaging.masks import dilated, eroded
 from pipeline.segmentation.mean_field_kernels import MAX_ODDS
 from pipeline.segmentation.without_plates.viewing_volume import ViewingVolume, ask_other_views
@@ -96,7 +95,7 @@ def cut_views(
     for step, bands in enumerate(BANDS):
         if step:
             wide = _carved(shares, masks, volume)
-        with ThreadPoolExecutor(thread_count()) as pool:
+        with task_pool() as pool:
             cuts = {name: pool.submit(cut_along, images[name], wide[name], bands) for name in images}
             for count, (name, cut) in enumerate(cuts.items(), 1):
                 shares[name] = cut.result()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.compute.threads import SLICES, in_threads, map_in_threads, thread_count
+from pipeline.compute.threads import SLICES, cut, in_threads, map_in_threads, slice_count, thread_count
 from rig.errors import InputError
 
 
@@ -37,6 +37,14 @@ def test_as_many_threads_work_as_are_asked_for(threads: int, monkeypatch: pytest
 
     in_threads(SLICES, work)
     assert len(seen) == threads
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 30, 1000])
+def test_more_threads_cut_the_same_slices_finer(count: int) -> None:
+    assert [slice_count(threads) for threads in (1, 2, 4, 8, 9, 16)] == [8, 8, 8, 16, 32, 32]
+    coarse, fine = ({first for first, _ in cut(count, slice_count(threads))} for threads in (4, 16))
+    assert coarse <= fine
+    assert sum(last - first for first, last in cut(count, slice_count(16))) == count
 
 
 @pytest.mark.parametrize("threads", ["1", "3"])
@@ -74,7 +82,7 @@ def test_an_error_of_any_slice_reaches_the_caller(monkeypatch: pytest.MonkeyPatc
 def test_no_stage_has_a_number_of_threads_of_its_own() -> None:
     """Every pool of the pipeline is as large as EIGENHEAD_THREADS says, but for writing, which waits for the disk."""
     root = Path(__file__).resolve().parents[3] / "pipeline"
-    pools = {path.relative_to(root).as_posix(): path.read_text() for path in root.rglob("*.py")}
-    sizes = {name: set(re.findall(r"with ThreadPoolExecutor\((.*?)\) as", text)) for name, text in pools.items()}
-    odd = {name: found - {"thread_count()"} for name, found in sizes.items() if found - {"thread_count()"}}
-    assert odd == {"results/write.py": {"max_workers=THREADS"}}
+    sources = {path.relative_to(root).as_posix(): path.read_text() for path in root.rglob("*.py")}
+    assert [name for name, text in sources.items() if "ThreadPoolExecutor(" in text] == ["compute/threads.py"]
+    sizes = {name: set(re.findall(r"with task_pool\((.*?)\) as", text)) for name, text in sources.items()}
+    assert {name: found for name, found in sizes.items() if found - {""}} == {"results/write.py": {"THREADS"}}

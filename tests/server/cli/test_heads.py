@@ -1,12 +1,15 @@
 """What the commands that make heads say beside their answer."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
+from pipeline.compute.trace import active_trace, span
+from rig.errors import EigenheadError
 from server.cli import reconstruct_local
 from server.cli.answers import SpoilsCapture
 from server.cli.main import app
@@ -81,6 +84,45 @@ def test_a_result_never_lies_among_the_pictures_of_its_capture(inside: str, encl
                 capture, out, model=None, settings={}, report=lambda stage, share: None
             )
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_trace_is_written_of_every_job_and_may_lie_in_the_result(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fails: bool
+) -> None:
+    def reconstructed(folder: Path, out: Path, **named: Any) -> None:
+        with span("stage", "fit"):
+            if fails:
+                raise OSError("no head")
+        (out / "report.json").write_text("{}")
+
+    monkeypatch.setattr(reconstruct_local, "_reconstruct_folder", reconstructed)
+    capture, out = small_capture(tmp_path / "capture"), tmp_path / "out"
+    with pytest.raises(OSError, match="no head") if fails else nullcontext():
+        reconstruct_local.reconstruct_locally(
+            capture, out, model=None, settings={}, report=lambda stage, share: None, trace=out / "trace.json"
+        )
+    events = json.loads((out / "trace.json").read_text())["traceEvents"]
+    assert [event["name"] for event in events if event["ph"] == "X"] == ["job", "fit"]
+    assert (out / "report.json").exists() is not fails
+    assert active_trace() is None
+
+
+def test_a_trace_that_cannot_be_written_or_spoils_the_capture_is_refused_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(reconstruct_local, "_reconstruct_folder", lambda *_, **__: pytest.fail("the work began"))
+    capture = small_capture(tmp_path / "capture")
+    (tmp_path / "file").write_text("x")
+    for place, why in {
+        capture / "cameras.json": "lies where the capture's own pictures do; name another place with --trace",
+        tmp_path / "file" / "trace.json": "cannot be written .* name another place with --trace",
+    }.items():
+        before = sorted(tmp_path.rglob("*"))
+        arguments = ["reconstruct", str(capture), "--out", str(tmp_path / "out"), "--trace", str(place)]
+        with pytest.raises(EigenheadError, match=why):
+            CliRunner().invoke(app, arguments, catch_exceptions=False)
+        assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_result_never_looks_like_a_camera_s_folder_of_photographs(tmp_path: Path) -> None:

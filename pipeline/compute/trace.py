@@ -1,0 +1,125 @@
+"""What runs on which thread when, recorded for Chrome's trace viewer and Perfetto, and for ``experiments scaling``.
+
+Nothing is recorded, and nothing but one test is paid, unless a trace is active. Stages, parts of stages, shared loops
+and their slices are spans of one thread each; those of one thread nest. Wall clock and processor seconds stand side by
+side: on a busy machine only the latter say what work there was.
+"""
+
+import functools
+import json
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from itertools import count
+from typing import Any, Literal, ParamSpec, TypeVar
+
+FORMAT = "eigenhead-trace/1"
+JOB = "job"
+Kind = Literal["job", "stage", "part", "loop", "slice"]
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Trace:
+    """Collects spans of all threads of this process, from when it is made."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter_ns()
+        self._before_s = time.process_time()  # what a start loads, of which there are no spans
+        self._events: list[dict[str, Any]] = []  # to append is atomic
+        self._threads: dict[int, str] = {}
+        self._loops = count()
+
+    def new_loop(self) -> int:
+        """Returns a number that no other loop of this trace has."""
+        return next(self._loops)
+
+    @contextmanager
+    def span(self, kind: Kind, name: str, **arguments: object) -> Iterator[None]:
+        """Records the block as one span of the calling thread, with that thread's processor seconds as ``cpu_s`` and,
+        but for loops and slices, those of all threads as ``process_cpu_s``. A block that raises is recorded, too."""
+        whole = kind not in ("loop", "slice")
+        before_s, process_s = time.thread_time(), time.process_time() if whole else 0.0
+        began = time.perf_counter_ns()
+        try:
+            yield
+        finally:
+            ended = time.perf_counter_ns()
+            if whole:
+                arguments["process_cpu_s"] = time.process_time() - process_s
+            self._record(kind, name, began, ended, {"cpu_s": time.thread_time() - before_s} | arguments)
+
+    def _record(self, kind: Kind, name: str, began: int, ended: int, arguments: dict[str, object]) -> None:
+        thread = threading.get_native_id()
+        self._threads.setdefault(thread, threading.current_thread().name)
+        times = {"ts": (began - self._began) / 1000, "dur": (ended - began) / 1000}  # microseconds
+        event = {"ph": "X", "cat": kind, "name": name, "pid": os.getpid(), "tid": thread}
+        self._events.append(event | times | {"args": arguments})
+
+    def encoded(self, *, threads: int) -> bytes:
+        """Returns the trace as JSON for Chrome's viewer, an event a line: the threads' names and complete events by
+        start. ``threads`` is how many shared a loop."""
+        header = {
+            "format": FORMAT,
+            "displayTimeUnit": "ms",
+            "threads": threads,
+            "cpus": len(os.sched_getaffinity(0)),
+            "before_cpu_s": self._before_s,
+        }
+        names: list[dict[str, Any]] = [
+            {"ph": "M", "name": "thread_name", "pid": os.getpid(), "tid": thread, "args": {"name": name}}
+            for thread, name in self._threads.items()
+        ]
+        events = names + sorted(self._events, key=lambda event: (event["ts"], -event["dur"]))
+        lines = ",\n".join(json.dumps(event) for event in events)
+        return f'{json.dumps(header)[:-1]}, "traceEvents": [\n{lines}\n]}}\n'.encode()
+
+
+_active: Trace | None = None
+
+
+def active_trace() -> Trace | None:
+    """Returns the trace that is recorded into, on any thread."""
+    return _active
+
+
+@contextmanager
+def recorded(trace: Trace | None) -> Iterator[None]:
+    """Records all spans of the block into ``trace``, as one job; None records nothing. One job a process at a time."""
+    global _active
+    if trace is None:
+        yield
+        return
+    earlier, _active = _active, trace
+    try:
+        with trace.span("job", JOB):
+            yield
+    finally:
+        _active = earlier
+
+
+def span(kind: Kind, name: str) -> AbstractContextManager[None]:
+    """Records the block, where a trace is active."""
+    return nullcontext() if _active is None else _active.span(kind, name)
+
+
+def traced(function: Callable[P, T]) -> Callable[P, T]:
+    """Makes the decorated function a part of the stage that calls it, under its name."""
+
+    @functools.wraps(function)
+    def timed(*arguments: P.args, **options: P.kwargs) -> T:
+        with span("part", name_of(function)):
+            return function(*arguments, **options)
+
+    return timed
+
+
+def name_of(function: Callable[..., object]) -> str:
+    """Returns where a loop stands: its module below the pipeline, and the function that holds it."""
+    inner = function
+    while isinstance(inner, functools.partial):
+        inner = inner.func
+    held = getattr(inner, "__qualname__", type(inner).__qualname__).split(".<locals>")[0]
+    return f"{inner.__module__.removeprefix('pipeline.')}.{held}"

@@ -1,0 +1,176 @@
+"""How long a job would take on more cores, by the processor seconds of its slices in a trace.
+
+What is in no shared loop stays as it is: it takes one core. A loop's slices are scheduled as ``parallel_for`` does it,
+the next one to whoever is free first. Cores are all alike and do not hold each other up (no memory that is too slow, no
+interpreter lock), so that the seconds are a bound from below; nested loops have the cores that the slices around them
+leave.
+"""
+
+import heapq
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from pipeline.compute.threads import cut, slice_count
+from pipeline.compute.trace import FORMAT
+
+WHOLE = ("job", "stage", "part")
+
+
+@dataclass(slots=True, eq=False)
+class Slice:
+    """Holds a slice's processor seconds, those of loops within left out, and these loops."""
+
+    first: int
+    serial_s: float
+    loops: "list[Loop]" = field(default_factory=list)
+
+    def seconds(self, cores: int) -> float:
+        """Returns how long it takes where so many cores are free for the loops within."""
+        return self.serial_s + sum(loop.seconds(cores) for loop in self.loops)
+
+
+@dataclass(slots=True, eq=False)
+class Loop:
+    """Holds a loop over ``count`` items as it was cut; the slices of a ``single`` one are cut no coarser."""
+
+    name: str
+    count: int
+    single: bool
+    slices: list[Slice] = field(default_factory=list)
+
+    def seconds(self, cores: int) -> float:
+        """Returns how long the loop takes on so many cores, cut for them."""
+        groups = self._groups(cores)
+        within = max(1, cores // max(1, len(groups)))
+        return schedule([sum(part.seconds(within) for part in group) for group in groups], cores)
+
+    def _groups(self, cores: int) -> list[list[Slice]]:
+        """The recorded slices by the coarser ones that so many threads make."""
+        ordered = sorted(self.slices, key=lambda part: part.first)
+        if self.single:
+            return [[part] for part in ordered]
+        bounds = cut(self.count, slice_count(cores))
+        groups = ([part for part in ordered if first <= part.first < last] for first, last in bounds)
+        return [group for group in groups if group]
+
+
+@dataclass(slots=True, eq=False)
+class Section:
+    """Holds a stage or a part of one: its visits' processor seconds of all threads, and the loops that it shares."""
+
+    name: str
+    cpu_s: float = 0.0
+    loops: list[Loop] = field(default_factory=list)
+
+    @property
+    def shared_s(self) -> float:
+        """Returns the processor seconds within shared loops."""
+        return sum(loop.seconds(1) for loop in self.loops)
+
+    @property
+    def serial_s(self) -> float:
+        """Returns the processor seconds that no other core can take over."""
+        return max(0.0, self.cpu_s - self.shared_s)
+
+    def seconds(self, cores: int) -> float:
+        return self.serial_s + sum(loop.seconds(cores) for loop in self.loops)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JobWork:
+    """Holds what a job worked: by stage in their order, ``start`` (what was loaded before) and ``between`` the stages
+    included; and by part, named "stage: part"."""
+
+    stages: tuple[Section, ...]
+    parts: tuple[Section, ...]
+
+    @property
+    def cpu_s(self) -> float:
+        return sum(stage.cpu_s for stage in self.stages)
+
+    @property
+    def serial_s(self) -> float:
+        return sum(stage.serial_s for stage in self.stages)
+
+    def seconds(self, cores: int) -> float:
+        return sum(stage.seconds(cores) for stage in self.stages)
+
+    def loops(self) -> dict[str, list[Loop]]:
+        """Returns the outer loops by name."""
+        named: dict[str, list[Loop]] = defaultdict(list)
+        for loop in (loop for stage in self.stages for loop in stage.loops):
+            named[loop.name].append(loop)
+        return dict(named)
+
+
+def schedule(seconds: Sequence[float], cores: int) -> float:
+    """Returns when the last of them ends where each begins, in order, on the core that is free first."""
+    free = [0.0] * cores
+    for duration in seconds:
+        heapq.heapreplace(free, free[0] + duration)
+    return max(free)
+
+
+def work_of(document: Mapping[str, Any]) -> JobWork:
+    """Returns the work that a trace's document tells of. Raises ValueError for another format."""
+    if document.get("format") != FORMAT:
+        raise ValueError(f"format {document.get('format')!r} for {FORMAT!r}")
+    spans = [event for event in document["traceEvents"] if event["ph"] == "X"]
+    stages = {"start": Section("start", document["before_cpu_s"])}
+    parts: dict[str, Section] = {}
+    loops = {span["args"]["loop"]: _loop(span) for span in spans if span["cat"] == "loop"}
+    slices: dict[int, Slice] = {}
+    between_s = 0.0
+    for span, around in _nested(spans):
+        name, kind, arguments = span["name"], span["cat"], span["args"]
+        stage = next((outer["name"] for outer in around if outer["cat"] == "stage"), None)
+        if kind == "job":
+            between_s += arguments["process_cpu_s"]
+        elif kind == "stage":
+            stages.setdefault(name, Section(name)).cpu_s += arguments["process_cpu_s"]
+            between_s -= arguments["process_cpu_s"]
+        elif kind == "part":
+            if not any(outer["cat"] == "slice" for outer in around):
+                parts.setdefault(f"{stage}: {name}", Section(f"{stage}: {name}")).cpu_s += arguments["process_cpu_s"]
+        elif kind == "slice":
+            slices[id(span)] = Slice(arguments.get("first", len(slices)), arguments["cpu_s"])
+            loops[arguments["loop"]].slices.append(slices[id(span)])
+            holder = next((outer for outer in reversed(around) if outer["cat"] == "slice"), None)
+            if holder is not None:  # a loop's within a loop's, both on this thread
+                slices[id(holder)].serial_s -= arguments["cpu_s"]
+        elif kind == "loop":
+            loop = loops[arguments["loop"]]
+            holder = next((outer for outer in reversed(around) if outer["cat"] == "slice"), None)
+            if holder is not None:
+                slices[id(holder)].loops.append(loop)
+                continue
+            if stage is not None:
+                stages[stage].loops.append(loop)
+            for outer in around:
+                if outer["cat"] == "part":
+                    parts[f"{stage}: {outer['name']}"].loops.append(loop)
+    return JobWork((*stages.values(), Section("between", max(0.0, between_s))), tuple(parts.values()))
+
+
+def _loop(span: Mapping[str, Any]) -> Loop:
+    return Loop(span["name"], span["args"]["count"], span["args"]["single"])
+
+
+def _nested(spans: Sequence[Mapping[str, Any]]) -> Iterator[tuple[Mapping[str, Any], list[Mapping[str, Any]]]]:
+    """Every span, after those of its thread that hold it, with these, the outermost first."""
+    threads: dict[int, list[Mapping[str, Any]]] = defaultdict(list)
+    for span in spans:
+        threads[span["tid"]].append(span)
+    for own_thread in threads.values():
+        around: list[Mapping[str, Any]] = []
+        for span in sorted(own_thread, key=lambda event: (event["ts"], -event["dur"])):
+            while around and _end(span) > _end(around[-1]):
+                around.pop()
+            yield span, around
+            around.append(span)
+
+
+def _end(span: Mapping[str, Any]) -> int:
+    return round(1000 * span["ts"]) + round(1000 * span["dur"])  # nanoseconds, so that nothing is rounded apart
