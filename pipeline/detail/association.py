@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.compute.threads import in_threads, thread_count
+from pipeline.compute.threads import in_threads
 from pipeline.geometry.closest_point_kernels import FannedMesh, closest_at_vertices
+from pipeline.geometry.nearest import nearest
 
 CANDIDATES = 4  # vertices whose triangles are tried
 
@@ -73,7 +74,7 @@ class Target:
         """
         count = min(CANDIDATES, len(self.head.vertices))
         within = reach_mm + self.corner_mm
-        _, near = self.tree.query(points, k=count, distance_upper_bound=within, workers=thread_count())
+        _, near = nearest(self.tree, points, count=count, within=within)
         near = near.reshape(len(points), count)
         triangle = np.empty(len(points), np.int64)
         blend, square = np.zeros((len(points), 3)), np.empty(len(points))

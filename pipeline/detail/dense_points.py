@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE
+from pipeline.geometry.nearest import nearest
 from pipeline.part_labels.codes import Part, codes_from_channels
 from pipeline.part_labels.votes import PartVotes, part_shares
 from pipeline.settings import FineSettings
@@ -40,7 +41,7 @@ def dense_points(
         The points, in the order of their cells; none where there are no maps or no votes.
     """
     views_needed = count_views_needed([each.camera for each in depth_maps], head_world.vertices.mean(axis=0), settings)
-    clouds = [_cloud(each, views_needed, settings) for each in depth_maps]
+    clouds = map_in_threads(lambda k: _cloud(depth_maps[k], views_needed, settings), len(depth_maps))
     if not clouds or votes is None:
         return SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
     points, normals, deviation = (np.concatenate(column) for column in zip(*clouds, strict=True))
@@ -74,7 +75,7 @@ def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 
 def _behind(points: Float[np.ndarray, "n 3"], head_world: Mesh) -> np.ndarray:
     vertices = head_world.vertices[::EVERY]
     normals = vertex_normals(head_world.vertices, head_world.faces)[::EVERY]
-    _, near = KDTree(vertices, balanced_tree=False, compact_nodes=False).query(points, workers=thread_count())
+    _, near = nearest(KDTree(vertices, balanced_tree=False, compact_nodes=False), points)
     return ((points - vertices[near]) * normals[near]).sum(axis=1) < -INSIDE_MM
 
 

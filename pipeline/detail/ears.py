@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from pipeline.detail.association import Target, interpolated
 from pipeline.detail.surface_points import SurfacePoints
+from pipeline.geometry.nearest import nearest
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
@@ -60,12 +61,12 @@ def with_ears_in_place(
         rows = np.flatnonzero(side)
         if not len(rows) or not len(skin.points):
             continue
-        distance, _ = KDTree(vertices[rows]).query(skin.points, distance_upper_bound=ABOUT_MM)
+        distance, _ = nearest(KDTree(vertices[rows]), skin.points, within=ABOUT_MM)
         near = skin.chosen(np.isfinite(distance))
         if len(near.points) < MIN_POINTS:
             continue
         turned = _registered(vertices, faces, side, near, model)
-        off, _ = KDTree(vertices[rows]).query(vertices, distance_upper_bound=4.0 * BLEND_MM)
+        off, _ = nearest(KDTree(vertices[rows]), vertices, within=4.0 * BLEND_MM)
         share = np.exp(-0.5 * (np.where(np.isfinite(off), off, 1e3) / BLEND_MM) ** 2)
         moved += share[:, None] * (turned - vertices)
     return vertices + moved

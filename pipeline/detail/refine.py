@@ -36,6 +36,7 @@ from pipeline.detail.solve import (
 )
 from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.detail.untangling import untangled_head
+from pipeline.geometry.nearest import nearest
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
@@ -257,7 +258,7 @@ def with_patches(
     offset = ((place - base[vertex]) * normals).sum(axis=1)
     information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
     at = interpolated(base[observed.corner], observed.blend)
-    alone = KDTree(base[vertex]).query(at, distance_upper_bound=PATCH_REACH_MM)[0] > PATCH_REACH_MM
+    alone = nearest(KDTree(base[vertex]), at, within=PATCH_REACH_MM)[0] > PATCH_REACH_MM
     corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
     return Observed(
         np.concatenate([observed.corner[alone], corner]),
@@ -305,6 +306,6 @@ def field_deviation(
         square += (posterior.directions.moved(draws[:, k]) * normals).sum(axis=1) ** 2 / settings.draws
     if not observed.any():
         return deviation_mm
-    distance, _ = KDTree(base[observed]).query(base, distance_upper_bound=6.0 * settings.length_mm)
+    distance, _ = nearest(KDTree(base[observed]), base, within=6.0 * settings.length_mm)
     near = np.exp(-0.5 * (np.where(np.isfinite(distance), distance, np.inf) / settings.length_mm) ** 2)
     return np.sqrt(near * square + (1.0 - near) * np.maximum(square, deviation_mm**2))

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.compute.threads import task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.problem import level_topology
 from pipeline.contour_fit.rim import find_rim, pack_views
@@ -82,8 +82,8 @@ def camera_figures(
             outside_rms_px=_rms(np.maximum(residual, 0.0), length) if spoke else None,
         )
 
-    with task_pool() as pool:  # distance transforms release the interpreter lock
-        return dict(zip(rig.names, pool.map(figures_of, range(len(rig)), rig), strict=True))
+    found = map_in_threads(lambda k: figures_of(k, rig.cameras[k]), len(rig))
+    return dict(zip(rig.names, found, strict=True))
 
 
 def _rms(values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> float:

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
+from pipeline.geometry.nearest import nearest
 from rig.mesh import Mesh, boundary_edges
 
 THICKEST_MM = 60.0  # of hair: farther out a point belongs to something else
@@ -24,7 +25,7 @@ def distance_to_head(
     vertices, normals = head_world.vertices[::EVERY], head_world.normals()[::EVERY]
     tree = KDTree(vertices, balanced_tree=False, compact_nodes=False)
     thickness = _thickness(tree, normals, seen)
-    far, near = (np.asarray(found) for found in tree.query(places))
+    far, near = nearest(tree, places)
     height = ((places - vertices[near]) * normals[near]).sum(axis=1)
     signed = np.copysign(far, height) - thickness[near]
     return np.where(near_rim(head_world, vertices)[near], -np.inf, signed)
@@ -36,7 +37,7 @@ def _thickness(
     """Mean height of the seen points over each vertex; between those that have some, the mean of the nearest of them,
     by the inverse square of their distance."""
     vertices = np.asarray(tree.data)
-    far, near = (np.asarray(found) for found in tree.query(seen, distance_upper_bound=THICKEST_MM))
+    far, near = nearest(tree, seen, within=THICKEST_MM)
     near, points = near[np.isfinite(far)], seen[np.isfinite(far)]
     height = np.maximum(((points - vertices[near]) * normals[near]).sum(axis=1), 0.0)
     count = np.bincount(near, minlength=len(vertices))
@@ -45,7 +46,7 @@ def _thickness(
     if len(known) < NEAREST:
         return np.zeros(len(vertices))
     blank = np.flatnonzero(count < MIN_POINTS)
-    far, near = KDTree(vertices[known]).query(vertices[blank], k=NEAREST)
+    far, near = nearest(KDTree(vertices[known]), vertices[blank], count=NEAREST)
     share = 1.0 / (far * far + EVEN_MM**2)
     thickness[blank] = (share * thickness[known[near]]).sum(axis=1) / share.sum(axis=1)
     return thickness
@@ -56,4 +57,4 @@ def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndar
     rim = np.unique(boundary_edges(head_world.faces))
     if not len(rim):
         return np.zeros(len(places), bool)
-    return KDTree(head_world.vertices[rim]).query(places, distance_upper_bound=RIM_MM)[0] < RIM_MM
+    return nearest(KDTree(head_world.vertices[rim]), places, within=RIM_MM)[0] < RIM_MM

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
+from pipeline.compute.threads import map_in_threads
 from pipeline.fusion.view_stack_kernels import write_outline
 from pipeline.fusion.vote_kernels import DEPTH, NORMAL, SIGMA, Pixels
 from pipeline.geometry.projection import packed_lens
@@ -43,8 +44,10 @@ def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhou
     sizes = np.array([depth_map.depth_mm.shape for depth_map in depth_maps], np.int64)
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
     pixels = np.zeros((starts[-1], 8), np.float32)
-    for depth_map, first, last in zip(depth_maps, starts[:-1], starts[1:], strict=True):
-        camera, view_pixels = rig[depth_map.camera.name], pixels[first:last]
+
+    def fill(view: int) -> None:
+        depth_map = depth_maps[view]
+        camera, view_pixels = rig[depth_map.camera.name], pixels[starts[view] : starts[view + 1]]
         view_pixels[:, DEPTH] = depth_map.depth_mm.ravel()
         view_pixels[:, NORMAL : NORMAL + 3] = depth_map.normal.reshape(-1, 3)
         alone = depth_map.views.ravel() < VIEWS_SURE
@@ -55,6 +58,8 @@ def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhou
         write_outline(
             crop, packed_lens(camera), depth_map.depth_mm.shape[1], silhouettes[camera.name].distance, view_pixels
         )
+
+    map_in_threads(fill, len(depth_maps))
     return ViewStack(np.stack([_packed(depth_map.camera) for depth_map in depth_maps]), sizes, starts[:-1], pixels)
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
-from pipeline.compute.threads import task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster_kernels import interpolate, rasterise
@@ -37,9 +37,9 @@ def depth_map(
 @traced
 def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
     """Returns what every camera of a rig sees of a mesh: camera z (mm) at each pixel, inf beside it."""
-    with task_pool() as pool:  # compiled code releases the interpreter lock
-        found = pool.map(lambda camera: depth_map(camera, mesh_world.vertices, mesh_world.faces)[0], rig)
-        return dict(zip(rig.names, found, strict=True))
+    vertices, faces = mesh_world.vertices, mesh_world.faces
+    found = map_in_threads(lambda k: depth_map(rig.cameras[k], vertices, faces)[0], len(rig))
+    return dict(zip(rig.names, found, strict=True))
 
 
 def picture(

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from pipeline.compute.threads import task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.appearance_cells import Cells, head_guide, make_cells
 from pipeline.part_labels.codes import CHANNELS
@@ -103,12 +103,11 @@ def classify_parts(
     report("parts", 0.6)
     rows = np.split(share, np.cumsum([np.count_nonzero(mask) for mask in inside])[:-1])
 
-    def one(view: Cells, mask: Bool[np.ndarray, "r c"], probabilities: Float32[np.ndarray, "n 3"]) -> PartMap:
-        name = view.camera.name
-        return PartMap(name, upsample_guided(view, mask, probabilities, images[name], masks[name], settings))
+    def one(k: int) -> PartMap:
+        name = cells[k].camera.name
+        return PartMap(name, upsample_guided(cells[k], inside[k], rows[k], images[name], masks[name], settings))
 
-    with task_pool() as pool:  # OpenCV and numpy release the interpreter lock
-        found = list(pool.map(one, cells, inside, rows))
+    found = map_in_threads(one, len(cells))
     report("parts", 1.0)
     return {each.camera: each for each in found}
 

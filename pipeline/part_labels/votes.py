@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.spatial import KDTree
 
+from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
+from pipeline.geometry.nearest import nearest
 from pipeline.geometry.projection import project_points
 from pipeline.part_labels.codes import Part, codes_from_channels
 from pipeline.part_labels.labelling import PartMap
@@ -46,12 +48,15 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
     Returns:
         The cells; None where no view has both depth and parts.
     """
-    clouds = [(points_world(each), parts[each.camera.name]) for each in depth_maps if each.camera.name in parts]
-    clouds = [(points, part) for points, part in clouds if len(points)]
-    if not clouds:
+    voting = [each for each in depth_maps if each.camera.name in parts and each.known.any()]
+    if not voting:
         return None
-    points = np.concatenate([points for points, _ in clouds])
-    shown = np.concatenate([_shown(points, part, rig) for points, part in clouds])
+
+    def cloud(k: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        points = points_world(voting[k])
+        return points, _shown(points, parts[voting[k].camera.name], rig)
+
+    points, shown = (np.concatenate(part) for part in zip(*map_in_threads(cloud, len(voting)), strict=True))
     corner = points.min(axis=0)
     cell = np.floor((points - corner) / CELL_MM).astype(np.int64)
     size = cell.max(axis=0) + 1
@@ -91,5 +96,5 @@ def part_shares(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> Float[np.
     row = np.minimum(np.searchsorted(votes.keys, keys), len(votes.keys) - 1)
     lost = np.flatnonzero(votes.keys[row] != keys)
     if len(lost):
-        row[lost] = KDTree(votes.places).query(points[lost])[1]
+        row[lost] = nearest(KDTree(votes.places), points[lost])[1]
     return votes.probability[row]

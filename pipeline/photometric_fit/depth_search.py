@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from pipeline.compute.threads import task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.contour_fit.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.contour_fit.rim import Views
 from pipeline.geometry.projection import project_points
@@ -110,8 +110,7 @@ def visibility_of(
         ends[:, seen] = here, further - here
         return facing, ends[0], ends[1]
 
-    with task_pool() as pool:
-        facing, pixel, along = zip(*pool.map(one, range(len(cameras))), strict=True)
+    facing, pixel, along = zip(*map_in_threads(one, len(cameras)), strict=True)
     return SampleVisibility(
         cameras, head_world.vertices, normals, points, np.stack(facing), np.stack(pixel), np.stack(along)
     )

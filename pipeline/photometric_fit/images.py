@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.compute.threads import map_in_threads, task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.contour_fit.rim import Views
 from pipeline.imaging.grey import LUMINANCE, noise_level
 
@@ -62,6 +62,6 @@ def blurred(
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
     """Returns all images, blurred, in one row, and the noise that is left: white noise falls by 2 sqrt(pi) sigma."""
     sigma = np.maximum(sigma_px, MIN_BLUR_PX)
-    with task_pool() as pool:
-        smooth = pool.map(lambda i, s: cv2.GaussianBlur(i, (0, 0), s).ravel(), photographs.grey, sigma.tolist())
-        return np.concatenate(list(smooth)), photographs.noise / (2.0 * np.sqrt(np.pi) * sigma)
+    grey = photographs.grey
+    smooth = map_in_threads(lambda k: cv2.GaussianBlur(grey[k], (0, 0), float(sigma[k])).ravel(), len(grey))
+    return np.concatenate(smooth), photographs.noise / (2.0 * np.sqrt(np.pi) * sigma)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.compute.threads import task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.raster import picture
 from pipeline.imaging.contour_distance import chamfer
 from pipeline.imaging.masks import box_around
@@ -113,8 +113,7 @@ def turntable(
         drawn = picture(camera, mesh_head.vertices, mesh_head.faces, colours, PAPER)
         return np.asarray(cv2.resize(drawn, panel, interpolation=cv2.INTER_AREA), np.uint8)
 
-    with task_pool() as pool:  # the rasteriser releases the interpreter lock
-        return list(pool.map(draw, np.radians(AZIMUTHS_DEG)))
+    return map_in_threads(lambda k: draw(np.radians(AZIMUTHS_DEG[k])), len(AZIMUTHS_DEG))
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]]) -> Resized:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.compute.threads import task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import depth_of, hull_extent
@@ -66,8 +66,8 @@ def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRI
         depth = np.where(inside, silhouettes[camera.name].distance[at[:, 1], at[:, 0]], -np.inf)
         return where, radius, inside, depth > radius, depth
 
-    with task_pool() as pool:  # NumPy releases the interpreter lock
-        return Votes(*(np.array(values) for values in zip(*pool.map(vote, rig), strict=True)))
+    votes = map_in_threads(lambda k: vote(rig.cameras[k]), len(rig))
+    return Votes(*(np.array(values) for values in zip(*votes, strict=True)))
 
 
 @traced
@@ -93,10 +93,10 @@ def judge_agreement(
     votes = cast_votes(silhouettes, believed)
     judged = dict(silhouettes)
     masks = [silhouettes[name].mask for name in trusted]
-    with task_pool() as pool:
-        shares = [*pool.map(lambda k: _shares(votes, k, masks[k]), range(len(trusted)))]
-        suspects = [k for k, (_, missing) in enumerate(shares) if missing > settings.missing_share_warned]
-        contradicted = dict(zip(suspects, pool.map(lambda k: _contradicted(votes, k, masks), suspects), strict=True))
+    shares = map_in_threads(lambda k: _shares(votes, k, masks[k]), len(trusted))
+    suspects = [k for k, (_, missing) in enumerate(shares) if missing > settings.missing_share_warned]
+    found = map_in_threads(lambda i: _contradicted(votes, suspects[i], masks), len(suspects))
+    contradicted = dict(zip(suspects, found, strict=True))
     limit = max(MIN_CONTRADICTED, MAX_CONTRADICTED * max(contradicted.values(), default=0.0))
     culprits = [k for k, share in contradicted.items() if share >= limit]
     for k, (name, (strange, missing)) in enumerate(zip(trusted, shares, strict=True)):

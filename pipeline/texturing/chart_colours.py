@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.compute.threads import task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.imaging.chart_plates import charts_in
 from pipeline.imaging.colour_chart import Chart, ChartCorrection, chart_correction, chart_normal
 from pipeline.texturing.light import BAND_FACTORS, Light, harmonics
@@ -38,9 +38,8 @@ class ChartColours:
 
 def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
     """Returns what the charts in all clean plates say of the cameras; a warning where none is found."""
-    with task_pool() as pool:
-        charts = pool.map(charts_in, [capture.backgrounds.get(name, ()) for name in rig.names])
-        return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
+    charts = map_in_threads(lambda k: charts_in(capture.backgrounds.get(rig.names[k], ())), len(rig))
+    return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
 
 
 def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
@@ -62,8 +61,9 @@ def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
         correction = colours.cameras.get(name)
         return in_true_colours(capture.images[name], mean if correction is None else correction.matrix)
 
-    with task_pool() as pool:
-        return replace(capture, images=dict(zip(capture.images, pool.map(corrected, capture.images), strict=True)))
+    names = list(capture.images)
+    images = map_in_threads(lambda k: corrected(names[k]), len(names))
+    return replace(capture, images=dict(zip(names, images, strict=True)))
 
 
 def in_true_colours(

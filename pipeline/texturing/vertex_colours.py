@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.compute.threads import task_pool
+from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.geometry.raster import camera_depths
 from pipeline.imaging.colour_balance import balance
@@ -93,8 +93,7 @@ def texture(
         sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
         return sight, image
 
-    with task_pool() as pool:  # the compiled kernels release the interpreter lock
-        found = list(pool.map(look, views))
+    found = map_in_threads(lambda k: look(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:

@@ -1,12 +1,17 @@
 """The order of the stages, a job that is cancelled in any of them, and a result with a warning that is refused."""
 
+import hashlib
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from pipeline.compute.trace import Trace, recorded
 from pipeline.evidence.plausibility import ImplausibleResult
 from pipeline.head_model.model import load_model
 from pipeline.reconstruct import reconstruct
+from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.errors import Cancelled
@@ -67,3 +72,31 @@ def test_a_warning_that_the_settings_name_refuses_the_result(
     assert "file-unread" in [warning.code for warning in reconstruct(noticed).warnings]
     with pytest.raises(ImplausibleResult, match=r"file-unread: notes\.txt"):
         reconstruct(replace(noticed, settings=replace(SPAN, fail_on=("file-unread",))))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_any_number_of_threads_makes_the_same_bytes_traced_or_not(
+    half_size_shot: SimulatedCapture, renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = replace(context_of(half_size_shot, renderer), settings=Settings())
+
+    def digests(name: str, threads: int, trace: Trace | None = None) -> dict[str, str]:
+        monkeypatch.setenv("EIGENHEAD_THREADS", str(threads))
+        with recorded(trace):
+            result = reconstruct(context)
+            write_result(tmp_path / name, result, context.capture)
+        files = [path for path in (tmp_path / name).rglob("*.*") if path.name != "report.json"]  # it has seconds
+        return {
+            path.relative_to(tmp_path / name).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in files
+        }
+
+    trace = Trace()
+    one = digests("one", 1, trace)  # cut as finely as for sixteen
+    assert {"head.ply", "head.glb", "bust.ply"} <= one.keys()
+    assert digests("two", 2) == one
+    assert digests("four", 4) == one
+    events = json.loads(trace.encoded(threads=1))["traceEvents"]
+    began = [event["name"] for event in events if event.get("cat") == "stage"]
+    assert [name for k, name in enumerate(began) if k == 0 or began[k - 1] != name] == list(STAGES[:-1])

@@ -1,0 +1,25 @@
+"""The nearest of many points, by as many threads as share a loop."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.compute.threads import in_threads
+
+
+def nearest(
+    tree: KDTree, points: Float[np.ndarray, "n d"], *, count: int = 1, within: float = np.inf
+) -> tuple[Float[np.ndarray, "n ..."], Int[np.ndarray, "n ..."]]:
+    """Returns the distances and rows of the ``count`` nearest points of the tree, as ``tree.query`` does.
+
+    SciPy's own ``workers`` start threads anew at every call, and all helpers of a loop beside them.
+    """
+    shape = (len(points),) if count == 1 else (len(points), count)
+    distance, row = np.empty(shape), np.empty(shape, np.intp)
+
+    def query(first: int, last: int) -> None:  # lets go of the interpreter
+        part = points[first:last]
+        distance[first:last], row[first:last] = tree.query(part, k=count, distance_upper_bound=within)
+
+    in_threads(len(points), query)
+    return distance, row
