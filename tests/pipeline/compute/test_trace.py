@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.compute import threads as parallel_for
+from pipeline.compute import threads
 from pipeline.compute.threads import TRACED_THREADS, in_threads, map_in_threads, slice_count, task_pool
 from pipeline.compute.trace import FORMAT, Trace, active_trace, name_of, recorded, span, traced
 
@@ -110,7 +110,7 @@ def test_nothing_is_recorded_without_a_trace(threads: int, monkeypatch: pytest.M
     trace = Trace()
     with recorded(trace):
         assert active_trace() is trace
-    monkeypatch.setattr(parallel_for, "_traced", lambda *_: pytest.fail("a loop was traced"))
+    monkeypatch.setattr(threads, "_traced", lambda *_: pytest.fail("a loop was traced"))
     monkeypatch.setattr(Trace, "span", lambda *_: pytest.fail("a span was recorded"))
     with recorded(None), span("stage", "first"):
         assert active_trace() is None
@@ -154,5 +154,5 @@ def test_a_loop_is_named_by_what_holds_it() -> None:
 
     held = f"{__name__}.test_a_loop_is_named_by_what_holds_it"
     assert {name_of(inner), name_of(lambda: None)} == {held}
-    assert name_of(slice_count) == "parallel_for.slice_count"
+    assert name_of(slice_count) == "threads.slice_count"
     assert name_of(squares) == f"{__name__}.squares"

@@ -1,0 +1,1 @@
+"""Measures where a job's processor seconds go, and what more cores would do."""
