@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.compute import threads
+from pipeline.compute import threads as threads_module
 from pipeline.compute.threads import TRACED_THREADS, in_threads, map_in_threads, slice_count, task_pool
 from pipeline.compute.trace import FORMAT, Trace, active_trace, name_of, recorded, span, traced
 
@@ -110,7 +110,7 @@ def test_nothing_is_recorded_without_a_trace(threads: int, monkeypatch: pytest.M
     trace = Trace()
     with recorded(trace):
         assert active_trace() is trace
-    monkeypatch.setattr(threads, "_traced", lambda *_: pytest.fail("a loop was traced"))
+    monkeypatch.setattr(threads_module, "_traced", lambda *_: pytest.fail("a loop was traced"))
     monkeypatch.setattr(Trace, "span", lambda *_: pytest.fail("a span was recorded"))
     with recorded(None), span("stage", "first"):
         assert active_trace() is None

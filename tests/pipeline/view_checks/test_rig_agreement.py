@@ -131,7 +131,9 @@ def test_principal_points_of_the_whole_picture_are_named_where_it_was_cropped(se
     changed = [lensed(c, cx=c.intrinsics.cx + 60, cy=c.intrinsics.cy + 40) for c in rig]
     found = wrong_rig(of_all, Rig(tuple(changed)))
     assert found is not None
-    moved = next(change for change in found.parameters["changes"] if change.code == "principal-points-moved")
+    changes = found.parameters["changes"]
+    assert isinstance(changes, tuple)
+    moved = next(change for change in changes if change.code == "principal-points-moved")
     assert (moved.parameters["right_px"], moved.parameters["down_px"]) == pytest.approx((-60, -40), abs=12)
 
 
