@@ -71,6 +71,23 @@ def format_names(value: str | None) -> str | None:
     return ",".join(names) or None
 
 
+Formats = Annotated[
+    str | None,
+    typer.Option(
+        help="Of the head: glb, ply (both by default), obj, usdz, stl, 3mf, with commas between.",
+        callback=format_names,
+    ),
+]
+Trace = Annotated[
+    Path | None,
+    typer.Option(
+        help="Write there what ran on which thread when, for Perfetto or chrome://tracing.",
+        metavar="FILE",
+        dir_okay=False,
+    ),
+]
+
+
 @app.command(epilog="Example: eigenhead reconstruct shots/anna.tar.gz --out heads/anna --method contour")
 def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
@@ -84,13 +101,7 @@ def reconstruct(
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
     detail: Annotated[str | None, chosen("span, kernel, photo or fine (the default).", of_setting("detail"))] = None,
     surface: Annotated[str | None, chosen("head, bust or both (the default).", of_output("surface"))] = None,
-    formats: Annotated[
-        str | None,
-        typer.Option(
-            help="Of the head: glb, ply (both by default), obj, usdz, stl, 3mf, with commas between.",
-            callback=format_names,
-        ),
-    ] = None,
+    formats: Formats = None,
     delight: Annotated[
         bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
     ] = False,
@@ -113,14 +124,7 @@ def reconstruct(
         ),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
-    trace: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write there what ran on which thread when, for Perfetto or chrome://tracing.",
-            metavar="FILE",
-            dir_okay=False,
-        ),
-    ] = None,
+    trace: Trace = None,
     data: Data = None,
     json_out: Json = False,
 ) -> None:

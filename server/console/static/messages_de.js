@@ -89,6 +89,7 @@ export default {
   "job-without-result": "Der Auftrag hat kein Ergebnis (Status: {state:word}).",
   "job-active": "Der Auftrag wartet oder läuft; erst abbrechen.",
   "too-many-jobs": "{count} Aufträge dieses Schlüssels warten oder laufen, mehr dürfen es nicht sein; warten, bis einer endet.",
+  "research-not-carried": "ein installiertes Paket enthält keine Experimente: das Projekt klonen, darin deploy/setup.sh ausführen und dort .venv/bin/eigenhead experiments",
   "result-missing": "Das Ergebnis ist nicht mehr im Datenordner: aus einer Sicherung zurückholen oder den Auftrag neu starten.",
   "worker-starting": "Der Worker wird gestartet.",
   "no-worker": "Kein Worker bedient die Warteschlange {queue}: einen starten mit `eigenhead worker --queue {queue_name}`.",

@@ -154,5 +154,5 @@ def test_a_loop_is_named_by_what_holds_it() -> None:
 
     held = f"{__name__}.test_a_loop_is_named_by_what_holds_it"
     assert {name_of(inner), name_of(lambda: None)} == {held}
-    assert name_of(slice_count) == "threads.slice_count"
+    assert name_of(slice_count) == "compute.threads.slice_count"
     assert name_of(squares) == f"{__name__}.squares"

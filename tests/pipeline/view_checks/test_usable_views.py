@@ -69,15 +69,15 @@ def test_two_views_are_too_few_and_each_lost_one_is_named(seen: Seen) -> None:
 def test_what_is_true_of_many_views_is_said_once(seen: Seen) -> None:
     rig, silhouettes = seen
     weak = [compose("outline-weak", share=0.31 + 0.01 * k) for k in range(len(rig))]
-    told = {
+    doubtful = {
         name: replace(s, quality=replace(s.quality, warnings=(weak[k],), usable=k < 2))
         for k, (name, s) in enumerate(silhouettes.items())
     }
     with pytest.raises(TooFewViews) as refused:
-        judged(rig, told)
+        judged(rig, doubtful)
     assert str(refused.value).count("hardly differs from the background") == 1
     assert "the same is true of 8 more (cam03, " in str(refused.value)
-    warnings = view_warnings(told)
+    warnings = view_warnings(doubtful)
     assert [warning.code for warning in warnings] == ["view-left-out", "view", "view"]
     doubts = {name: replace(s, quality=replace(s.quality, doubts=(weak[0],))) for name, s in silhouettes.items()}
     (doubt,) = view_warnings(doubts)
