@@ -45,7 +45,7 @@ class Scale:
 
     @property
     def assumed(self) -> bool:
-        """Tells whether nothing was measured."""
+        """Tells whether the scale is assumed, because the photographs hold nothing of known length."""
         return self.source == ASSUMED
 
 

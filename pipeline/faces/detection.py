@@ -37,11 +37,14 @@ RIGHT_EYE, LEFT_EYE = 2, 3  # rows of the finder's faces
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceDetection:
-    """A face in a picture (its own, distorted pixels; (0, 0) is the centre of the top-left one).
+    """Holds one face that was found in one picture.
 
-    ``roll_deg`` is how far the face's upright is turned clockwise in the picture. Of the eyes, the right one's points
-    (the subject's) come first, then the left one's: of each iris its centre, then its edge towards the nose, up, away
-    from the nose, down; of each pair of lids 16 points of their edges, as ``points.RIGHT_EYE_OUTLINE`` counts them.
+    All positions are pixels of the picture as it was taken, lens distortion included; (0, 0) is the centre of the
+    top-left pixel. ``landmarks_px`` are the 468 points of the face mesh. ``roll_deg`` says how far the face's upright
+    is turned clockwise in the picture. ``irises_px`` holds five points of the subject's right eye, then five of the
+    left one: the centre of the iris, then its edge towards the nose, above, away from the nose and below. ``lids_px``
+    holds 16 points on the edges of the right eye's lids, in the order of ``points.RIGHT_EYE_OUTLINE``, then 16 of the
+    left.
     """
 
     landmarks_px: Float[np.ndarray, "468 2"]

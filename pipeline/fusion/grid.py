@@ -37,8 +37,10 @@ def whole_box(corner: Float[np.ndarray, " 3"], edges_mm: Float[np.ndarray, " 3"]
 
 
 def refined(coarse: Grid, wanted: Bool[np.ndarray, "nx ny nz"]) -> Grid:
-    """Returns nodes of half the step: eight for every wanted node of the coarse grid's box, itself the lowest of
-    them."""
+    """Returns a grid of half the step.
+
+    Each node of ``coarse`` that ``wanted`` marks becomes eight nodes: one at its own position, and seven half a step
+    further along x, y and z."""
     nx, ny, nz = coarse.shape
     shape = (2 * nx - 1, 2 * ny - 1, 2 * nz - 1)
     return _linked(coarse.corner, coarse.step_mm / 2, shape, kernels.halved(wanted))

@@ -38,15 +38,16 @@ class PartVotes:
 
 @traced
 def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig: Rig) -> PartVotes | None:
-    """Returns the votes of all known pixels.
+    """Averages the part probabilities of all views' pixels in cells of ``CELL_MM``, where depth and parts are known.
 
     Args:
-        depth_maps: one a view.
-        parts: of the same views, on the photographs' own grids.
+        depth_maps: the depth map of each view.
+        parts: the part map of each view by camera, in pixels of the photograph.
         rig: the cameras as calibrated.
 
     Returns:
-        The cells; None where no view has both depth and parts.
+        The mean point and mean probabilities of each cell in which a pixel lies, or None if no view has both a depth
+        map and a part map.
     """
     voting = [each for each in depth_maps if each.camera.name in parts and each.known.any()]
     if not voting:

@@ -22,7 +22,7 @@ DAMAGE = (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.Bad
 
 
 class BadTemplate(EigenheadError):
-    """Reports a file that is no template of this project, or a damaged one."""
+    """Refuses a file that should hold a registered mesh template and is of another kind, or damaged."""
 
     def __init__(self, path: Path, why: Message | str) -> None:
         super().__init__(compose("template-unusable", path=str(path), why=why, name=path.stem))

@@ -60,7 +60,7 @@ def _workers(service: Service) -> Check:
 
 
 def check_egl(service: Service) -> None:
-    """Asked once a process, when it starts: it takes a second or more, and what is there stays. Blocks."""
+    """Tries to make an OpenGL context, once a process, since that takes a second or more; blocks meanwhile."""
     try:
         with service.children.one() as child:
             service.known["egl"] = Check(ok=True, detail=verbatim(child.remote(try_egl)()))

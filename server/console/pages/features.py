@@ -102,7 +102,8 @@ class Picked:
 
 
 class Drafts:
-    """Points that are not saved yet, by who picks them: a reload of the page brings them back."""
+    """Holds the feature points that an operator has picked and not saved yet, a set for each operator, so that a reload
+    of the page shows them again."""
 
     def __init__(self, most: int = 200) -> None:
         self._most, self._kept = most, OrderedDict[tuple[str, str], Points]()

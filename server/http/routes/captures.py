@@ -123,7 +123,7 @@ def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureO
 
 @router.get("/captures/{capture_id}/checks", responses=documented(404))
 def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureChecks:
-    """What the verdict follows from: exposure, sharpness, the camera's place and the subject's outline by camera."""
+    """Returns what decided the verdict: each camera's exposure, sharpness and position, and the subject's outline."""
     return CaptureChecks.model_validate({"cameras": service.store.checks(capture_id)})
 
 
