@@ -25,6 +25,7 @@ FRAME_MOST_MM = 10_000.0  # and of the spread, since axes that hardly converge m
 UNIT_MOST = 1_000_000  # nanometres; beyond, it is no unit
 UNITS = {10: compose("centimetres"), 25.4: compose("inches"), 100: compose("decimetres"), 1000: compose("metres")}
 UNIT_FRAME_MOST_MM = 2500.0  # in a unit that is guessed: a head has a twelfth of the picture then
+FOCAL_LEAST_PX = 10.0  # smaller ones are shares of the picture's size, and so are their principal points
 CORNER_PX = 1.0  # a principal point that nobody gave is 0, or half a pixel off it
 OTHER_SIZE, SIZE_SPREAD = (
     0.4,
@@ -67,7 +68,8 @@ def _principal_point_faults(rig: Rig) -> list[Message]:
     another size, or none at all. A crop moves them by pixels, and a shifted lens one way."""
     sizes = np.array([(camera.intrinsics.width, camera.intrinsics.height) for camera in rig], float)
     points = np.array([(camera.intrinsics.cx, camera.intrinsics.cy) for camera in rig])
-    if (np.abs(points) <= CORNER_PX).all():
+    focal = np.array([(camera.intrinsics.fx, camera.intrinsics.fy) for camera in rig])
+    if (np.abs(points) <= CORNER_PX).all() and (focal > FOCAL_LEAST_PX).all():  # else shares of the picture's size
         return [compose("principal-points-missing")]
     shares = (2.0 * points + 1.0) / sizes
     share = float(np.median(shares))

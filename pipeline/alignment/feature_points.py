@@ -58,7 +58,7 @@ def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Mess
     grossly = GROSS_NOISE * noise_px
     judged = {name: views for name, views in features.items() if len(views) >= MIN_JUDGED_VIEWS}
     wrong = len(judged) - len(locate_features(judged, rig, noise_px=grossly).points)
-    if len(judged) < MIN_JUDGED_POINTS or wrong < WRONG_SHARE * len(judged):
+    if len(judged) < max(MIN_JUDGED_POINTS, len(features) / 2) or wrong < WRONG_SHARE * len(judged):
         return None
     exchanged = {name: {camera: at[::-1] for camera, at in views.items()} for name, views in judged.items()}
     right = len(locate_features(exchanged, rig, noise_px=grossly).points)

@@ -7,7 +7,7 @@ a third of a fit.
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
@@ -89,7 +89,12 @@ def _share(slices: list[tuple[int, int]], work: Callable[[int, int], None], thre
             work(first, last)
 
     helpers = [_pool(threads - 1).submit(take) for _ in range(min(threads, len(slices)) - 1)]
-    take()
+    try:
+        take()
+    except BaseException:
+        left.clear()
+        wait([helper for helper in helpers if not helper.cancel()])  # none may still work when the caller goes on
+        raise
     for helper in helpers:
         if not helper.cancel():
             helper.result()

@@ -23,6 +23,7 @@ GLANCE_PX = 640  # longer side: a face of a third of it fills the networks' 192 
 SMALLEST_PX = 96  # shorter side: no face in a smaller picture is more than a guess
 MUST_SEE = 0.7  # cosine: a camera within 45 degrees of where a face looks shows it, hair beside it or not
 GLANCE = SearchEffort(max_fruitless=5, min_facing=MUST_SEE, rounds=3, with_eyes=False)
+MIN_OFF_MIDDLE_DEG = 5.0  # of the cameras; less is the networks' own error
 MIN_FAN = 0.3  # mean of the unit directions to the cameras: a fan of 180 degrees has 0.64, a full circle 0
 MIN_WITNESSES = 2  # other cameras that show the face, before one is blamed that does not
 
@@ -61,20 +62,35 @@ def sight_face(
     sighting = FaceSighting(len(subject.found), True, True, front, _missing(subject, face))
     if not has_front(rig):
         return sighting
-    left_deg, up_deg = gaze_from(face, rig[front])
+    from_front = gaze_from(face, rig[front].axis_world if front in rig.names else -_fan(rig))
+    from_middle = gaze_from(face, -_fan(rig))
+    left_deg, up_deg = (_turned(*of) for of in zip(from_front, from_middle, strict=True))
     return replace(sighting, left_deg=left_deg, up_deg=up_deg)
+
+
+def _turned(from_front_deg: float, from_middle_deg: float) -> float:
+    """The angle from the front camera, 0 unless the face is turned that way from the middle of the cameras, too: of
+    cameras in rows the front one stands above or below it, and who looks between the rows is turned from neither."""
+    agreed = from_front_deg * from_middle_deg > 0.0 and abs(from_middle_deg) >= MIN_OFF_MIDDLE_DEG
+    return from_front_deg if agreed else 0.0
 
 
 def has_front(rig: Rig) -> bool:
     """Tells whether the cameras stand on one side of the subject, so that one of them is the front."""
+    return float(np.linalg.norm(_fan(rig))) > MIN_FAN
+
+
+def _fan(rig: Rig) -> Float[np.ndarray, " 3"]:
+    """The mean of the unit vectors from the subject to the cameras: of length 1 in one spot, 0 in a full ring."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return float(np.linalg.norm(directions.mean(axis=0))) > MIN_FAN
+    return directions.mean(axis=0)
 
 
-def gaze_from(face: MatchedFaces, camera: Camera) -> tuple[float, float]:
-    """Returns by how many degrees a face is turned from a camera's axis: to the subject's left, and up."""
-    across, upwards, ahead = -camera.axis_world @ face.world_from_face.rotation
+def gaze_from(face: MatchedFaces, axis_world: Float[np.ndarray, " 3"]) -> tuple[float, float]:
+    """Returns by how many degrees a face is turned from an axis of view: to the subject's left, and up."""
+    towards = -axis_world / np.linalg.norm(axis_world)
+    across, upwards, ahead = towards @ face.world_from_face.rotation
     return float(-np.degrees(np.arctan2(across, ahead))), float(-np.degrees(np.arcsin(np.clip(upwards, -1.0, 1.0))))
 
 

@@ -19,6 +19,7 @@ from rig.rig import Rig
 
 Pixels = Float[np.ndarray, "_ 2"]
 FACTORS = (1.0, 0.5, 0.67, 1.5, 2.0)  # of the focal lengths, of which the best are searched from
+MAX_SEARCHED_CAMERAS = 12  # of many: the search takes time by their square, and three numbers need no more
 SEARCHES, STEPS = 2, 90  # and how often the misses are asked in each
 STRIDE = 0.1  # of a factor's logarithm, and of a picture's side
 OTHER_FACTOR, OTHER_SHIFT = 0.15, 0.03  # of a factor's logarithm and a side: what makes a rig contradict itself
@@ -62,8 +63,11 @@ def find_lens_reading(hulls: Sequence[Pixels], rig: Rig, misfit: Callable[[Rig],
     """
     from scipy.optimize import minimize  # a quarter of a second, and few rigs are wrong
 
+    searched = np.unique(np.linspace(0, len(rig) - 1, MAX_SEARCHED_CAMERAS).round().astype(int))
+    some, some_hulls = Rig(tuple(rig.cameras[k] for k in searched)), [hulls[k] for k in searched]
+
     def cost(at: Float[np.ndarray, " 3"]) -> float:
-        misses = np.abs(tangency_errors_px(hulls, _read(rig, at)))
+        misses = np.abs(tangency_errors_px(some_hulls, _read(some, at)))
         known = misses[np.isfinite(misses)]
         return float(np.mean(np.sqrt(known))) if len(known) >= misses.size / 4 else 1e6
 

@@ -95,7 +95,7 @@ def masks_off_edges(
     off = [edge.offset_px for edge in edges if edge.is_off]
     middle = float(np.median(off)) if off else 0.0
     alike = [offset for offset in off if offset * middle > 0]
-    if 2 * len(alike) <= len(edges):
+    if 2 * len(alike) <= len(judged):
         return []
     where = compose("outlines-outside") if middle < 0 else compose("outlines-inside")
     return [compose("masks-off-edges", count=len(alike), all=len(judged), offset_px=abs(middle), where=where)]

@@ -83,7 +83,8 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
     names = [camera.name for camera in found]
     faults += _repeated(names) + _shared_serials(found)
     if faults:
-        written = [entry["name"] for entry in entries if isinstance(entry, dict) and isinstance(entry.get("name"), str)]
+        read = [entry for entry in entries[:CAMERAS_MOST] if isinstance(entry, dict)]
+        written = [entry["name"] for entry in read if isinstance(entry.get("name"), str)]
         raise InputError(subject, say_once(faults, [*filter(None, written), *places]))
     return Rig(tuple(found))
 

@@ -6,8 +6,9 @@ background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
 features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
 
-Without background/ and masks/ altogether the subject is found from the photographs. Without images/ the pictures lie
-beside cameras.json. Which file is whose, where names differ, is found in ``rig.formats.shot_files``.
+Without background/ and masks/ altogether the subject is the opaque part of pictures that were all cut out, else it is
+found from the photographs. Without images/ the pictures lie beside cameras.json. Which file is whose, where names
+differ, is found in ``rig.formats.shot_files``.
 """
 
 import hashlib
@@ -25,7 +26,7 @@ from rig.capture import Capture, Features
 from rig.errors import InputError
 from rig.formats.cameras_file import NO_RIG, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
-from rig.formats.capture_masks import mask_subjects
+from rig.formats.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.fault_groups import say_once
 from rig.formats.features_json import document_from_features, features_from_bytes
 from rig.formats.images import cut_out_alpha, decode_image_file, picture_size, write_image
@@ -165,6 +166,7 @@ def read_shot(
     *,
     pixels_most: int | None = None,
     with_features: bool = True,
+    with_cut_outs: bool = True,
 ) -> Capture:
     """Returns the images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``, but
     those of ``files``, which were found before."""
@@ -199,28 +201,34 @@ def read_shot(
         digests["features.json"] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
         features = work_features(features, rig, work_rig(rig, pixels_most))
-    cut_out = {} if masks or backgrounds else _cut_outs(folder, jobs, rig)
-    subjects = mask_subjects(masks or cut_out, rig, faults, pixels_most=pixels_most)
+    subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)
+    if with_cut_outs and not masks and not backgrounds and len(images) == len(rig):
+        subjects = _cut_outs(folder, jobs, rig, pixels_most) or subjects
     return Capture(
         images,
         {name: tuple(plates) for name, plates in backgrounds.items()},
         subjects.masks,
         features,
         digests,
-        (*levels, *subjects.remarks, *([compose("masks-of-alpha")] if cut_out else [])),
+        (*levels, *subjects.remarks),
         subjects.soft,
     )
 
 
-def _cut_outs(folder: Path, jobs: Sequence[tuple[str, str, Path]], rig: Rig) -> dict[str, tuple[str, np.ndarray]]:
-    """The alpha of each picture, where all were cut out: what is left of them has no other outline."""
+def _cut_outs(
+    folder: Path, jobs: Sequence[tuple[str, str, Path]], rig: Rig, pixels_most: int | None
+) -> MaskSubjects | None:
+    """The masks of pictures that were all cut out, of their alpha; None where one was not, or has an alpha that is no
+    mask: nobody said that it is one, so it is no fault."""
     found = {}
     for _, name, path in jobs:
         alpha, k = cut_out_alpha(path), rig[name].intrinsics
         if alpha is None or alpha.shape != (k.height, k.width):
-            return {}
+            return None
         found[name] = path.relative_to(folder).as_posix(), alpha
-    return found
+    unfit: list[Message] = []
+    subjects = mask_subjects(found, rig, unfit, pixels_most=pixels_most)
+    return None if unfit else replace(subjects, remarks=(*subjects.remarks, compose("masks-of-alpha")))
 
 
 def _sample_bits(

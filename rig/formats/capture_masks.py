@@ -75,7 +75,8 @@ def _without_specks(share: Share) -> tuple[Share, float]:
     One speck at the border of the picture would be part of the outline that cameras are compared by."""
     white = share > 127
     changed, area, lost = share, max(int(np.count_nonzero(white)), 1), 0
-    for of, fill in ((white, 0), (~white, 255)):
+    for fill in (0, 255):
+        of = changed > 127 if fill == 0 else changed <= 127  # holes of specks went with them
         _, labels, stats, _ = cv2.connectedComponentsWithStats(of.astype(np.uint8), connectivity=8 if fill == 0 else 4)
         labels, areas = np.asarray(labels, np.int32), np.asarray(stats, np.int64)[:, cv2.CC_STAT_AREA]
         largest = int(areas[1:].max(initial=0))

@@ -25,6 +25,7 @@ from rig.formats.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXE
 from rig.formats.picture_samples import WHOLE_BITS
 from rig.formats.work_size import at_share, halvings
 from rig.image import ImageRgb
+from rig.mask_polarity import subject_convention
 from rig.messages.message import Message, compose
 
 # Pillow's names. JPEG covers the MPO that many phones write into a .jpg, PPM all of Netpbm's maps.
@@ -36,6 +37,8 @@ JPEG = b"\xff\xd8\xff"
 NETPBM = re.compile(
     rb"P[2356](?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+(\d+)\s"
 )  # its last number is white
+PNG_COLOUR_TYPE, PNG_WITH_ALPHA = 25, (4, 6)  # where the header holds it, and which values have an alpha
+CUT_AWAY_LEAST = 0.25  # of a picture from which the subject was cut out; an undistorted one has a rim of 0.1 at most
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 GREY_FLAGS = (
     cv2.IMREAD_GRAYSCALE,
@@ -133,15 +136,32 @@ def decode_image_file(
 
 
 def cut_out_alpha(path: Path) -> Plane | None:
-    """Returns the alpha of a picture that was cut out, in the file's own numbers; None where it has none, or the same
-    everywhere."""
-    data = path.read_bytes()
-    if not data.startswith(PNG) and path.suffix.lower() not in (".webp", ".tif", ".tiff"):
+    """Returns the alpha of a picture from which the subject was cut out, in the file's own numbers.
+
+    None where the file has no alpha, is too large or damaged, or its alpha shows no subject: one that stands in the
+    middle, with at least ``CUT_AWAY_LEAST`` of the picture transparent around it. Rounded corners and the empty rim of
+    an undistorted picture are no cut-out."""
+    data, suffix = path.read_bytes(), path.suffix.lower()
+    if data.startswith(PNG):
+        if len(data) <= PNG_COLOUR_TYPE or data[PNG_COLOUR_TYPE] not in PNG_WITH_ALPHA:
+            return None
+    elif suffix not in (".webp", ".tif", ".tiff"):
         return None
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None or pixels.ndim != 3 or pixels.shape[2] != 4 or pixels[..., 3].min() == pixels[..., 3].max():
+    try:
+        with _faults_of(path.name):
+            (width, height), _ = _header_size(data, suffix)
+            if width * height > PIXELS_MOST:
+                return None
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except InputError:
         return None
-    return np.ascontiguousarray(pixels[..., 3])
+    if pixels is None or pixels.ndim != 3 or pixels.shape[2] != 4:
+        return None
+    alpha = np.ascontiguousarray(pixels[..., 3])
+    opaque = alpha > np.iinfo(alpha.dtype).max // 2 if alpha.dtype.kind == "u" else alpha > 0.5
+    if 1.0 - opaque.mean() < CUT_AWAY_LEAST or subject_convention(opaque) != "white":
+        return None
+    return alpha
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import defaultdict
 from pathlib import Path
+from queue import Empty
 
 from rig.errors import Cancelled
 from rig.messages.message import compose
@@ -16,7 +17,7 @@ from server.services.work import refuse_board
 from server.storage.face_cache import FacesDocument, faces_once
 from server.tasks.faces import find_capture_faces
 
-PATIENCE_S = 60.0  # eleven pictures of 12 Mpx take 4 s, forty 15
+PATIENCE_S = 50.0  # eleven pictures of 12 Mpx take 4 s, forty 15
 
 _finding: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
@@ -34,7 +35,7 @@ def found_faces(service: Service, identity: str) -> FacesDocument:
     files = service.store.folder("captures", identity) / "files"
 
     def find() -> FacesDocument:
-        with service.children.one() as child:
+        with service.children.one(max(0.0, deadline - time.monotonic())) as child:
             work = child.remote(find_capture_faces, cancelled=lambda: time.monotonic() > deadline)
             return work(capture=str(files), images=images)
 
@@ -43,7 +44,7 @@ def found_faces(service: Service, identity: str) -> FacesDocument:
         raise _slow()
     try:
         return faces_once(service.store.cache_of(identity) / "faces", record.inputs, find)
-    except Cancelled:
+    except (Cancelled, Empty):
         raise _slow() from None
     finally:
         lock.release()

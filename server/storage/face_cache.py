@@ -45,7 +45,8 @@ class FacesDocument(TypedDict):
 
 def faces_once(folder: Path, inputs: Mapping[str, str], find: Callable[[], FacesDocument]) -> FacesDocument:
     """Calls ``find``, unless ``folder`` holds what it found before. ``inputs``: sha256 of the capture's files."""
-    folder.mkdir(parents=True, exist_ok=True)
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
     path = folder / (_key(inputs) + SUFFIX)
     with suppress(OSError, ValueError):
         document = json.loads(path.read_bytes())

@@ -177,8 +177,9 @@ class ChildProcessPool:
             self._free.put(child)
 
     @contextmanager
-    def one(self) -> Iterator[Child]:
-        child = self._free.get()
+    def one(self, timeout_s: float | None = None) -> Iterator[Child]:
+        """Yields a child that nobody else has meanwhile. Raises queue.Empty where none is free in time."""
+        child = self._free.get(timeout=timeout_s)
         try:
             yield child
         finally:

@@ -217,7 +217,7 @@ def check_capture(
         report("check", number / len(rig))
         of_sizes, of_files = _size_faults(root, files, camera, image_pixels), list[Message]()
         if not of_sizes:
-            shot = read_shot(root, rig.subset([camera.name]), of_files, files, with_features=False)
+            shot = read_shot(root, rig.subset([camera.name]), of_files, files, with_features=False, with_cut_outs=False)
             digests |= shot.digests
             empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
             views |= _view_of(shot, camera.name, measured)

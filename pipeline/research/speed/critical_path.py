@@ -1,9 +1,9 @@
 """How long a job would take on more cores, by the processor seconds of its slices in a trace.
 
-What is in no shared loop stays as it is: it takes one core. A loop's slices are scheduled as ``parallel_for`` does it,
-the next one to whoever is free first. Cores are all alike and do not hold each other up (no memory that is too slow, no
-interpreter lock), so that the seconds are a bound from below; nested loops have the cores that the slices around them
-leave.
+What is in no shared loop stays as it is: it takes one core. A loop's slices are scheduled as
+``pipeline.compute.threads`` does it, the next one to whoever is free first. Cores are all alike and do not hold each
+other up (no memory that is too slow, no interpreter lock), so that the seconds are a bound from below; nested loops
+have the cores that the slices around them leave.
 """
 
 import heapq

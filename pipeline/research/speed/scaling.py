@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.compute import threads as parallel_for
+from pipeline.compute import threads as pool
 from pipeline.compute import trace
 from pipeline.compute.threads import THREADS
 from pipeline.research import markdown
@@ -57,7 +57,7 @@ def scaling(
     Raises JobFailed.
     """
     most = threads or len(os.sched_getaffinity(0))
-    records = Records(folder, "scaling", key_of(parallel_for, trace, critical_path, CORES))
+    records = Records(folder, "scaling", key_of(pool, trace, critical_path, CORES))
     rows: list[Row] = []
     for done, capture in enumerate(captures):
         row: Row = {"name": capture.name}

@@ -321,6 +321,7 @@ export default {
   "Looking for faces ...": "Gesichter werden gesucht ...",
   "the face that was found in it": "das Gesicht, das darin gefunden wurde",
   "The face is in {count} picture. | The face is in {count} pictures.": "Das Gesicht ist in {count} Bild. | Das Gesicht ist in {count} Bildern.",
+  "The service does not answer.": "Der Dienst antwortet nicht.",
   "No picture shows a face that others confirm.": "Kein Bild zeigt ein Gesicht, das andere bestätigen.",
   "Pick features": "Merkmale setzen",
   "Remove ...": "Entfernen ...",

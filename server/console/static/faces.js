@@ -31,14 +31,22 @@ export const facesOf = {
     async readFaces(id, address = `/console/captures/${id}/faces`) {
       if (!id || this.faces[id] || this.finding === id) return;
       this.finding = id;
-      const answer = await fetch(address),
+      let document = null; // stays so where the service does not answer, or a proxy answers for it
+      let found = false;
+      try {
+        const answer = await fetch(address);
         document = await answer.json();
+        found = answer.ok;
+      } catch {
+        found = false;
+      }
       const awaited = this.finding === id; // another capture may be looked at by now
       if (awaited) this.finding = "";
-      if (answer.ok) this.faces[id] = document;
+      if (found) this.faces[id] = document;
       else if (awaited) {
         this.withFaces = false;
-        window.eigenheadSay("fault", told(document), toldFaults(document));
+        if (document) window.eigenheadSay("fault", told(document), toldFaults(document));
+        else window.eigenheadSay("fault", say("The service does not answer."), []);
       }
     },
     facesIn(id, camera) {

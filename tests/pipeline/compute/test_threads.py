@@ -3,6 +3,7 @@
 import os
 import re
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -86,3 +87,22 @@ def test_no_stage_has_a_number_of_threads_of_its_own() -> None:
     assert [name for name, text in sources.items() if "ThreadPoolExecutor(" in text] == ["compute/threads.py"]
     sizes = {name: set(re.findall(r"with task_pool\((.*?)\) as", text)) for name, text in sources.items()}
     assert {name: found for name, found in sizes.items() if found - {""}} == {"results/write.py": {"THREADS"}}
+
+
+def test_nobody_still_works_when_an_error_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EIGENHEAD_THREADS", "3")
+    running: list[int] = []
+    together = threading.Barrier(3, timeout=20.0)
+
+    def work(first: int, last: int) -> None:
+        running.append(first)
+        together.wait()  # all three are at work
+        if threading.current_thread() is threading.main_thread():
+            running.remove(first)
+            raise ValueError("of the caller")
+        time.sleep(0.1)
+        running.remove(first)
+
+    with pytest.raises(ValueError, match="of the caller"):
+        in_threads(3, work)
+    assert running == []

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.faces.networks import FaceNetworks, load_networks
-from pipeline.faces.sighting import file_pixels, has_front, reduce_picture, sight_face
+from pipeline.faces.sighting import _turned, file_pixels, has_front, reduce_picture, sight_face
 from rig.camera import Camera, Intrinsics
 from rig.geometry import RigidTransform, look_at
 from rig.recorded_lens import RecordedLens
@@ -81,3 +81,9 @@ def test_pixels_of_an_undistorted_picture_go_back_through_the_lens() -> None:
     np.testing.assert_allclose(
         recorded.undistorted(file_pixels(pixels, camera, camera), lens.matrix()), pixels, atol=1e-6
     )
+
+
+def test_who_looks_between_two_rows_is_turned_from_neither() -> None:
+    assert _turned(-20.0, 1.0) == 0.0
+    assert _turned(-20.0, -3.0) == 0.0
+    assert _turned(25.0, 7.0) == 25.0

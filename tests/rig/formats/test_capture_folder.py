@@ -16,7 +16,7 @@ from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.capture_folder import capture_root, read_capture, size_fault, write_capture
 from rig.formats.features_json import features_from_bytes
-from rig.formats.images import read_image, write_image
+from rig.formats.images import cut_out_alpha, read_image, write_image
 from rig.geometry import look_at
 from rig.messages.message import Message, texts_of
 from rig.recorded_lens import RecordedLens
@@ -129,6 +129,38 @@ def test_the_alpha_of_cut_outs_is_their_mask_where_there_is_no_other(folder: Pat
     assert not capture.masks[rig.names[0]][0].any()
     write_image(pictures[0], read_image(pictures[0]))
     assert dict(read_capture(folder)[0].masks) == {}
+
+
+@pytest.mark.parametrize("shape", ["rounded corners", "noise", "rim", "one of them"])
+def test_an_alpha_that_is_no_cut_out_is_no_mask_and_no_fault(folder: Path, shape: str) -> None:
+    shutil.rmtree(folder / "background")
+    shutil.rmtree(folder / "masks", ignore_errors=True)
+    for path in sorted((folder / "images").glob("*.png")):
+        rgb = cv2.imread(str(path))
+        assert rgb is not None
+        alpha = np.full(rgb.shape[:2], 255, np.uint8)
+        if shape == "rounded corners":
+            alpha[:2, :2] = alpha[-2:, -2:] = 0
+        elif shape == "noise":
+            alpha[::2, ::3] = 254
+        elif shape == "rim":
+            alpha[0] = alpha[-1] = alpha[:, 0] = alpha[:, -1] = 0
+        cv2.imwrite(str(path), np.dstack([rgb, alpha]))
+    if shape == "one of them":
+        cut_out(sorted((folder / "images").glob("*.png"))[0])
+    capture, rig = read_capture(folder)
+    assert dict(capture.masks) == {}
+    assert capture.remarks == ()
+    assert capture.images.keys() == set(rig.names)
+
+
+def test_an_alpha_is_not_decoded_where_the_header_says_too_much(tmp_path: Path) -> None:
+    path = tmp_path / "large.png"
+    cv2.imwrite(str(path), np.zeros((8, 8, 4), np.uint8))
+    data = bytearray(path.read_bytes())
+    data[16:24] = (60000).to_bytes(4, "big") * 2
+    path.write_bytes(data)
+    assert cut_out_alpha(path) is None
 
 
 def test_one_enclosing_folder(folder: Path) -> None:

@@ -9,6 +9,7 @@ import pytest
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.capture_folder import read_capture, write_capture
+from rig.formats.capture_masks import _without_specks
 from tests.rig.formats.test_capture_folder import HEIGHT, WIDTH, picture, small_rig
 
 ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
@@ -76,3 +77,14 @@ def test_what_is_true_of_all_masks_is_said_once(folder: Path) -> None:
         read_capture(folder)
     (fault,) = refused.value.faults
     assert fault.text.startswith("each of the 3 masks masks/a.png to masks/c.png holds areas of")
+
+
+def test_a_hole_in_a_speck_goes_with_it() -> None:
+    mask = np.zeros((200, 200), np.uint8)
+    mask[60:180, 60:140] = 255
+    mask[5:10, 5:10] = 255
+    mask[7, 7] = 0
+    cleaned, lost = _without_specks(mask)
+    assert lost > 0.0
+    assert not cleaned[:50].any()
+    np.testing.assert_array_equal(cleaned[60:180, 60:140], 255)

@@ -85,7 +85,7 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_line(
 PREPARE_AND_USE = """
 import sys
 import numpy as np
-from pipeline import kernel_list
+from pipeline.compute import kernel_list
 from pipeline.fusion.grid_kernels import grown
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.compute.kernel_list import Kernel
