@@ -39,8 +39,9 @@ RULER_MM = 100
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """``columns`` and ``rows`` count squares. ``measured_*_mm`` is the printed pattern's outer size by a ruler or
-    caliper, if someone measured it: the second distance against which the scale is checked."""
+    """Describes a calibration board; ``columns`` and ``rows`` count squares. ``measured_width_mm`` and
+    ``measured_height_mm`` are the outer size of the printed pattern as measured by ruler or caliper, against which the
+    scale is checked."""
 
     kind: Kind
     columns: int
@@ -65,7 +66,7 @@ class Board:
 
     @property
     def marker_count(self) -> int:
-        """Markers of a ChArUco board: one in every white square."""
+        """Returns the number of markers on a ChArUco board, one in every white square."""
         return self.columns * self.rows // 2
 
     def corners(self) -> Float[np.ndarray, "n 3"]:
@@ -77,8 +78,8 @@ class Board:
         return 0.5 * self.square_mm * np.array([self.columns, self.rows, 0.0])
 
     def turns(self) -> list[Int[np.ndarray, " _"]]:
-        """Orders of the corners that no picture can tell apart from the first: ``order[i]`` is the corner that looks
-        like corner i once the board is turned. A ChArUco board has one, for its markers differ."""
+        """Returns the orders of the corners that no picture can tell apart: ``order[i]`` is the corner that looks like
+        corner i once the board is turned. A ChArUco board has only one, because its markers differ."""
         index = np.arange(self.corner_count).reshape(self.rows - 1, self.columns - 1)
         if self.kind == "charuco":
             return [index.ravel()]
@@ -93,21 +94,20 @@ class Board:
 
     @property
     def is_chiral(self) -> bool:
-        """Tells whether a picture of the pattern differs from every picture of its mirror image: only then can a
-        mirrored camera be told from its own pictures. A checkerboard with an odd side, or a square one, is its own
-        image."""
+        """Tells whether a picture of the pattern differs from every picture of its mirror image; only then do pictures
+        show that a camera is mirrored. A checkerboard that is square or has an odd side equals its mirror image."""
         if self.kind == "charuco":
             return True
         return self.columns % 2 == 0 and self.rows % 2 == 0 and self.columns != self.rows
 
     def squares(self) -> Bool[np.ndarray, "rows columns"]:
-        """Marks where a square is black."""
+        """Returns for each square whether it is black."""
         row, column = np.indices((self.rows, self.columns))
         white_first = self.kind == "charuco" and self.legacy and self.rows % 2 == 0
         return ((row + column) % 2 == 0) ^ self.inverted ^ white_first
 
     def opencv(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's own board; ChArUco only."""
+        """Returns the board as an object of OpenCV. For ChArUco boards only."""
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         size = (self.columns, self.rows)
         numbers = np.arange(self.marker_count) + self.first_marker
@@ -117,7 +117,7 @@ class Board:
 
 
 def read_board(path: Path) -> Board:
-    """Reads ``board.toml``. Raises InputError naming every fault."""
+    """Reads a board from a ``board.toml`` file. Raises InputError naming every fault."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
@@ -126,7 +126,7 @@ def read_board(path: Path) -> Board:
 
 
 def board_from_document(document: Mapping[str, Any], subject: str = "board.toml") -> Board:
-    """Returns the board of decoded TOML. Raises InputError naming every fault."""
+    """Returns the board that a decoded ``board.toml`` describes. Raises InputError naming every fault."""
     known = set(Board.__dataclass_fields__)
     strange = [key for key in document if key not in known]
     faults = [compose("board-key-unknown", key=f"{key!r}", known=sorted(known)) for key in strange]
@@ -170,7 +170,7 @@ def _dictionary_faults(document: Mapping[str, Any]) -> list[Message]:
 
 
 def write_board(board: Board, path: Path) -> None:
-    """Writes ``board.toml``."""
+    """Writes a board as a ``board.toml`` file."""
     lines = [f'kind = "{board.kind}"', f"columns = {board.columns}  # squares", f"rows = {board.rows}"]
     lines.append(f"square_mm = {board.square_mm!r}")
     if board.kind == "charuco":
@@ -194,7 +194,7 @@ def _side(board: Board, key: str) -> int:
 
 
 def write_board_pdf(board: Board, path: Path) -> None:
-    """Writes the board at true scale, on the smallest paper that holds it, with a ruler to check the print."""
+    """Writes the board as a PDF at true scale, on the smallest paper that holds it, with a ruler to check the print."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     page = _paper(width, height)
     pdf = FPDF(unit="mm", format=page)

@@ -26,8 +26,8 @@ SB = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Holds the board in one picture. ``rise_px``: width of the transition from black to white (10 to 90 %), the
-    blur."""
+    """Holds the board's corners in one picture: their numbers ``ids`` and pixels. ``rise_px`` measures the blur: the
+    width (px) of an edge from 10 to 90 % of its height."""
 
     ids: Int[np.ndarray, " n"]
     corners: Float[np.ndarray, "n 2"]
@@ -35,7 +35,8 @@ class Found:
 
 
 def detect(grey: UInt8[np.ndarray, "h w"], board: Board) -> Found | None:
-    """Returns the board in one picture, or None. Corners are in the board's order, sub-pixel."""
+    """Finds the board in one grey picture. Returns its corners to a fraction of a pixel, in the board's order, or None
+    where the board is not found."""
     picture = 255 - grey if board.inverted else grey
     found = (_charuco if board.kind == "charuco" else _checkerboard)(picture, board)
     if found is None or len(found[0]) < CORNERS_LEAST or not is_flat_grid(board, *found):
@@ -56,8 +57,9 @@ def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.nda
 
 
 def rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
-    """Returns the width in pixels of the board's edges, 10 to 90 %, in the blurrier of its two directions; infinite
-    where no edge rises within the room that the pattern leaves (half a square, or the rim around a marker)."""
+    """Computes the width (px) of the board's edges, from 10 to 90 % of their height, in the blurrier of the board's two
+    directions. Infinite where no edge rises within the room that the pattern leaves (half a square, or the rim around a
+    marker)."""
     ids, corners = found
     flat = board.corners()[ids, :2] / board.square_mm
     homography = _homography(flat, corners)
@@ -107,7 +109,8 @@ def _checkerboard(grey: np.ndarray, board: Board) -> Corners | None:
 
 
 def in_board_order(grey: np.ndarray, corners: np.ndarray, board: Board) -> Float[np.ndarray, "rows columns 2"]:
-    """Returns the corners in a right-handed order that the board's colours allow."""
+    """Returns the corners (px) as a grid of the board's rows and columns, turned so that it is right-handed and agrees
+    with the board's colours."""
     columns, rows = board.grid
     grid = corners.reshape(rows, columns, 2)
     across, down = (grid[:, -1] - grid[:, 0]).mean(axis=0), (grid[-1] - grid[0]).mean(axis=0)
@@ -135,8 +138,8 @@ def _contrast(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> fl
 
 
 def pattern_continues(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> bool:
-    """Tells whether squares alternate even outside the board's outline: then it is a part of a board with more
-    squares."""
+    """Tells whether squares also alternate outside the board's outline, so that the corners found are part of a larger
+    board."""
     inside = abs(_contrast(grey, grid))
     rows, columns = grid.shape[:2]
     flat = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
@@ -172,7 +175,8 @@ def _sector_based_exhaustive(grey: np.ndarray, board: Board) -> np.ndarray | Non
 
 
 def classic_corners(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    """Returns corners (px, row by row) by OpenCV's adaptive threshold; None where the whole board is not found."""
+    """Returns the corners (px, row by row) that OpenCV's detector with adaptive threshold finds; None where it does not
+    find the whole board."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     ok, corners = cv2.findChessboardCorners(grey, board.grid, flags=flags)
     return _refine(grey, corners.reshape(-1, 2), 0.35, board) if ok else None

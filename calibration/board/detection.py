@@ -44,7 +44,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class PictureNote:
-    """Why the board was not found in a picture of a camera."""
+    """Holds why the board was not found in a picture of a camera."""
 
     camera: str
     picture: str
@@ -56,9 +56,9 @@ class PictureNote:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """All finds. ``sizes``: (width, height) per camera, in the order of the cameras; ``missed``: (camera, shot) without
-    a find; ``notes`` say, per camera, what was wrong with pictures that hold another pattern; ``remarks`` what of the
-    board is otherwise than it was described."""
+    """Holds where the board was found in all pictures. ``sizes``: (width, height) by camera; ``missed``: (camera, shot)
+    of each picture without the board; ``notes``: for cameras that never see the board, what their pictures show
+    instead; ``remarks``: how the board differs from its description."""
 
     board: Board
     sizes: dict[str, tuple[int, int]]
@@ -74,14 +74,14 @@ class Detections:
 
 
 class WrongBoard(EigenheadError):
-    """The pictures do not show the board that was described."""
+    """Reports that the pictures show another board than the one that was described."""
 
     def __init__(self, reasons: Iterable[Message]) -> None:
         super().__init__(compose("wrong-board", notes=tuple(reasons)))
 
 
 def reasons_of(notes: Iterable[PictureNote]) -> list[Message]:
-    """Returns each reason, said once for all cameras that have it."""
+    """Returns each reason once, with the pictures that it holds for."""
     pictures: dict[Message, list[str]] = {}
     for note in notes:
         pictures.setdefault(note.reason, []).append(f"{note.camera}/{note.picture}")
@@ -97,11 +97,12 @@ def _some_pictures(names: list[str]) -> str | Message:
 
 
 def ignore_progress(stage: str, fraction: float) -> None:
-    """The progress hook of callers that want none."""
+    """Does nothing; the progress hook of callers that want none."""
 
 
 def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
-    """``IMAGES/<camera>/<shot>.<ext>`` as {camera: {shot: path}}. Raises InputError naming every fault."""
+    """Lists the pictures ``IMAGES/<camera>/<shot>.<ext>`` of a folder as {camera: {shot: path}}. Raises InputError
+    naming every fault."""
     if not folder.is_dir():
         raise InputError(str(folder), [compose("no-picture-folder")])
     faults, cameras = list[Message](), {}
@@ -124,9 +125,12 @@ def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
 def detect_folder(
     folder: Path, board: Board, *, cache: Path | None = None, workers: int = 2, report: Progress = ignore_progress
 ) -> Detections:
-    """Finds the board in every picture of ``folder``; a ChArUco board also with the first square white, or with markers
-    that begin at another number. Raises InputError on damaged input, WrongBoard where no picture shows the board and
-    some show another. ``cache`` is a folder in which finds are kept by the pictures' content."""
+    """Finds the board in every picture of ``folder``. A ChArUco board is also found if its first square is white or its
+    markers begin at another number than described. ``cache``: a folder in which results are kept by the SHA-256 of the
+    picture.
+
+    Raises InputError for damaged input, and WrongBoard where no picture shows the board and some show another.
+    """
     pictures = list_pictures(folder)
     detections = _detect_pictures(folder, pictures, board, cache, workers, report)
     if board.kind == "charuco":

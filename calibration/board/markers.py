@@ -27,8 +27,8 @@ RATIO_OFF = 0.05  # of the square, between the told and the measured side of mar
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How markers are laid out: squares in a row, the number of the first marker, and whether the first square is white
-    (``legacy``). ``ratio``: a marker's side by a square's, as measured."""
+    """Describes how markers are laid out: squares in a row, number of the first marker, and whether the first square is
+    white (``legacy``). ``ratio`` is the measured side of a marker divided by that of a square."""
 
     columns: int
     first_marker: int
@@ -37,8 +37,8 @@ class Layout:
 
 
 def find_markers(grey: UInt8[np.ndarray, "h w"], dictionary: str) -> dict[int, Float[np.ndarray, "4 2"]]:
-    """Returns the markers of one of OpenCV's dictionaries in a picture; a number that is there twice cannot be told
-    apart."""
+    """Returns the corners (px) of the markers in a grey picture, by the marker's number. A number that occurs twice is
+    left out."""
     return _detected(grey, cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)))
 
 
@@ -50,8 +50,8 @@ def _detected(grey: np.ndarray, dictionary: cv2.aruco.Dictionary) -> dict[int, F
 
 
 def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
-    """Returns the layout that explains the markers of most pictures, one of as many columns as ``board`` where there is
-    one; None where none does."""
+    """Finds the layout that explains the markers in most pictures, preferring one with as many columns as ``board``.
+    Returns None where no layout does."""
     shown = [markers for markers in pictures if len(markers) >= MARKERS_LEAST]
     if not shown:
         return None
@@ -115,7 +115,8 @@ def _fit(flat: Float[np.ndarray, "m 4 2"], seen: Float[np.ndarray, "m 4 2"]) -> 
 
 
 def other_dictionary(greys: Iterable[UInt8[np.ndarray, "h w"]], dictionary: str) -> str | None:
-    """Another of OpenCV's dictionaries, whose markers a picture shows; the smallest that holds them."""
+    """Finds another of OpenCV's dictionaries whose markers a picture shows, the smallest that holds them. Returns None
+    where there is none."""
     names = sorted((name for name in dir(cv2.aruco) if name.startswith("DICT_") and name != dictionary), key=_size)
     for grey in greys:
         counts = {name: len(find_markers(grey, name)) for name in names}
@@ -130,7 +131,7 @@ def _size(name: str) -> int:
 
 
 def is_april_grid(markers: Markers) -> bool:
-    """Tells whether markers stand in every cell of a grid, numbered from row to row, as on Kalibr's AprilGrid."""
+    """Tells whether there is a marker in every cell of a grid, numbered row by row, as on Kalibr's AprilGrid."""
     if len(markers) < MARKERS_LEAST:
         return False
     numbers = np.array(sorted(markers))
@@ -149,8 +150,8 @@ def is_april_grid(markers: Markers) -> bool:
 
 
 def board_of(layout: Layout, board: Board) -> Board | None:
-    """Returns the described board with the pattern and the first number of ``layout``; None where its squares are
-    others."""
+    """Returns ``board`` with the first marker and the colour of the first square that ``layout`` has. Returns None
+    where the layout's squares or markers are of another number or size."""
     if layout.columns != board.columns or abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
         return None
     return replace(board, legacy=layout.legacy, first_marker=layout.first_marker)

@@ -39,9 +39,13 @@ OUTLIER_SIGMAS = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """``blocks``: per camera 6 x 6 of left perturbations (rad, mm), which hold what the lens's uncertainty adds;
-    ``pose_sigma_px``: their size at the subject; ``focal_sigma_px`` per camera; ``noise_px`` of a keypoint, an axis.
-    ``misfit``: of ``lens_misfit``; what is above 1 widens all of them."""
+    """Holds how well the cameras of a solved structure are known.
+
+    ``blocks``: covariance of each camera's pose as a left perturbation (rad, mm), the lens's uncertainty included;
+    ``pose_sigma_px``: what it amounts to at the subject (px); ``focal_sigma_px``: standard deviation of each focal
+    length (px); ``noise_px``: noise of a keypoint along each axis. ``misfit``: result of ``lens_misfit``; above 1 it
+    widens all of them.
+    """
 
     blocks: Float[np.ndarray, "c 6 6"]
     pose_sigma_px: Float[np.ndarray, " c"]
@@ -51,7 +55,7 @@ class Uncertainty:
 
 
 def uncertainty(structure: Structure) -> Uncertainty:
-    """Covariances of the cameras of a solved structure in millimetres."""
+    """Computes the covariances of the cameras of a solved structure, whose lengths must be in millimetres."""
     rig = structure.rig
     noise = max(NOISE_LEAST_PX, 1.4826 * float(np.median(np.abs(structure.residuals()))))
     places = camera_places(structure)
@@ -84,7 +88,8 @@ def uncertainty(structure: Structure) -> Uncertainty:
 
 
 def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
-    """Returns where each camera's f k1 k2 cx cy and its pose stand among all unknowns."""
+    """Returns, for each camera, the indices of its unknowns (f k1 k2 cx cy, then the six of its pose) among all
+    unknowns."""
     count = len(structure.rig)
     lenses = np.zeros(count, int) if structure.one_lens else np.arange(count)
     lens = LENS * lenses[:, None] + np.arange(LENS)
@@ -92,15 +97,18 @@ def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
 
 
 def reduced_camera_system(structure: Structure, noise_px: float) -> Float[np.ndarray, "p p"]:
-    """``S`` of the module's docstring, for keypoints of ``noise_px`` an axis, without those that are wrong."""
+    """Returns the reduced camera system ``S`` of the module's docstring for keypoints with a noise of ``noise_px``
+    along each axis. Outliers are left out."""
     return _reduced(structure, noise_px)[0]
 
 
 def lens_misfit(structure: Structure, noise_px: float) -> float:
-    """By how much more than chance a lens of each camera's own would explain the points: the fall of chi-squared by
-    one Gauss-Newton step, by the number of values that it would free. 1 where all cameras have the same lens.
+    """Computes how much better the points would be explained if each camera had a lens of its own: about 1 for one
+    common lens, more where the lenses differ.
 
-    A score test (Rao 1948): residuals themselves hardly show it, because the poses make up for a wrong lens."""
+    A score test (Rao 1948): the fall of chi-squared in one Gauss-Newton step, divided by the number of values set free.
+    The residuals themselves hardly show a wrong lens, because the poses make up for it.
+    """
     if not structure.one_lens or len(structure.rig) < 2:
         return 1.0
     falls = []

@@ -30,9 +30,12 @@ SIDE_MOST_PX = 2400  # features are found in pictures no larger; they are placed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """COLMAP databases of one image a camera, and what they hold: keypoints found in each camera, verified matches of
-    each pair of cameras, and how many keypoints in all have one. The first database has one lens for all images where
-    they are of one size, the last one a lens each unless ``one_lens``."""
+    """Holds the matches between photographs, in COLMAP databases that have one image a camera.
+
+    ``databases``: the first has one lens for all images where they are of one size; the last has a lens for each image
+    unless ``one_lens``. ``features``: number of keypoints by camera; ``matched``: number of verified matches by pair of
+    cameras; ``matched_keypoints``: number of keypoints that have a match.
+    """
 
     databases: tuple[Path, ...]
     one_lens: bool
@@ -43,11 +46,12 @@ class Matches:
 
 
 def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool | None, report: Progress) -> Matches:
-    """Features of every photograph, matched within each shot and verified by two-view geometry.
+    """Finds keypoints in all photographs, matches them within each shot and verifies the matches by two-view geometry.
 
-    ``scratch`` is a folder of the caller's that may be deleted once the structure is solved; ``one_lens``: all
-    photographs are of one camera at one setting; None: they are where each camera has one picture and all are of one
-    size. Raises InputError naming every picture that cannot be used."""
+    ``scratch`` is a folder of the caller's that may be deleted once the structure is solved. ``one_lens`` says whether
+    all photographs are of one camera at one setting; None takes that for granted where each camera has one picture and
+    all are of one size. Raises InputError naming every picture that cannot be used.
+    """
     sizes = _write_grey(photographs, scratch / "pictures")
     if one_lens is None:
         one_lens = len(set(sizes.values())) == 1 and photographs.shots == (ONE_SHOT,)
@@ -67,7 +71,7 @@ def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """COLMAP without its log, of which one line in a thousand is for a user."""
+    """Silences COLMAP's log while the block runs; only one of its lines in a thousand is for a user."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel

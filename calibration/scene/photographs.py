@@ -25,7 +25,7 @@ ONE_SHOT = "shot"  # the name of the only one, where every camera has one pictur
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographs:
-    """Files by camera, then by shot; both in the order of their names."""
+    """Holds the files of photographs by camera, then by shot, both sorted by name."""
 
     files: Mapping[str, Mapping[str, Path]]
 
@@ -39,7 +39,7 @@ class Photographs:
 
 
 def find_photographs(folder: Path) -> Photographs:
-    """Returns the photographs of ``folder``. Raises InputError naming every fault."""
+    """Lists the photographs in ``folder`` by camera and shot. Raises InputError naming every fault."""
     if not folder.is_dir():
         raise InputError(folder.name, [compose("no-folder-of-photographs")])
     root = capture_root(folder)
@@ -67,8 +67,8 @@ def find_photographs(folder: Path) -> Photographs:
 
 
 def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """Returns the masks (True = subject) that lie beside one shot's photographs, in masks/. Raises InputError for one
-    that is damaged or of another size."""
+    """Returns the masks (True = subject) by camera that lie in masks/ beside the photographs of a single shot. Raises
+    InputError for a mask that is damaged or of another size than its photograph."""
     root = capture_root(folder)
     if photographs.shots != (ONE_SHOT,) or not (root / "masks").is_dir():
         return {}

@@ -14,7 +14,7 @@ def write_scene_report(calibration: SceneCalibration, path: Path) -> None:
 
 
 def scene_page(calibration: SceneCalibration) -> str:
-    """Returns the HTML page."""
+    """Returns the report of a calibration as the text of an HTML page."""
     figures, scale = calibration.figures(), calibration.scale
     mark = "bad" if scale.assumed else "good"
     total = len(calibration.rig) + len(calibration.left_out)

@@ -23,7 +23,7 @@ class SceneCameraFigures(TypedDict):
 
 
 class SceneFigures(TypedDict):
-    """Holds the numbers of ``calibrate --from scene --json``."""
+    """Holds the numbers that ``calibrate --from scene --json`` prints."""
 
     rms_px: float
     used_share: float
@@ -41,7 +41,7 @@ class ScaleDocument(TypedDict):
 
 
 class SceneDocument(TypedDict):
-    """``calibration.json`` of a scene."""
+    """Holds the content of a scene's ``calibration.json``."""
 
     figures: SceneFigures
     front: str
@@ -56,9 +56,12 @@ class SceneDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneCalibration:
-    """``rig``: with covariances, mm, world frame; ``structure``: the same cameras with their points; ``left_out``:
-    views that did not join, and why; ``features``: keypoints found in each view; ``matched``: how many of them in all
-    are found in another view too; ``refinement``: what silhouettes made of the poses, where there were masks."""
+    """Holds a rig that was calibrated from photographs of a scene (mm, world frame, with covariances).
+
+    ``structure``: the same cameras with their points; ``left_out``: views that did not join, and why; ``features``:
+    number of keypoints found in each view; ``matched``: number of keypoints, over all views, that are found in another
+    view too; ``refinement``: how silhouettes changed the poses, where there were masks.
+    """
 
     rig: Rig
     structure: Structure
@@ -72,11 +75,11 @@ class SceneCalibration:
     refinement: Message | None = None
 
     def absences(self) -> list[Message]:
-        """Returns, for every view that did not join, which and why."""
+        """Returns for every view that did not join the others which view it is and why."""
         return [compose("located", where=name, fault=why) for name, why in self.left_out.items()]
 
     def figures(self) -> SceneFigures:
-        """Returns the numbers of ``calibrate --from scene --json``."""
+        """Returns the numbers that ``calibrate --from scene --json`` prints."""
         misses = self.structure.residuals()
         cameras: dict[str, SceneCameraFigures] = {}
         for index, camera in enumerate(self.rig):
@@ -99,7 +102,7 @@ class SceneCalibration:
         }
 
     def document(self) -> SceneDocument:
-        """Returns everything but points and residuals, as JSON."""
+        """Returns the calibration as plain values for JSON, without points and residuals."""
         return {
             "figures": self.figures(),
             "front": self.front,

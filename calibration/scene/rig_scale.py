@@ -26,7 +26,8 @@ AGREES_LEAST = 0.002  # and at least this share: half a millimetre of a head
 
 
 def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
-    """Scales a rig by a known length.
+    """Scales a rig so that a known length is right (mm). Returns the rig and a message of what was done; the rig as it
+    is, and no message, where it agrees with the length within the length's uncertainty.
 
     Args:
         capture: pictures as ``rig`` took them.
@@ -43,7 +44,7 @@ def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) 
 
 
 def times(rig: Rig, factor: float) -> Rig:
-    """Returns the rig with all lengths times ``factor``, its covariances with them."""
+    """Returns the rig with all its lengths multiplied by ``factor`` and its covariances scaled accordingly."""
     grows = np.diag([1.0, 1.0, 1.0, factor, factor, factor])
     return Rig(
         tuple(

@@ -35,8 +35,9 @@ POINTS_LEAST = 30
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """``factor``: mm in the structure's unit; ``share``: its relative standard deviation; ``source``: points, tag,
-    cameras or head-size; ``told``: the same for a reader."""
+    """Holds the scale of a structure. ``factor``: millimetres in its unit of length; ``share``: relative standard
+    deviation of ``factor``; ``source``: points, tag, cameras or head-size; ``provenance``: where the scale comes from,
+    as a sentence."""
 
     factor: float
     share: float
@@ -52,9 +53,11 @@ class Scale:
 def find_scale(
     structure: Structure, known: KnownLength | None, photographs: Photographs, head: Float[np.ndarray, "v 3"]
 ) -> Scale:
-    """Returns the scale from ``known``, or from ``head``, the vertices (mm) of a model's mean head, where that is None.
+    """Computes the scale of a structure from a ``known`` length or, where that is None, from the size of a mean head
+    (``head``: its vertices, mm). Raises InputError where the photographs that joined do not show the known length.
 
-    Raises InputError where the photographs that joined do not show the known length."""
+    Raises InputError where the photographs that joined do not show the known length.
+    """
     if isinstance(known, PointDistance):
         return scale_from_points(structure.rig, known)
     if isinstance(known, CameraDistance):
@@ -65,8 +68,8 @@ def find_scale(
 
 
 def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
-    """Computes the scale from the centres of two cameras; a lens's entrance pupil is known to some millimetres from
-    outside."""
+    """Computes the scale from the known distance of two cameras' centres. From outside, the entrance pupil of a lens is
+    known to some millimetres. Raises InputError where a camera did not join."""
     lost = [name for name in known.cameras if name not in rig]
     if lost:
         raise InputError("scale.json", [compose("scale-camera-lost", camera=name) for name in lost])
@@ -79,7 +82,8 @@ def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
 
 
 def scale_from_points(rig: Rig, known: PointDistance) -> Scale:
-    """Computes the scale from two points that were picked in two views or more each."""
+    """Computes the scale from the known distance of two points, each picked in two views or more. Raises InputError
+    where a point cannot be triangulated."""
     ends, faults = [], []
     for name, views in (("first", known.first), ("second", known.second)):
         joined = {camera: pixel for camera, pixel in views.items() if camera in rig}
@@ -109,7 +113,8 @@ Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
 
 
 def find_tags(photographs: Photographs, known: TagSize) -> Tags:
-    """Returns corners (px) of the tags of a dictionary, by shot and number, then by camera."""
+    """Finds the tags of a dictionary in all photographs. Returns their corners (px) by (shot, number of the tag), then
+    by camera."""
     detector = _tag_detector(known)
     tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
     for camera, shots in photographs.files.items():
@@ -122,7 +127,8 @@ def find_tags(photographs: Photographs, known: TagSize) -> Tags:
 
 
 def find_tags_of_shot(images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], known: TagSize) -> Tags:
-    """Finds the corners (px) of the tags in one shot's pictures, by number, then by camera."""
+    """Finds the tags of a dictionary in the pictures of one shot. Returns their corners (px) by ("", number of the
+    tag), then by camera."""
     detector = _tag_detector(known)
     tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
     for camera, image in images.items():
@@ -150,7 +156,8 @@ def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) 
 
 
 def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
-    """Computes the scale from the sides of all tags that two views or more show, the median over tags."""
+    """Computes the scale from the known side of tags, as the median over all tags that two views or more show. Raises
+    InputError where there is none."""
     found = []
     for number, views in tags.items():
         joined = {camera: corners for camera, corners in views.items() if camera in rig}
@@ -176,7 +183,8 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
 
 
 def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:
-    """Computes the scale from the median distance of points from their middle, as in ``head`` (mm)."""
+    """Assumes the scale at which the points that the cameras look at are as far from their middle (median) as the
+    vertices of a mean head ``head`` (mm) are from theirs."""
     points = _looked_at(structure)
     ratio = _median_radius(head) / _median_radius(points)
     provenance = compose("scale-by-head")

@@ -48,14 +48,15 @@ def calibrate_scene(
     one_lens: bool | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> SceneCalibration:
-    """Calibrates the cameras of ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``.
+    """Calibrates the cameras of the photographs ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``.
 
-    ``scale``: a ``scale.json``; ``front``: the camera that the subject faces, guessed without it; ``one_lens``: whether
-    all photographs are of one camera at one setting, which is taken from the folder's kind without it (one picture a
-    camera and all of one size: one lens). The same photographs give the same rig on the same machine.
+    ``scale``: path of a ``scale.json``; ``front``: the camera that the subject faces, guessed if None; ``one_lens``:
+    whether all photographs are of one camera at one setting; None takes that for granted where each camera has one
+    picture and all are of one size. The same photographs give the same rig on the same machine.
 
     Raises InputError naming every fault of the photographs and of ``scale.json``, and CalibrationRefused with the views
-    that did not join, why, and what to add."""
+    that did not join, why, and what to add.
+    """
     photographs = find_photographs(folder)
     names = photographs.names
     if front is not None and front not in names:
@@ -76,7 +77,8 @@ def calibrate_scene(
 
 
 def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, Message]]:
-    """Returns the structure with why views are left out of it. Raises CalibrationRefused where too few joined."""
+    """Returns the structure and, by name, why views are left out of it. Raises CalibrationRefused where too few views
+    joined."""
     names = list(matches.sizes)
     joined = structure.rig.names if structure is not None else ()
     left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
@@ -90,7 +92,8 @@ def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, di
 def placed(
     structure: Structure, scale: Scale, matches: Matches, left_out: dict[str, Message], front: str | None
 ) -> SceneCalibration:
-    """Returns the calibration in millimetres and in the world frame, with its covariances."""
+    """Returns the calibration of a structure, in millimetres and in the world frame, with covariances and warnings.
+    Raises CalibrationRefused where ``front`` did not join."""
     if front in left_out:
         raise CalibrationRefused([compose("front-left-out", camera=str(front), why=left_out[str(front)])])
     here = transformed(structure, structure.rig, scale.factor)
@@ -124,8 +127,8 @@ def placed(
 
 
 def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.ndarray, "_ _"]]) -> SceneCalibration:
-    """Returns the calibration with the poses that the subject's silhouettes agree on, if pairs of views that were held
-    out do; the calibration itself where there are too few masks."""
+    """Refines the poses of a calibration so that the subject's silhouettes agree, and returns it with the new poses if
+    pairs of views that were held out agree better. Returns the calibration unchanged where there are too few masks."""
     rig = calibration.rig
     known = [name for name in rig.names if name in masks]
     if len(known) < VIEWS_LEAST:
@@ -137,7 +140,8 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
 
 
 def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
-    """Returns the structure times ``factor``, in the frame in which its cameras are those of ``moved``."""
+    """Returns the structure with its lengths multiplied by ``factor``, moved to the frame in which the structure's
+    cameras have the poses of ``moved``."""
     before, after = structure.rig.cameras[0].camera_from_world, moved.cameras[0].camera_from_world
     new_from_old = after.inverse() @ before
     cameras = tuple(

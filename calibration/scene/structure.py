@@ -32,8 +32,11 @@ TRACK_LEAST = 3  # a point in two views only tells nothing about the third; and 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Structure:
-    """``rig``: the cameras that joined, in the scene's own frame and unit; ``points``: in the same; ``camera_of``,
-    ``point_of`` and ``pixels``: each observation. ``one_lens``: all cameras have the same intrinsics."""
+    """Holds cameras and points that were solved from matches.
+
+    ``rig`` and ``points`` are in the frame and unit of the scene. Observation i is the pixel ``pixels[i]`` of camera
+    ``camera_of[i]`` and of point ``point_of[i]``. ``one_lens``: all cameras have the same intrinsics.
+    """
 
     rig: Rig
     points: Float[np.ndarray, "p 3"]
@@ -44,13 +47,13 @@ class Structure:
 
     @property
     def estimated(self) -> int:
-        """Returns how many of a lens's f, k1, k2, cx, cy, in this order, were estimated."""
+        """Returns how many of the values f, k1, k2, cx, cy of a lens, in this order, were estimated."""
         if not self.one_lens:
             return 1
         return 5 if len(self.rig) >= CENTRE_VIEWS else 3
 
     def residuals(self) -> Float[np.ndarray, "n 2"]:
-        """Returns projected less observed, px."""
+        """Returns the projected less the observed pixel of each observation (px)."""
         projected = np.empty_like(self.pixels)
         for index, camera in enumerate(self.rig):
             of_camera = self.camera_of == index
@@ -59,10 +62,13 @@ class Structure:
 
 
 def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Structure | None:
-    """Returns the largest set of cameras that join, with their points; None where no pair of views starts one.
+    """Solves for the largest set of cameras that join, with their points. Returns None where no pair of views gives a
+    start.
 
-    Lenses of their own are started from the one that explains all views best, and keep its distortion: a view of a
-    head cannot tell its focal length from its distance, nor its 300 points a lens's bend from their own noise."""
+    If each camera has a lens of its own, it starts from the one lens that explains all views best and keeps its
+    distortion: in a view of a head, focal length and distance cannot be told apart, and 300 points do not tell
+    distortion from noise.
+    """
     import pycolmap
 
     best, lens = None, None
@@ -153,7 +159,7 @@ def _camera(name: str, image: Any, lens: Any) -> Camera:
 
 
 def why_not(name: str, matches: Matches, joined: Collection[str]) -> Message:
-    """Tells why a view did not join the others, and what to add."""
+    """Explains why a view did not join the others, and what to add."""
     features = matches.features[name]
     if features < FEATURES_LEAST:
         return compose("join-points-bare", points=features)

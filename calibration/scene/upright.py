@@ -13,7 +13,8 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # abou
 
 
 def in_guessed_frame(rig: Rig, front: str | None) -> Rig:
-    """``in_world_frame`` of the rig as if every camera had been held upright."""
+    """Returns the rig in a world frame that is guessed as if every camera had been held upright (``in_world_frame``);
+    cameras held on their side or upside down are turned for the guess alone."""
     turns = [np.linalg.matrix_power(QUARTER, int(count)) for count in quarter_turns(rig)]
     upright = Rig(
         tuple(

@@ -6,7 +6,7 @@ from rig.messages.message import Message, compose
 
 
 def judge_scene(calibration: SceneCalibration) -> Verdict:
-    """Judges a calibration by its weakest camera; an assumed scale or a view that did not join leaves it usable at
+    """Judges a calibration by its weakest camera. An assumed scale, or a view that did not join, makes it usable at
     best."""
     sigma = dict(zip(calibration.rig.names, calibration.uncertainty.pose_sigma_px, strict=True))
     poor = [name for name, px in sigma.items() if px > POSE_POOR_PX]

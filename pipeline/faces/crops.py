@@ -17,8 +17,8 @@ AREA_FROM = 1.7  # pixels of the picture to one of the crop from which the next 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crop:
-    """A square: its centre and side (px of the picture), the angle by which what is upright in it is turned clockwise
-    in the picture, and whether it is read as in a mirror."""
+    """Holds a square part of a picture: its centre and side (px of the picture), and the angle (degrees, clockwise) by
+    which the square is turned in the picture. A ``mirrored`` crop is read from right to left."""
 
     centre_px: Float[np.ndarray, " 2"]
     side_px: float
@@ -26,7 +26,8 @@ class Crop:
     mirrored: bool = False
 
     def picture_from_crop(self, size: int) -> Float[np.ndarray, "2 3"]:
-        """The affine map from pixels of the crop, sampled at ``size`` a side, to pixels of the picture."""
+        """Returns the affine map (2 x 3) from pixels of this crop, sampled at ``size`` x ``size``, to pixels of the
+        picture."""
         turn = np.deg2rad(self.roll_deg)
         scale = self.side_px / size
         linear = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -38,17 +39,17 @@ class Crop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pyramid:
-    """A picture at full size, half, quarter and so on."""
+    """Holds a picture at full size, half, quarter and so on, the full size first."""
 
     levels: tuple[ImageRgb, ...]
 
     @property
     def size_px(self) -> Float[np.ndarray, " 2"]:
-        """Width and height of the full size."""
+        """Returns the width and height of the full-size picture in pixels."""
         return np.array(self.levels[0].shape[1::-1], float)
 
     def sample(self, crop: Crop, size: int) -> UInt8[np.ndarray, "size size 3"]:
-        """The crop at ``size`` pixels a side; black outside the picture."""
+        """Returns the pixels of a crop, resampled to ``size`` x ``size``; black where the crop leaves the picture."""
         picture_from_crop = crop.picture_from_crop(size)
         halvings = int(np.ceil(np.log2(max(crop.side_px / size / AREA_FROM, 1.0))))
         level = self.levels[min(halvings, len(self.levels) - 1)]
@@ -60,7 +61,7 @@ class Pyramid:
 
 
 def make_pyramid(image: ImageRgb) -> Pyramid:
-    """Halves a picture until it is small."""
+    """Halves a picture again and again, until its longer side is below twice ``SMALLEST_PX``, and returns all sizes."""
     levels = [np.ascontiguousarray(image)]
     while max(levels[-1].shape[:2]) >= 2 * SMALLEST_PX:
         height, width = levels[-1].shape[:2]
@@ -72,5 +73,5 @@ def make_pyramid(image: ImageRgb) -> Pyramid:
 def in_picture(
     points_crop: Float[np.ndarray, "n 2"], picture_from_crop: Float[np.ndarray, "2 3"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Pixels of the picture for pixels of a crop."""
+    """Returns the pixels of the picture at which points of a crop lie."""
     return points_crop @ picture_from_crop[:, :2].T + picture_from_crop[:, 2]

@@ -57,31 +57,34 @@ class FaceDetection:
 
     @property
     def size_px(self) -> float:
-        """The larger side of the points' box, level with the face."""
+        """Returns the larger side (px) of the box around the 468 points, the box being turned as the face is."""
         return crop_around(self.landmarks_px).side_px / CROP_OF_FACE
 
 
 def find_faces(image: ImageRgb, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Finds the faces in a picture, best first: the large ones (an eighth of its longer side and more), and where there
-    are none the small ones (half of that)."""
+    """Finds the faces in a picture and returns them, best score first. Faces of an eighth of the picture's longer side
+    or more are searched first; faces down to half of that only where there are none."""
     pyramid = make_pyramid(image)
     return find_large_faces(pyramid, networks) or find_small_faces(pyramid, networks)
 
 
 def find_large_faces(pyramid: Pyramid, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Searches the whole picture (0.03 s where a face is upright, else 0.06 s)."""
+    """Finds the faces that are large enough to be seen in the picture as a whole. Takes 0.03 s where a face is upright,
+    else 0.06 s."""
     return _find(pyramid, _whole(pyramid), networks)
 
 
 def find_small_faces(pyramid: Pyramid, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Searches nine parts of a picture, each at twice the size (0.35 s)."""
+    """Finds smaller faces, in nine overlapping parts of the picture that are each searched at twice the size. Takes
+    0.35 s."""
     return _find(pyramid, _parts(pyramid), networks)
 
 
 def find_face_at(
     pyramid: Pyramid, crop: Crop, networks: FaceNetworks, *, min_rounds: int = MIN_ROUNDS
 ) -> FaceDetection:
-    """Places the points on the face in a crop, which follows them; the score says whether there was one."""
+    """Places the 468 points on the face in a crop. The crop is moved to the points until it settles; whether it held a
+    face is told by the result's score."""
     for count in range(MAX_ROUNDS):
         points, _, _ = _place(pyramid, crop, networks)
         before, crop = crop, crop_around(points)
@@ -96,7 +99,7 @@ def find_face_at(
 
 
 def crop_around(points_px: Float[np.ndarray, "468 2"]) -> Crop:
-    """The crop that the landmark network wants around points like those that it places."""
+    """Returns the crop in which the landmark network expects a face with these 468 points (px of the picture)."""
     right = points_px[list(LEFT_EYE_CORNERS)].mean(axis=0) - points_px[list(RIGHT_EYE_CORNERS)].mean(axis=0)
     down = points_px[CHIN] - points_px[FOREHEAD]
     across = right + (down[1], -down[0])  # in a profile the eyes say nothing of the roll, chin and forehead do

@@ -31,7 +31,7 @@ MIN_LANDMARKS = 6  # that models share, for one to be carried to the other
 
 
 class NoLandmarkMap(EigenheadError):
-    """A model on which nobody knows where the points of a face are."""
+    """Reports a head model that names too few landmarks to place the 468 points of a face on it."""
 
     def __init__(self, name: str, shared: int) -> None:
         super().__init__(
@@ -42,7 +42,8 @@ class NoLandmarkMap(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:
-    """A model's surface points for the finder's points, and the finder's error (mm, head frame). Read-only arrays."""
+    """Holds the points on a head model's surface that the finder's 468 points stand for, and the finder's error at each
+    (mm, head frame). Arrays are read-only."""
 
     rows: Int[np.ndarray, "468 3"]  # vertices of the full level
     weights: Float[np.ndarray, "468 3"]  # of them; each row sums to 1
@@ -52,21 +53,25 @@ class LandmarkMap:
     slides: Bool[np.ndarray, " 468"]  # jaw line, forehead: better left out of what looks for single points
 
     def points(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "468 3"]:
-        """The surface points of a head with these vertices (full level, any frame)."""
+        """Returns the 468 surface points of a head, from its vertices at the full level, in the
+        frame of the vertices."""
         return (vertices[self.rows] * self.weights[..., None]).sum(axis=1)
 
     def expected(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "468 3"]:
-        """Where the finder puts them in the mean, for vertices in the head frame."""
+        """Returns where the finder puts the 468 points on average: the surface points with the finder's mean error
+        added (mm, head frame)."""
         return self.points(vertices) + self.offset_mm
 
     def covariance(self, which: Int[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
-        """Of the errors of some points, x y z of the first, then of the second and so on (mm^2, head frame)."""
+        """Returns the covariance of the finder's errors at the named points (mm^2, head frame), ordered x y z of the
+        first point, x y z of the second and so on."""
         modes = self.shared_mm[:, which].reshape(len(self.shared_mm), -1)
         return modes.T @ modes + np.diag(self.deviation_mm[which].ravel() ** 2)
 
 
 def landmark_map(model: HeadModel) -> LandmarkMap:
-    """Returns a model's map: the measured one where its triangles are a built-in model's, else a carried one.
+    """Returns the landmark map of a head model. A built-in model, known by its triangles, has a measured one; for any
+    other the points are carried over from the default model's mean head.
 
     Raises NoLandmarkMap where the model names too few landmarks.
     """
@@ -80,13 +85,14 @@ def landmark_map(model: HeadModel) -> LandmarkMap:
 
 
 def built_in_map(name: str) -> LandmarkMap:
-    """Returns the measured map of ``makehuman`` or ``ict-facekit``."""
+    """Returns the measured landmark map of a built-in model, ``makehuman`` or ``ict-facekit``."""
     table = _table()
     return _map(table[f"{name}_rows"], table[f"{name}_weights"], table[f"{name}_offset_mm"], 0.0)
 
 
 def faces_digest(model: HeadModel) -> str:
-    """Returns the sha256 of a model's triangles: heads of one topology have their points at the same rows."""
+    """Returns the SHA-256 of a head model's triangles at the full level. Models with the same triangles share one
+    landmark map."""
     faces = np.ascontiguousarray(model.levels["full"].faces, np.int32)
     return hashlib.sha256(faces.tobytes()).hexdigest()
 

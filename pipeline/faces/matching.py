@@ -43,11 +43,11 @@ DISSENTING_FACING = 0.5  # the same of a camera that must see it
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFaces:
-    """One face in several views, and its points in the world (mm).
+    """Holds one person's face as found in several views, and its 468 points in the world frame (mm).
 
-    An error of the points is the sum of three: one of each point by its own (``covariances``), one of each view
-    (``shared_mm``: each mode times a standard normal number), and the network's idea of a face, which all views share
-    (a model's ``landmark_map.LandmarkMap``).
+    The error of a point is the sum of three: the point's own, independent of all others (``covariances``); the view's,
+    common to all points that the view shows (``shared_mm``: each mode times a standard normal number); and the
+    network's idea of a face, common to all views (the model's ``landmark_map.LandmarkMap``).
     """
 
     detections: Mapping[str, FaceDetection]  # by view
@@ -64,12 +64,12 @@ class MatchedFaces:
 
     @property
     def eye_distance_mm(self) -> float:
-        """Between the middles of the eyes."""
+        """Returns the distance between the middles of the two eyes (mm)."""
         return _eye_distance_mm(self.points_world)
 
     @property
     def facing_world(self) -> Float[np.ndarray, " 3"]:
-        """Unit vector along which the face looks."""
+        """Returns the unit vector (world frame) along which the face looks."""
         return self.world_from_face.rotation[:, 2]
 
 
@@ -79,7 +79,8 @@ def match_faces(
     *,
     eye_distance_mm: tuple[float, float] | None = EYE_DISTANCE_MM,
 ) -> MatchedFaces | None:
-    """Finds the face that the rig was set up for among all that its views show.
+    """Finds the subject's face among all faces that the views show, and triangulates its 468 points. Returns None where
+    no two views show one face.
 
     Args:
         candidates: the faces found in each view, best first.
@@ -93,7 +94,8 @@ def match_faces(
 def find_subject_face(
     candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig, eye_distance_mm: tuple[float, float] | None
 ) -> TriangulatedFace | None:
-    """Finds the face that ``match_faces`` finds, and triangulates a few of its points."""
+    """Finds the subject's face, as ``match_faces`` does, and triangulates only every thirteenth of its points, which is
+    faster."""
     faces = _consistent(candidates, rig, eye_distance_mm)
     return max(faces, key=lambda face: _prominence(face, rig), default=None)
 
@@ -101,7 +103,8 @@ def find_subject_face(
 def complete_match(
     face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> MatchedFaces | None:
-    """Triangulates all points of a face. None where its views do not determine every one."""
+    """Triangulates all 468 points of a face that was found. Returns None where its views do not
+    determine every point."""
     whole = triangulate_face(face.detections, rig)
     return whole and _matched(whole, rig, _outliers(face, candidates, rig))
 
@@ -231,7 +234,7 @@ def _dissenting(face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDe
 
 
 def mean_eye_distance_mm() -> float:
-    """Returns how far the eyes' middles are apart in the mean adult."""
+    """Returns the distance between the middles of the eyes of the mean adult (mm)."""
     return _eye_distance_mm(point_table().shape_mm)
 
 

@@ -39,7 +39,7 @@ LID_POINTS, IRIS_POINTS = 16, 5
 
 
 class DamagedNetwork(EigenheadError):
-    """A network's file that is missing, or not the one that this version was made with."""
+    """Reports a network file that is missing or whose content is not the one that this version was made with."""
 
     def __init__(self, path: Path, why: str) -> None:
         super().__init__(f"{path}: {why}; install the program again")
@@ -47,7 +47,7 @@ class DamagedNetwork(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceNetworks:
-    """The loaded networks. Several threads may use one: a lock lets them in one by one."""
+    """Holds the three loaded networks. Several threads may share them: a lock runs one network at a time."""
 
     finder: cv2.dnn.Net
     landmark: cv2.dnn.Net
@@ -55,7 +55,7 @@ class FaceNetworks:
     _lock: Any = field(default_factory=threading.Lock, repr=False)
 
     def find(self, crop: UInt8[np.ndarray, "192 192 3"]) -> tuple[Float[np.ndarray, "n 8 2"], Float[np.ndarray, " n"]]:
-        """Proposes a face at every cell of a picture.
+        """Proposes a face for every cell of the 192 x 192 crop; most proposals are none, as their scores say.
 
         Returns:
             For each cell a face's centre, width and height, right eye, left eye, tip of the nose, mouth, right and left
@@ -70,15 +70,16 @@ class FaceNetworks:
         return faces, scores.ravel().astype(float)
 
     def place_landmarks(self, crop: UInt8[np.ndarray, "192 192 3"]) -> tuple[Float[np.ndarray, "468 3"], float]:
-        """Places the points on the face that fills a crop (px of the crop, z likewise), and returns its score."""
+        """Returns the 468 points of the face that fills a crop (x, y and z in px of the crop) and the network's score,
+        above 0 for a face."""
         points, score = self._run(self.landmark, _blob(crop), ("conv2d_20", "conv2d_30"))
         return points.reshape(LANDMARKS, 3).astype(float), float(score.ravel()[0])
 
     def place_eye(
         self, crop: UInt8[np.ndarray, "64 64 3"]
     ) -> tuple[Float[np.ndarray, "16 2"], Float[np.ndarray, "5 2"]]:
-        """Places the lids' edges and the iris (centre, left, top, right, bottom) of a right eye, or of a left one
-        mirrored (px of the crop)."""
+        """Returns the lids' edges and the iris (centre, left, top, right, bottom) of the eye in a crop (px of the
+        crop). The eye must be a right one, or a left one mirrored."""
         eye, iris = self._run(self.eye, _blob(crop), ("output_eyes_contours_and_brows", "output_iris"))
         return eye.reshape(-1, 3)[:LID_POINTS, :2].astype(float), iris.reshape(IRIS_POINTS, 3)[:, :2].astype(float)
 
@@ -89,7 +90,7 @@ class FaceNetworks:
 
 
 def load_networks(folder: Path = PACKS) -> FaceNetworks:
-    """Loads the networks (0.05 s, 25 MB). Raises DamagedNetwork."""
+    """Loads the three networks from a folder (0.05 s, 25 MB). Raises DamagedNetwork."""
     finder, landmark, eye = (_load(folder / name) for name in SHA256)
     return FaceNetworks(finder, landmark, eye)
 

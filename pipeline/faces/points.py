@@ -23,9 +23,10 @@ inner one, then along the upper lid."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTable:
-    """What was measured of the points; arrays are read-only. Face frame: x to the subject's left, y up, z out.
+    """Holds what was measured of the network's 468 points. Arrays are read-only. Face frame: x to the subject's left, y
+    up, z out of the face.
 
-    Noise is in shares of a face's size, and its logarithm grows with ``1 - cos`` of an angle.
+    Noise is a share of the face's size in the picture. Its logarithm grows with ``1 - cos`` of the angle to the camera.
     """
 
     mirror_images: Int[np.ndarray, " 468"]  # of each point; those of the midline are their own
@@ -38,7 +39,7 @@ class PointTable:
 
 @cache
 def point_table() -> PointTable:
-    """Reads the table that ships with the networks."""
+    """Returns the table of measurements that ships with the networks, read once."""
     with np.load(Path(__file__).parent / "packs" / "points.npz", allow_pickle=False) as table:
         arrays = {name: table[name].astype(int if name == "mirror_images" else float) for name in table.files}
     for array in arrays.values():
@@ -47,8 +48,9 @@ def point_table() -> PointTable:
 
 
 def view_terms(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 8"]:
-    """Returns what a point's error depends on: terms to the third order of the direction from the face to the camera
-    (unit, face frame). ``VIEW_TERMS_MIRRORED`` are their signs for a mirror image."""
+    """Returns the eight polynomial terms, up to third order, that the network's bias is a sum of. ``direction`` is the
+    unit vector from the face to the camera (face frame); times ``VIEW_TERMS_MIRRORED`` the terms are those of the
+    mirror image."""
     x, y, _ = direction
     return np.array([1.0, x, y, x * x, x * y, y * y, x**3, x * x * y])
 
@@ -57,14 +59,15 @@ VIEW_TERMS_MIRRORED = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
 
 
 def view_bias(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "468 2"]:
-    """Returns how far the network puts each point from where it is, seen from a direction: shares of the face's size,
-    right and down in a picture that is level with the face."""
+    """Returns by how much the network misplaces each point of a face seen from ``direction`` (unit, face frame): to the
+    right and down in a picture level with the face, as a share of the face's size."""
     return np.tensordot(view_terms(direction), point_table().view_bias, axes=1)
 
 
 def place_face(points_world: Float[np.ndarray, "n 3"], which: slice = slice(None)) -> tuple[Similarity, float]:
-    """Returns where a mean face lies that is most like some of the points, by its breadth and height, and their depth
-    by its own."""
+    """Returns the pose and scale (world_from_face) at which a mean face fits some of the points best, and the relief.
+    The scale follows from breadth and height; the relief is the points' depth over the mean face's, 1 for a mean face
+    and 0 for a flat one."""
     shape = point_table().shape_mm[which]
     mean, middle = shape.mean(axis=0), points_world.mean(axis=0)
     rotation = rigid_fit(shape, points_world).rotation
@@ -76,6 +79,6 @@ def place_face(points_world: Float[np.ndarray, "n 3"], which: slice = slice(None
 
 
 def direction_from_face(world_from_face: Similarity, camera: Camera) -> Float[np.ndarray, " 3"]:
-    """Returns the unit direction from a face to a camera, in the face's frame."""
+    """Returns the unit vector from a face to a camera, in the face frame."""
     towards = (camera.centre_world - world_from_face.translation) @ world_from_face.rotation
     return towards / np.linalg.norm(towards)

@@ -29,7 +29,8 @@ MIN_WITNESSES = 2  # other cameras that show the face, before one is blamed that
 
 
 def reduce_picture(image: ImageRgb, camera: Camera, longest_px: int) -> tuple[UInt8[np.ndarray, "_ _ 3"], Camera]:
-    """Makes a picture smaller, where its longer side is above ``longest_px``, and its camera with it."""
+    """Returns a picture and its camera reduced so that the picture's longer side is ``longest_px``; both unchanged
+    where it is no longer than that."""
     factor = longest_px / max(image.shape[:2])
     if factor >= 1.0:
         return image, camera
@@ -46,7 +47,8 @@ def sight_face(
     front: str,
     eye_distance_mm: tuple[float, float] | None = EYE_DISTANCE_MM,
 ) -> FaceSighting:
-    """Finds the face and where it looks (0.1 to 0.4 s at 640 px, by the views that show it).
+    """Finds the subject's face in small pictures, which cameras lack it, and how far it is turned from the front
+    camera. Takes 0.1 to 0.4 s at 640 px.
 
     Args:
         images: by camera, small.
@@ -102,7 +104,7 @@ def _missing(subject: SubjectFaces, face: MatchedFaces) -> tuple[str, ...]:
 
 
 def file_pixels(pixels: Float[np.ndarray, "n 2"], read_by: Camera, recorded_by: Camera) -> Float[np.ndarray, "n 2"]:
-    """Returns where pixels of a picture that was read smaller, and undistorted, lie in its file."""
+    """Returns where pixels of a picture that was reduced and undistorted on reading lie in the picture's file."""
     small, full = read_by.intrinsics, recorded_by.intrinsics
     scaled = (pixels + 0.5) * (full.width / small.width, full.height / small.height) - 0.5
     lens = recorded_by.recorded

@@ -24,8 +24,8 @@ MIN_COSINE = 0.2  # of the angle from a point's normal to the camera: those that
 
 
 def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | None:
-    """Returns world_from_face of a mean adult whose points a camera sees where they were found, at scale 1. None where
-    no pose of a face explains them, or where they leave the lens."""
+    """Returns the pose (world_from_face, scale 1) in which a mean adult's points project to where one camera found
+    them. Returns None where no pose explains the points or where they lie outside the lens."""
     shape, pixels = point_table().shape_mm, face.landmarks_px
     seen = np.ones(len(shape), bool)
     placed: Similarity | None = None
@@ -42,7 +42,8 @@ def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | Non
 
 
 def match_alone(name: str, face: FaceDetection, camera: Camera) -> MatchedFaces | None:
-    """Returns the face as ``matching`` hands it on, for a view that alone shows one. None as ``place_from_one_view``.
+    """Returns a face that only one view shows in the form that ``matching`` returns, its points being a mean adult's.
+    Returns None where ``place_from_one_view`` does.
 
     The pixels say where the points are across the line of sight. What they leave open moves all points together: along
     their rays, and about the face's middle.

@@ -41,11 +41,11 @@ MIN_INSIDE = 0.6  # share of a face's points within a picture
 
 @dataclass(frozen=True, slots=True)
 class SearchEffort:
-    """How far a search goes.
+    """Holds how thoroughly the subject's face is searched for.
 
-    ``max_fruitless``: views without a face after which it ends; None searches all, and small faces after that.
-    ``min_facing``: cosine between where a face looks and a camera in which it is looked for; ``rounds``: how often
-    that is done again as views join.
+    ``max_fruitless``: the search ends after this many views without a face; with None all views are searched, and then
+    small faces. ``min_facing``: least cosine between where the face looks and the direction to a camera whose picture
+    is looked at again; ``rounds``: how often that is repeated as views join.
     """
 
     max_fruitless: int | None = None
@@ -59,9 +59,9 @@ THOROUGH = SearchEffort()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubjectFaces:
-    """What was found in each view that was searched or looked at, best first, and the subject among it.
+    """Holds the faces found in each view that was searched, best first, and which of them are the subject's.
 
-    Where one view alone shows a face, and that beyond doubt, its points are the mean adult's (``single_view``).
+    Where a single view shows a face, and beyond doubt, the points are a mean adult's (``single_view``).
     """
 
     found: Mapping[str, tuple[FaceDetection, ...]]

@@ -26,7 +26,7 @@ ROUNDS = 2  # of how the face lies, and what follows from it
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangulatedFace:
-    """Points of one face in the world, and what is said of them in each view (in the order of ``detections``).
+    """Holds points of one face in the world frame, with each view's pixels and noise in the order of ``detections``.
 
     Noise is independent from point to point in ``noise_px`` and ``points.covariances``; ``view_noise_px`` moves all
     points of a view together.
@@ -42,7 +42,7 @@ class TriangulatedFace:
 
     @property
     def misfits(self) -> dict[str, float]:
-        """Of each view the RMS of its residuals by their noise."""
+        """Returns, for each view, the RMS of its residuals divided by their expected noise: 1 where they agree."""
         variance = self.noise_px[..., None] ** 2 + self.view_noise_px[:, None, None] ** 2
         squares = (self.points.residuals_px**2 / variance).mean(axis=(1, 2))
         return dict(zip(self.detections, np.sqrt(squares).tolist(), strict=True))
@@ -51,7 +51,8 @@ class TriangulatedFace:
 def triangulate_face(
     detections: Mapping[str, FaceDetection], rig: Rig, which: slice = ALL_POINTS
 ) -> TriangulatedFace | None:
-    """Triangulates some of a face's points, or all. None where its views do not determine them."""
+    """Triangulates the points ``which`` of a face from its detections by view, and places a mean face on them. Returns
+    None where the views do not determine the points."""
     cameras, faces = [rig[name] for name in detections], list(detections.values())
     pixels = np.stack([face.landmarks_px[which] for face in faces])
     sizes = np.array([face.size_px for face in faces])
@@ -73,7 +74,8 @@ def triangulate_face(
 
 
 def unbiased_px(face: FaceDetection, world_from_face: Similarity, camera: Camera) -> Float[np.ndarray, "468 2"]:
-    """Returns a detection's points without the network's bias for a face that lies as it does."""
+    """Returns a detection's 468 points (px of the picture) with the network's bias for this pose of
+    the face taken off."""
     bias = face.size_px * view_bias(direction_from_face(world_from_face, camera))
     roll = np.deg2rad(face.roll_deg)
     picture_from_level = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
@@ -87,7 +89,8 @@ def point_noise_px(
     camera: Camera,
     which: slice = ALL_POINTS,
 ) -> Float[np.ndarray, " n"]:
-    """Returns the standard deviation of a coordinate of each point in a view, by its own."""
+    """Returns the standard deviation (px, along each axis) of the independent error of each point in a view. It grows
+    as the skin at the point turns away from the camera."""
     straight, growth = point_table().point_noise
     normals = point_table().normals[which] @ world_from_face.rotation.T
     towards = camera.centre_world - points_world
@@ -96,13 +99,14 @@ def point_noise_px(
 
 
 def view_noise_px(size_px: float, world_from_face: Similarity, camera: Camera) -> float:
-    """Returns the standard deviation by which all points of a view are off together, along each axis."""
+    """Returns the standard deviation (px, along each axis) of the error that all points of a view have in common."""
     straight, growth = point_table().view_noise
     return float(straight * size_px * np.exp(growth * (1.0 - direction_from_face(world_from_face, camera)[2])))
 
 
 def shared_modes(face: TriangulatedFace, rig: Rig) -> Float[np.ndarray, "m n 3"]:
-    """Returns how the points move together (mm) by one standard deviation of each view's noise along each axis."""
+    """Returns, for each view and each image axis, how far every point moves (mm) if all pixels of the view are off by
+    one standard deviation of the view's common error."""
     modes = []
     for name, noise, view_noise in zip(face.detections, face.noise_px, face.view_noise_px, strict=True):
         _, slopes = rig[name].project_with_jacobian(face.points.positions_world)

@@ -11,7 +11,7 @@ DATA, MODELS = "EIGENHEAD_DATA", "EIGENHEAD_MODELS"
 
 
 def data_folder() -> Path:
-    """Returns the folder of captures, results, keys, jobs and models. It need not exist."""
+    """Returns the folder in which captures, results, keys, jobs and models are kept. The folder need not exist."""
     configured = os.environ.get(DATA)
     if configured:
         return Path(configured)
@@ -19,6 +19,6 @@ def data_folder() -> Path:
 
 
 def models_folder() -> Path:
-    """Returns the folder of the user's own head models. It need not exist."""
+    """Returns the folder of the user's head models. The folder need not exist."""
     configured = os.environ.get(MODELS)
     return Path(configured) if configured else data_folder() / "models"

@@ -34,7 +34,8 @@ ARKIT = tuple(sorted([*_WHOLE, *(f"{name}{side}" for name in _SIDED for side in 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expressions:
-    """Holds E shapes on the cage, head frame. Arrays are read-only once they belong to a model."""
+    """Holds the expressions of a model as displacements of the cage's vertices (head frame). Arrays are read-only once
+    they belong to a model."""
 
     names: tuple[str, ...]
     shapes: Float32[np.ndarray, "E V0 3"]  # mm at weight 1
@@ -43,8 +44,8 @@ class Expressions:
         return len(self.names)
 
     def moved(self, weights: Mapping[str, float]) -> Float[np.ndarray, "V0 3"]:
-        """Returns the displacement of the cage (mm) for weights by name. Raises KeyError for a name that is not
-        there."""
+        """Returns the displacement of each vertex of the cage (mm) for weights that are named by expression. Raises
+        KeyError for an unknown expression."""
         out = np.zeros(self.shapes.shape[1:])
         for name, weight in weights.items():
             if name not in self.names:
@@ -54,33 +55,34 @@ class Expressions:
 
 
 def no_expressions(vertices: int) -> Expressions:
-    """Returns the expressions of a model that has none."""
+    """Returns an empty set of expressions for a cage with this many vertices."""
     return Expressions((), np.zeros((0, vertices, 3), np.float32))
 
 
 def visible(expressions: Expressions) -> Expressions:
-    """Returns those that move the skin."""
+    """Returns the expressions that move some vertex of the skin by ``MIN_MM`` or more."""
     kept = np.linalg.norm(expressions.shapes, axis=2).max(axis=1) >= MIN_MM if len(expressions) else np.zeros(0, bool)
     names = tuple(name for name, keep in zip(expressions.names, kept, strict=True) if keep)
     return Expressions(names, expressions.shapes[kept])
 
 
 def plain_name(name: str) -> str:
-    """Returns a name in Apple's manner: ``mouthSmile_L`` is ``mouthSmileLeft``."""
+    """Returns the name of an expression in Apple's spelling: ``mouthSmile_L`` becomes ``mouthSmileLeft``."""
     return re.sub(r"_([LR])$", lambda side: "Left" if side[1] == "L" else "Right", name)
 
 
 def words(name: str) -> str:
-    """Returns a name as people say it: ``mouthSmile_L`` is ``mouth smile left``."""
+    """Returns the name of an expression in plain words: ``mouthSmile_L`` becomes ``mouth smile left``."""
     spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", plain_name(name))
     return re.sub(r"[-_ ]+", " ", spaced).strip().lower()
 
 
 def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """Returns for each of Apple's names, in their order: which of the shapes together stand for it; none where none
-    does.
+    """Returns, for each of Apple's 52 names, the indices of the model's shapes that together stand for it; an empty
+    tuple where none does.
 
-    A shape of that name, or the two sides of one that Apple does not part (ICT-FaceKit's cheekPuff_L and cheekPuff_R).
+    That is the shape of the same name or, where the model splits what Apple does not, the left and the right one
+    (ICT-FaceKit's cheekPuff_L and cheekPuff_R).
     """
     known = {plain_name(name): k for k, name in enumerate(names)}
     found = {}
@@ -91,8 +93,8 @@ def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
-    """Reads ``NAME=WEIGHT`` with names of the model, in its own manner or Apple's. Raises InputError naming every
-    fault."""
+    """Reads texts such as ``mouthSmile_L=0.5`` and returns the weights by the model's name of the expression; Apple's
+    names are understood, too. Raises InputError naming every fault."""
     known = {plain_name(name): name for name in names} | {name: name for name in names}
     found, faults = {}, []
     for text in texts:
@@ -115,7 +117,7 @@ def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str,
 
 
 def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
-    """Tells how far the eyes (``right``, ``left``) are closed by blinking, 0 to 1."""
+    """Returns how far each eye (``right``, ``left``) is closed by the blinks among the weights, from 0 (open) to 1."""
     found: dict[str, float] = dict.fromkeys(("right", "left"), 0.0)
     for name, weight in weights.items():
         side = BLINKS.get(plain_name(name))
@@ -125,7 +127,8 @@ def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
 
 
 def packed(expressions: Expressions) -> dict[str, np.ndarray]:
-    """Packs them as a model file keeps them: the moved vertices of each shape, float16 (0.004 mm of a centimetre)."""
+    """Packs expressions into the arrays of a model file: only the vertices that each shape moves, in float16 (0.004 mm
+    of a centimetre)."""
     moved = np.abs(expressions.shapes).max(axis=2) > SPARSE_MM
     return {
         "expression_counts": moved.sum(axis=1).astype(np.int32),
@@ -135,7 +138,8 @@ def packed(expressions: Expressions) -> dict[str, np.ndarray]:
 
 
 def unpacked(names: list[str], arrays: Mapping[str, np.ndarray], vertices: int) -> Expressions:
-    """Returns what ``packed`` made. Raises ValueError where the arrays contradict each other."""
+    """Returns the expressions that ``packed`` made arrays of, for a cage with this many vertices. Raises ValueError
+    where the arrays contradict each other."""
     counts, rows, moves = (arrays[f"expression_{part}"] for part in ("counts", "vertices", "moves"))
     if len(counts) != len(names) or counts.sum() != len(rows) or moves.shape != (len(rows), 3):
         raise ValueError("its expressions' arrays do not fit each other")

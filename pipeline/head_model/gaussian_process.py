@@ -26,7 +26,7 @@ KEPT = 0.98  # share of the process's variance that the modes must carry
 
 @dataclass(frozen=True, slots=True)
 class KernelScale:
-    """Holds one Gaussian of the kernel."""
+    """Holds the length and the amplitude (mm) of one Gaussian in the covariance of the Gaussian process."""
 
     length_mm: float
     amplitude_mm: float
@@ -41,7 +41,8 @@ FREE = 0.4  # share of the variance that need not be symmetric
 def with_kernel(
     model: HeadModel, count: int, *, scales: tuple[KernelScale, ...] = SCALES, most: int = 300
 ) -> HeadModel:
-    """Returns the first ``count`` eigenheads followed by at most ``most`` kernel modes (mm per standard deviation)."""
+    """Returns the model with its first ``count`` eigenheads as modes, followed by at most ``most`` modes of the
+    Gaussian process (mm per standard deviation)."""
     span = with_modes(model, count)
     modes = kernel_modes(span, scales, most)
     sigma = np.linalg.norm(modes.reshape(len(modes), -1), axis=1).astype(np.float32)
@@ -54,11 +55,11 @@ def with_kernel(
 
 
 def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float, most: int = 400) -> HeadModel:
-    """Returns the model with further modes of a shorter length inside the face region, for those who see more than a
-    rim.
+    """Returns the model with further modes of a shorter length that deform the face region only, for solvers that see
+    more of the face than its outline.
 
-    They fade out over half a length beyond the region, and are not made orthogonal to the others: prior variance of a
-    deformation is meant to add up over lengths.
+    The modes fade out over half a length beyond the region. They are not made orthogonal to the other modes: the prior
+    variances of all lengths are meant to add up.
     """
     level = model.levels["cage"]
     points = model.mean.astype(float)
@@ -85,7 +86,8 @@ def _gaussian(
 
 
 def kernel_modes(model: HeadModel, scales: tuple[KernelScale, ...], most: int) -> Float[np.ndarray, "r v0 3"]:
-    """Eigenfunctions of the process on the cage, along its normals, orthogonal to the model's own modes."""
+    """Returns the leading eigenfunctions of the Gaussian process: displacements of the cage's vertices along their
+    normals (mm per standard deviation), orthogonal to the model's modes."""
     points = model.mean.astype(float)
     normals = vertex_normals(points, model.levels["cage"].faces)
     nodes = spread_nodes(points, min(NODES, len(points)))
@@ -104,7 +106,7 @@ def kernel_modes(model: HeadModel, scales: tuple[KernelScale, ...], most: int) -
 def covariance(
     x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"], scales: tuple[KernelScale, ...]
 ) -> Float[np.ndarray, "n m"]:
-    """Returns k(x, y) in mm^2."""
+    """Returns the covariance k(x, y) of the displacements at points x and y (mm^2); positions in mm, head frame."""
     direct, mirrored = _square_distance(x, y), _square_distance(x, y * (-1.0, 1.0, 1.0))
     total = np.zeros_like(direct)
     for scale in scales:
@@ -120,7 +122,8 @@ def _square_distance(x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"]) -
 
 
 def spread_nodes(points: Float[np.ndarray, "v 3"], count: int) -> Int[np.ndarray, " n"]:
-    """Returns farthest-point sampling, from the point farthest along z: even cover, the same every time."""
+    """Returns the indices of ``count`` points that lie far from each other, by farthest-point sampling from the one
+    with the largest z. The same points give the same choice."""
     nodes = np.empty(count, int)
     nodes[0] = int(np.argmax(points[:, 2]))
     distance = np.full(len(points), np.inf)

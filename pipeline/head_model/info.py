@@ -12,7 +12,7 @@ class LevelInfo(TypedDict):
 
 
 class ModelInfo(TypedDict):
-    """Says what is known of a model. Vertices and faces are the full level's; what nobody measured is None."""
+    """Holds what is known of a model. Vertices and faces are those of the full level; what nobody measured is None."""
 
     name: str
     licence: str
@@ -32,7 +32,7 @@ class ModelInfo(TypedDict):
 
 
 def model_info(model: HeadModel) -> ModelInfo:
-    """Returns plain values."""
+    """Returns what a model is made of, as plain values that JSON can hold."""
     full = model.levels["full"]
     return {
         "name": model.name,

@@ -46,7 +46,8 @@ SEVEN_POINTS = (
 
 
 def mirrored(name: str) -> str:
-    """Returns the same landmark on the other side; a midline landmark is its own mirror image."""
+    """Returns the name of the landmark on the other side of the head; a midline landmark has no other and keeps its
+    name."""
     if name.endswith("_right"):
         return name.removesuffix("_right") + "_left"
     if name.endswith("_left"):
@@ -55,5 +56,6 @@ def mirrored(name: str) -> str:
 
 
 def stacked(points: Mapping[str, Float[np.ndarray, " 3"]], names: Iterable[str] = NAMES) -> Float[np.ndarray, "L 3"]:
-    """Returns the named points as rows, in the order of ``names``. Raises KeyError where one is missing."""
+    """Returns the positions of the landmarks ``names`` as rows of an array, in that order. Raises KeyError where one is
+    missing."""
     return np.array([points[name] for name in names], float).reshape(-1, 3)

@@ -26,8 +26,8 @@ MODES_AT_ONCE = 16  # in double precision: they stay in the processor's cache
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds one resolution. ``vertices_level = operator @ vertices_cage``; faces wind anticlockwise seen from
-    outside."""
+    """Holds one resolution of a head model. ``vertices_level = operator @ vertices_cage``; faces wind anticlockwise
+    seen from outside."""
 
     faces: Int[np.ndarray, "F 3"]
     operator: sparse.csr_array  # (V, V0)
@@ -38,13 +38,14 @@ class Level:
 
     @property
     def count(self) -> int:
-        """Returns the number of vertices."""
+        """Returns the number of vertices of this level."""
         return row_count(self.operator)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadModel:
-    """Holds H(z) = mean + sum_m z_m modes_m (eq. 1), head frame, mm. Arrays are read-only. Memory: see the module."""
+    """Holds an eigenhead model, H(z) = mean + sum_m z_m modes_m (eq. 1), in the head frame (mm).
+    Arrays are read-only."""
 
     name: str
     licence: str
@@ -64,7 +65,8 @@ class HeadModel:
     _bases: dict[tuple[str, int], np.ndarray] = field(default_factory=dict, repr=False)
 
     def cage(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "V0 3"]:
-        """Returns cage vertices (float64, mm) for the first m <= M coefficients, in standard deviations."""
+        """Returns the vertices of the cage (head frame, mm) for the first m coefficients, given in standard deviations.
+        Raises ValueError for more coefficients than modes."""
         count = len(coefficients)
         if count > len(self.modes):
             raise ValueError(f"{count} coefficients, but model {self.name} has {len(self.modes)} modes")
@@ -75,21 +77,24 @@ class HeadModel:
         return found.reshape(-1, 3)
 
     def vertices(self, coefficients: Float[np.ndarray, " m"], level: str = "full") -> Float[np.ndarray, "V 3"]:
-        """Returns vertices of a level, float64, head frame, mm. Raises KeyError for an unknown level."""
+        """Returns the vertices of a level (head frame, mm) for the first coefficients, given in standard deviations.
+        Raises KeyError for an unknown level."""
         return self.levels[level].operator @ self.cage(coefficients)
 
     def posed_vertices(
         self, coefficients: Float[np.ndarray, " m"], weights: Mapping[str, float], level: str = "full"
     ) -> Float[np.ndarray, "V 3"]:
-        """Returns ``vertices`` of a head that makes a face: weights of expressions by name. Raises KeyError."""
+        """Returns the vertices of a level (head frame, mm) with expressions added, whose weights are named by
+        expression. Raises KeyError for an unknown level or expression."""
         return self.levels[level].operator @ (self.cage(coefficients) + self.expressions.moved(weights))
 
     def basis(
         self, level: str, count: int, vertices: Int[np.ndarray, " S"] | None = None
     ) -> Float32[np.ndarray, "m S 3"]:
-        """Returns the first ``count`` modes at a level's vertices (all, or the given ones), mm per standard deviation.
+        """Returns the first ``count`` modes at the vertices of a level, or at those in ``vertices`` alone (mm per
+        standard deviation).
 
-        Only the rows asked for are computed. The basis of a whole level is kept and handed out read-only.
+        The basis of a whole level is kept and handed out read-only; that of a few vertices is computed anew.
         """
         if vertices is not None:
             return self._rows(self.levels[level].operator[np.asarray(vertices)], count)
@@ -106,7 +111,8 @@ class HeadModel:
 
 
 def assemble(parts: ModelParts, sha256: str) -> HeadModel:
-    """Returns the model in memory: operators, borders and landmarks of every level; arrays become read-only."""
+    """Builds the model in memory from the parts of a model file: operators, borders and landmarks of every level.
+    Arrays become read-only."""
     count = len(parts.mean)
     full, full_faces = refine(parts.faces, count, parts.subdivisions)
     region = full @ parts.face_region.astype(float) > 0.5
@@ -164,14 +170,14 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 
 
 def load_model(name_or_path: str | Path = "default") -> HeadModel:
-    """Returns the named model (shipped, or in the user's folder) or the one in a file. Raises UnknownModel or
-    BadModel."""
+    """Loads a head model by its name (shipped, or in the user's folder) or from a file. Raises
+    UnknownModel or BadModel."""
     parts, sha256 = read_parts(model_path(name_or_path))
     return assemble(parts, sha256)
 
 
 def with_modes(model: HeadModel, count: int) -> HeadModel:
-    """Returns the same model with only its first ``count`` modes."""
+    """Returns the model reduced to its first ``count`` modes."""
     posed = range(min(model.posed.start, count), min(model.posed.stop, count))
     return replace(
         model,
@@ -184,8 +190,8 @@ def with_modes(model: HeadModel, count: int) -> HeadModel:
 
 
 def with_expressions(model: HeadModel) -> HeadModel:
-    """Returns the model with its expressions as further modes, whose coefficients are their weights; as it is without
-    any."""
+    """Returns the model with its expressions appended as modes, so that their coefficients are the expressions'
+    weights. Returns the same model where it has no expressions or they are modes already."""
     count = len(model.expressions)
     if not count or len(model.posed):
         return model

@@ -13,15 +13,16 @@ from rig.mesh import vertex_normals
 
 
 def model_basis(model: HeadModel, settings: Settings) -> HeadModel:
-    """Returns the model with the modes that the settings ask for: the eigenheads in use and, where the detail goes
-    beyond their span, the kernel's modes and the model's expressions."""
+    """Returns the model with the modes that the settings ask for: eigenheads alone, or eigenheads, modes of the
+    Gaussian process and expressions where the fit may leave the span."""
     within_span = settings.detail == "span" or settings.method == "simplex"
     return basis_of(model, min(settings.fitting.modes, len(model.modes)), kernel=not within_span)
 
 
 @lru_cache(maxsize=2)  # models are few, jobs are many, and others keep what they make of the same model
 def basis_of(model: HeadModel, eigenheads: int, *, kernel: bool) -> HeadModel:
-    """Returns the model with its first ``eigenheads`` modes, and with kernel modes and expressions if ``kernel``."""
+    """Returns the model with its first ``eigenheads`` modes and, if ``kernel``, the modes of the Gaussian process and
+    the expressions after them."""
     if not kernel:
         return with_modes(model, eigenheads)
     inputs = (model.mean, model.modes[:eigenheads], model.sigma[:eigenheads], model.levels["cage"].faces)

@@ -31,7 +31,7 @@ class BadModel(EigenheadError):
 
 
 class Damaged(BadModel):
-    """Holds a file of which a part is missing or cannot be read."""
+    """Reports a model file of which a part is missing or cannot be read."""
 
     def __init__(self, path: Path | str, fault: Exception) -> None:
         super().__init__(path, f"damaged or incomplete ({fault})")
@@ -39,7 +39,8 @@ class Damaged(BadModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelParts:
-    """Holds what a model file holds; ``assemble`` makes the HeadModel of it."""
+    """Holds the content of a model file. ``pipeline.head_model.model.assemble`` builds the
+    HeadModel from these parts."""
 
     name: str
     licence: str
@@ -60,7 +61,7 @@ class ModelParts:
 
 
 def save_model(path: Path, parts: ModelParts) -> None:
-    """Writes a model file (npz, compressed; float32, rounded to 2^-12 mm so that it packs small)."""
+    """Writes a model file (compressed npz, float32). Lengths are rounded to 2^-12 mm, which compresses well."""
     expressions = parts.expressions or no_expressions(len(parts.mean))
     meta = {
         "format": FORMAT,
@@ -92,7 +93,7 @@ def save_model(path: Path, parts: ModelParts) -> None:
 
 
 def rounded(values: np.ndarray) -> Float32[np.ndarray, "..."]:
-    """Rounds as a model file keeps lengths."""
+    """Returns lengths (mm) rounded to 2^-12 mm, as a model file keeps them."""
     return (np.round(np.asarray(values, float) * 4096) / 4096).astype(np.float32)
 
 
@@ -116,7 +117,7 @@ def read_parts(path: Path) -> tuple[ModelParts, str]:
 
 
 def expression_names(path: Path) -> tuple[str, ...]:
-    """Returns the names of a model's expressions without reading its shapes. Raises BadModel."""
+    """Returns the names of the expressions in a model file without reading their shapes. Raises BadModel."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return tuple(json.loads(file["meta"].tobytes()).get("expressions", ()))

@@ -24,14 +24,14 @@ class UnknownModel(EigenheadError):
 
 
 class ShippedModel(EigenheadError):
-    """Reports a model that comes with the program, where one of the user's own is meant."""
+    """Reports an attempt to remove a head model that comes with the program."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"the head model {name!r} comes with the program and cannot be removed")
 
 
 def list_models() -> dict[str, Path]:
-    """Returns models at hand by name: the shipped default and the files of the user's folder."""
+    """Returns the files of the available head models by name: the shipped default and those in the user's folder."""
     found = {DEFAULT: PACKS / _PACK_FILES[DEFAULT]}
     folder = models_folder()
     if folder.is_dir():
@@ -40,7 +40,7 @@ def list_models() -> dict[str, Path]:
 
 
 def model_path(name_or_path: str | Path) -> Path:
-    """Returns the file behind a name or path. Raises UnknownModel."""
+    """Returns the file of the head model that is named, or that lies at a path. Raises UnknownModel."""
     name = str(name_or_path)
     if name in _PACK_FILES:
         return PACKS / _PACK_FILES[name]
@@ -54,7 +54,7 @@ def model_path(name_or_path: str | Path) -> Path:
 
 
 def model_sha256(path: Path) -> str:
-    """Returns the SHA-256 of a model's file, as results name it. Raises OSError."""
+    """Returns the SHA-256 of a model file, by which results name their model. Raises OSError."""
     state = path.stat()
     return _sha256(path, state.st_mtime_ns, state.st_size)
 
@@ -66,8 +66,8 @@ def _sha256(path: Path, changed_ns: int, size: int) -> str:
 
 
 def remove_model(name: str) -> Path:
-    """Removes a model of the user's folder; returns where it was. Raises UnknownModel, and ShippedModel for those that
-    come with the program."""
+    """Removes a head model from the user's folder and returns the path that its file had. Raises UnknownModel, and
+    ShippedModel for a model that comes with the program."""
     path = models_folder() / f"{name}.npz"
     if path.parent != models_folder() or not path.is_file():
         raise ShippedModel(name) if name in _PACK_FILES else UnknownModel(name)

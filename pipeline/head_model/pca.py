@@ -15,8 +15,8 @@ from rig.geometry import rigid_fit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Components:
-    """Holds principal components: mean + scores @ modes gives the heads back. Modes are mm per standard deviation and
-    orthogonal."""
+    """Holds the principal components of a set of heads: mean + scores @ modes gives the heads back. Modes are
+    orthogonal to each other, in mm per standard deviation."""
 
     mean: Float[np.ndarray, "V 3"]
     modes: Float[np.ndarray, "M V 3"]
@@ -27,7 +27,8 @@ class Components:
 def align(
     heads: Float[np.ndarray, "N V 3"], weights: Float[np.ndarray, " V"], *, rounds: int = 10
 ) -> Float[np.ndarray, "N V 3"]:
-    """Returns every head moved rigidly onto the common mean, which keeps the pose and place of the first head."""
+    """Returns the heads, each moved rigidly (never scaled) onto their common mean. The mean keeps the pose and place of
+    the first head; ``weights`` are those of the vertices."""
     aligned, mean = heads.copy(), heads[0]
     first = heads[0]
     for _ in range(rounds):
@@ -43,8 +44,8 @@ def align(
 
 
 def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
-    """Returns N - 1 components of N aligned heads. The sign of a mode makes its largest entry positive: builds
-    repeat."""
+    """Computes the principal components of N aligned heads, N - 1 at most. The largest entry of each mode is positive,
+    so that two builds agree."""
     count, vertices = heads.shape[:2]
     flat = heads.reshape(count, -1).astype(float)
     mean = flat.mean(0)
@@ -62,7 +63,8 @@ def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
 
 
 def orthogonalised(modes: Float[np.ndarray, "M V 3"]) -> tuple[Float[np.ndarray, "M V 3"], Float[np.ndarray, " M"]]:
-    """Returns orthogonal modes with exactly the same distribution of heads, and their sigma.
+    """Returns orthogonal modes that describe exactly the same Gaussian distribution of heads, and their standard
+    deviations (mm).
 
     For z ~ N(0, I), heads are mean + A z with A = U S V^T. V^T z is N(0, I) again, so U S spans the same Gaussian: no
     variance is lost or moved, only the axes turn.

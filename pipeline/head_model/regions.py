@@ -20,8 +20,8 @@ NECK_BELOW_TRAGION_MM = 30.0
 
 @lru_cache(maxsize=2)  # models are few, jobs are many
 def head_regions(model: HeadModel) -> dict[str, Bool[np.ndarray, " v"]]:
-    """Returns vertices of the full level by region. Eyes, nose and mouth are parts of the face; the others do not
-    overlap."""
+    """Returns which vertices of the full level belong to each region. Eyes, nose and mouth are parts of the face; all
+    other regions are disjoint."""
     vertices, marks = model.vertices(np.zeros(0)), model.landmarks
     at = {name: vertices[row] for name, row in marks.items()}
     face = model.levels["full"].face_region

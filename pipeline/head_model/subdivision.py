@@ -22,7 +22,7 @@ class NotAManifold(EigenheadError):
 
 
 def row_count(operator: sparse.csr_array) -> int:
-    """Returns rows of a sparse operator."""
+    """Returns the number of rows of a sparse matrix."""
     shape = operator.shape
     assert shape is not None
     return int(shape[0])
@@ -31,8 +31,8 @@ def row_count(operator: sparse.csr_array) -> int:
 def edges_of(
     faces: Int[np.ndarray, "F 3"],
 ) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "F 3"], Int[np.ndarray, " E"]]:
-    """Returns unique edges (sorted pairs), the edge opposite each corner of each face, and the faces at each edge (a
-    count)."""
+    """Returns the mesh's edges (sorted pairs of vertices), the index of the edge opposite each corner of each triangle,
+    and the number of triangles at each edge."""
     directed = np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]]).astype(np.int64)
     low, high = directed.min(1), directed.max(1)
     base = int(faces.max()) + 1
@@ -45,7 +45,8 @@ def edges_of(
 
 
 def check_manifold(faces: Int[np.ndarray, "F 3"]) -> None:
-    """Raises NotAManifold where an edge has over two faces, or two neighbours wind against each other."""
+    """Raises NotAManifold where an edge has more than two triangles, or two neighbouring triangles wind in opposite
+    senses."""
     _, _, counts = edges_of(faces)
     if (counts > 2).any():
         raise NotAManifold(int((counts > 2).sum()), "are shared by more than two triangles")
@@ -56,7 +57,7 @@ def check_manifold(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def boundary_vertices(faces: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndarray, " V"]:
-    """Returns vertices on an open edge of the mesh."""
+    """Returns a mask of the ``count`` vertices that is true on open edges of the mesh."""
     edges, _, uses = edges_of(faces)
     flags = np.zeros(count, bool)
     flags[edges[uses == 1].ravel()] = True
@@ -64,13 +65,14 @@ def boundary_vertices(faces: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndar
 
 
 def vertex_areas(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, " V"]:
-    """Returns a third of the area of the triangles at each vertex, mm²."""
+    """Returns for each vertex a third of the area of the triangles around it (mm²)."""
     area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 6
     return np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
 
 
 def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
-    """Returns closed loops of open edges, each in the direction in which its triangles run. Raises NotAManifold."""
+    """Returns the open borders of a mesh, each as a list of vertices in the direction in which the border's triangles
+    run. Raises NotAManifold where a border touches itself."""
     after: dict[int, int] = {}
     rim = boundary_edges(faces)
     for a, b in rim.tolist():
@@ -89,9 +91,10 @@ def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
 
 
 def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.ndarray, "T 3"]:
-    """Returns a strip of triangles across a long opening such as a mouth or an eye, from its left end to its right one.
+    """Returns triangles that close a long opening such as a mouth or an eye, from its end with the least x to the one
+    with the largest. No vertex is added.
 
-    No vertex is added. The strip continues the surface if ``loop`` runs as ``boundary_loops`` gives it.
+    The triangles face as the surface around the opening does if ``loop`` comes from ``boundary_loops``.
     """
     x = vertices[loop, 0]
     start, end = int(x.argmin()), int(x.argmax())
@@ -112,7 +115,8 @@ def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.nd
 
 
 def subdivision(faces: Int[np.ndarray, "F 3"], count: int) -> tuple[sparse.csr_array, Int[np.ndarray, "F4 3"]]:
-    """Returns one Loop step: the operator ((V + E) x V) and the refined faces. Old vertices come first."""
+    """Computes one step of Loop subdivision: the operator ((V + E) x V) from old vertices to new ones, and the refined
+    triangles. Old vertices come first."""
     edges, opposite_edge, uses = edges_of(faces)
     moved = _even_rule(edges, uses, count)
     fresh = _odd_rule(faces, edges, opposite_edge, uses, count)
@@ -156,7 +160,8 @@ def _odd_rule(
 
 
 def refine(faces: Int[np.ndarray, "F 3"], count: int, steps: int) -> tuple[sparse.csr_array, Int[np.ndarray, "G 3"]]:
-    """Returns ``steps`` Loop steps as one operator (identity for 0)."""
+    """Computes ``steps`` steps of Loop subdivision as one operator, the identity for 0 steps, and
+    the refined triangles."""
     operator: sparse.csr_array = sparse.csr_array(sparse.identity(count, format="csr"))
     for _ in range(steps):
         step, faces = subdivision(faces, row_count(operator))

@@ -37,7 +37,7 @@ CODES = 65535
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Albedo:
-    """Holds the image, sRGB, in the texture's layout, and the light that was taken off."""
+    """Holds the albedo image (sRGB, in the texture's layout) and the light that was taken off the texture."""
 
     atlas: Atlas
     light: Light
@@ -53,8 +53,9 @@ def estimate_albedo(
     *,
     chart: ChartColours | None = None,
 ) -> tuple[Albedo | None, list[ReportWarning]]:
-    """Returns the albedo of a textured head; a warning where it cannot be told. With a ``chart`` it is the skin's own
-    in level and colour, too; else by convention (``pipeline.texturing.light``)."""
+    """Estimates the albedo of a textured head, or returns None and a warning where light and skin cannot be told apart.
+    With a ``chart`` the albedo has the skin's true level and colour; without one both are a convention
+    (``pipeline.texturing.light``)."""
     if atlas is None or around is None or coloured.dim is None:
         return None, [compose("no-albedo", reason=compose("albedo-without-texture"))]
     seen = coloured.views > 0
@@ -80,8 +81,8 @@ def shine_left(
     seen: Bool[np.ndarray, " v"],
     around: Neighbourhood,
 ) -> Float[np.ndarray, " v"]:
-    """Returns the share of each vertex' light that is no highlight, ``MAX_SHINE`` to 1. By brightness: highlights of
-    skin have their lamp's colour, but a dim view's own colour is noise."""
+    """Returns the share of each vertex' light that is not highlight, from ``1 - MAX_SHINE`` to 1. Only brightness is
+    compared: a highlight has the colour of its lamp, and the colour of a dim view is mostly noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
     ratio = around.calmed(ratio[:, None], CALM)[:, 0]
@@ -91,7 +92,8 @@ def shine_left(
 
 
 def multiplied(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndarray, "s s 3"]:
-    """Returns the texture's image, each texel by the factor of its triangle's corners, in linear light."""
+    """Returns the texture's image with each texel multiplied, in linear light, by the factors interpolated from the
+    corners of the texel's triangle."""
     image, size = atlas.image, len(atlas.image)
     coarse = _factor_image(atlas.layout, factors)
     linear = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)

@@ -34,7 +34,8 @@ def fill_unobserved_patches(
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
     settings: TextureSettings,
 ) -> Decision:
-    """Returns the decision with a view for the corners of every patch that one sees, but not by its corners."""
+    """Returns the decision with a view added at the corners of every wide patch that a camera sees although it sees
+    none of the corners, such as a strip that closes an eye."""
     rows = np.flatnonzero(_blind(decision.weights, mesh_world.faces))
     faces, normals, area = _parts(mesh_world, rows)
     rows = rows[_wide(faces, area)]

@@ -30,20 +30,23 @@ ENCODED = np.rint(255 * srgb_from_linear(np.arange(CODES + 1) / CODES)).astype(n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChartColours:
-    """Holds the corrections by camera, and the mean way that the charts face (unit vector, world frame)."""
+    """Holds the colour correction of each camera that saw a chart, and the mean direction that the charts face (unit
+    vector, world frame)."""
 
     cameras: Mapping[str, ChartCorrection]
     normal_world: Float[np.ndarray, " 3"]
 
 
 def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """Returns what the charts in all clean plates say of the cameras; a warning where none is found."""
+    """Finds the charts in all clean plates and returns the cameras' colour corrections. Returns None and a warning
+    where no plate shows a chart."""
     charts = map_in_threads(lambda k: charts_in(capture.backgrounds.get(rig.names[k], ())), len(rig))
     return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
 
 
 def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """Returns the same of charts that were found, by camera."""
+    """Returns the cameras' colour corrections from charts that were found, named by camera. Returns None and a warning
+    where no chart gives one."""
     found = {name: chart_correction(visible) for name, visible in charts.items() if visible}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:
@@ -54,7 +57,8 @@ def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[Char
 
 
 def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
-    """Returns the capture with corrected photographs; its plates stay."""
+    """Returns the capture with the colours of its photographs corrected; its clean plates are unchanged. A camera that
+    saw no chart gets the mean correction."""
     mean = np.mean([correction.matrix for correction in colours.cameras.values()], axis=0)
 
     def corrected(name: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -74,6 +78,6 @@ def in_true_colours(
 
 
 def levelled_by_chart(light: Light, normal_world: Float[np.ndarray, " 3"]) -> Light:
-    """Returns the light as strong, and of the colour, as it fell on the chart: there white is white."""
+    """Returns the light scaled in each channel so that a white surface facing as the chart did is exactly white."""
     on_chart = (harmonics(normal_world[None]) * BAND_FACTORS) @ light.coefficients
     return replace(light, coefficients=light.coefficients / on_chart[0], on_chart=True)

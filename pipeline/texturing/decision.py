@@ -18,8 +18,8 @@ CODES = np.arange(256) / 255.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """Holds the views of each vertex (-1: none), the first the chosen one, their shares, what is added to them (codes),
-    and what the cameras see."""
+    """Holds which photographs colour each vertex. ``slots``: the views of a vertex, the chosen one first (-1: none);
+    ``shares``: their weights in the mean; ``corrections``: codes that are added to each view at the vertex."""
 
     views: Rig
     slots: Int32[np.ndarray, "v s"]
@@ -29,14 +29,16 @@ class Decision:
     pictures: Pictures
 
     def choice(self, colours: UInt8[np.ndarray, "v 3"]) -> Choice:
-        """Returns it for the compiled loops; ``colours`` where no view sees a triangle."""
+        """Returns the decision as the compiled loops read it. ``colours`` (sRGB codes) are used where no view sees a
+        triangle."""
         filled = np.zeros((len(colours), 4), np.float32)
         filled[:, :3] = colours
         return Choice(self.slots, self.shares, self.corrections, filled, self.weights)
 
 
 def window_table(sigma: float) -> Float32[np.ndarray, "_ _"]:
-    """Returns weights of four pixels for every place between the middle two: a Gaussian."""
+    """Returns the Gaussian weights of four neighbouring pixels, one row for each position between the middle two.
+    ``sigma`` is in pixels."""
     phase = np.arange(PHASES + 1) / PHASES
     weights = np.exp(-0.5 * ((np.arange(TAPS) - 1 - phase[:, None]) / sigma) ** 2)
     return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -52,7 +54,8 @@ def pack_pictures(
     mesh_world: Mesh,
     footprint_px: float,
 ) -> Pictures:
-    """Returns the photographs' parts about the silhouettes, gains and offsets applied, one behind the other."""
+    """Returns the part of each photograph around the silhouette, with the camera's gain and offset applied, all in one
+    array one behind the other."""
     boxes = [box_around(masks[camera.name], TAPS) for camera in views]
     parts = [image[box] for image, box in zip(images, boxes, strict=True)]
     first = np.cumsum([0] + [part.size for part in parts])

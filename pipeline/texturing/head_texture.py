@@ -16,8 +16,8 @@ from rig.messages.message import compose
 
 
 def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
-    """Returns the model's texture layout where a file of the result has a texture, and warnings of settings and
-    model."""
+    """Returns the model's texture layout, or None where no file of the result has a texture or the model cannot be laid
+    out; and the warnings about settings and model."""
     outputs = settings.outputs
     old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
     warnings = [compose("old-setting", setting=name) for name, is_set in old.items() if is_set]
@@ -33,7 +33,7 @@ def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | Non
 def paint_head(
     layout: ModelLayout | None, mesh: Mesh, coloured: Texture, face_region: Bool[np.ndarray, " v"], settings: Settings
 ) -> Atlas | None:
-    """Returns the head's texture; None where there is no layout, or no camera saw it."""
+    """Returns the texture of the head. Returns None where there is no layout or no camera saw the head."""
     if layout is None or coloured.decision is None:
         return None
     region = np.flatnonzero(face_region)

@@ -11,7 +11,7 @@ RELAXATIONS = ((60, 1.7), (10, 1.0))  # sweeps and factor: over-relaxed, then pl
 
 
 def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int32[np.ndarray, " s"], Int32[np.ndarray, " e"]]:
-    """Returns adjacency of the vertices in compressed rows: starts (count + 1,) and indices, each pair once."""
+    """Returns which vertices share an edge, as compressed rows: starts (count + 1) and the neighbours' indices."""
     along = np.roll(faces, -1, axis=1)
     ends = np.concatenate([faces, along]).ravel(), np.concatenate([along, faces]).ravel()
     pairs = sparse.csr_array((np.ones(len(ends[0]), bool), ends), shape=(count, count))  # adds up what is there twice
@@ -21,8 +21,8 @@ def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int32[np.ndar
 def fill_unknown(
     values: Float[np.ndarray, "v c"], known: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v c"]:
-    """Returns ``values`` (four channels at most) with the unknown ones filled; parts of the mesh that know nothing take
-    the mean of the rest."""
+    """Returns ``values`` (four channels at most) with those of unknown vertices filled smoothly from their neighbours.
+    A part of the mesh without any known vertex gets the mean of the known ones."""
     out = values.astype(float)
     if known.all() or not known.any():
         return out

@@ -42,9 +42,9 @@ MIN_VERTICES = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Light:
-    """Holds the light. ``coefficients``: radiance in orthonormal real harmonics, order as ``harmonics`` gives them,
-    world frame, by channel; the mean over the sphere is 1, or, ``on_chart``, what it gives to the colour chart.
-    ``residual``: what it leaves of the face's linear colours, by their level (the median)."""
+    """Holds the light that the head was photographed in. ``coefficients``: radiance in the order of ``harmonics``,
+    world frame, one column a channel; scaled to a mean of 1 over the sphere or, if ``on_chart``, so that white on the
+    chart is white. ``residual``: the median relative error that the light leaves in the face's linear colours."""
 
     coefficients: Float[np.ndarray, "9 3"]
     residual: float
@@ -52,8 +52,8 @@ class Light:
 
 
 def harmonics(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 9"]:
-    """Returns real spherical harmonics up to second order of unit vectors: 1; y, z, x; xy, yz, 3z2 - 1, xz, x2 - y2
-    (Ramamoorthi and Hanrahan, eq. (3))."""
+    """Returns the nine real spherical harmonics up to second order of unit vectors: 1; y, z, x; xy, yz, 3z2 - 1, xz, x2
+    - y2 (Ramamoorthi and Hanrahan, eq. (3))."""
     x, y, z = directions.T
     columns = (
         0.282095 * np.ones_like(x),
@@ -70,7 +70,7 @@ def harmonics(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 9"]:
 
 
 def spread_directions(count: int) -> Float[np.ndarray, "n 3"]:
-    """Returns unit vectors spread evenly over the sphere."""
+    """Returns ``count`` unit vectors spread evenly over the sphere."""
     index = np.arange(count) + 0.5
     z, angle = 1.0 - 2.0 * index / count, index * np.pi * (3.0 - np.sqrt(5.0))
     ring = np.sqrt(1.0 - z**2)
@@ -83,8 +83,8 @@ SURROUND = harmonics(spread_directions(DIRECTIONS)) * BAND_FACTORS  # unhidden w
 def transfer(
     mesh_world: Mesh, normals: Float[np.ndarray, "v 3"], around: Neighbourhood, directions: int = DIRECTIONS
 ) -> Float[np.ndarray, "v 9"]:
-    """Tells how bright each vertex is, as matt white, in the light of each harmonic: what it would be unhidden, less
-    what the mesh hides of the directions, sampled, but for the light that hidden directions send back."""
+    """Computes how bright each vertex would be, as matt white, in the light of each harmonic. Directions that the mesh
+    hides from a vertex give no light but the share that the hiding surface sends back."""
     unhidden = harmonics(normals) * BAND_FACTORS
     towards = spread_directions(directions)
     basis = harmonics(towards) * (4.0 / directions)  # the sphere's 4 pi by the matt surface's pi
@@ -138,8 +138,8 @@ def _hidden(
 def fit_light(
     white: Float[np.ndarray, "v 9"], colours: Float[np.ndarray, "v 3"], skin: Bool[np.ndarray, " v"]
 ) -> Light | None:
-    """Returns the light, from linear colours of what is taken for one skin; None where there is too little of it, or it
-    is black.
+    """Estimates the light from the linear colours of skin, which is taken for one colour. Returns None where there are
+    too few vertices or they are black.
 
     Args:
         white: the vertices' ``transfer``.

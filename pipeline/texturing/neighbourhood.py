@@ -9,7 +9,8 @@ from jaxtyping import Float, Int32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """Holds vertices about each vertex, in compressed rows, and the place of the same edge seen from its other end."""
+    """Holds the neighbours of each vertex as compressed rows; ``opposite`` is, for each edge, the position of the same
+    edge in the row of its other end."""
 
     starts: Int32[np.ndarray, " s"]
     indices: Int32[np.ndarray, " e"]
@@ -17,7 +18,7 @@ class Neighbourhood:
 
     @classmethod
     def of(cls, starts: Int32[np.ndarray, " s"], indices: Int32[np.ndarray, " e"]) -> "Neighbourhood":
-        """Builds it from ``starts`` and sorted ``indices`` of a symmetric adjacency."""
+        """Builds the neighbourhood from compressed rows: ``starts`` and sorted ``indices`` of a symmetric adjacency."""
         rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
         # Rows are sorted: ordered by the other end first, the edges of its row come in the same order.
         opposite = np.empty(len(indices), np.int32)
@@ -29,7 +30,8 @@ class Neighbourhood:
         return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
 
     def calmed(self, values: Float[np.ndarray, "v c"], rounds: int) -> Float[np.ndarray, "v c"]:
-        """Returns values of the vertices, in each round half their own, half the mean of those beside them."""
+        """Returns the values smoothed over the mesh: in each round a vertex keeps half its value and takes half the
+        mean of its neighbours'."""
         count = len(self.starts) - 1
         share = 0.5 / np.maximum(np.diff(self.starts), 1)
         means = sparse.csr_array((np.repeat(share, np.diff(self.starts)), self.indices, self.starts), (count, count))

@@ -27,7 +27,7 @@ BAND_ROWS = 64
 def paint_texture(
     layout: Layout, mesh_world: Mesh, colours: UInt8[np.ndarray, "v 3"], decision: Decision, size: int
 ) -> Atlas:
-    """Returns the image of a head, ``size`` texels wide and high.
+    """Paints the texture of a head, an image ``size`` texels wide and high.
 
     Args:
         layout: of the mesh's vertices.
@@ -70,8 +70,8 @@ def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarr
 def texture_size(
     layout: Layout, mesh_world: Mesh, views: Rig, region: Int[np.ndarray, " n"], *, wanted: int | None = None
 ) -> int:
-    """Returns the side of the image (texels): the smallest whose texels on the face are no coarser than a pixel
-    there."""
+    """Returns the side of the texture in texels: ``wanted`` if given, else the smallest of ``SIZES`` whose texels on
+    the face are no coarser than a photograph's pixels there."""
     if wanted is not None:
         return wanted
     inside = layout.faces[np.isin(layout.source[layout.faces], region).all(axis=1)]

@@ -26,7 +26,8 @@ def level_views(
     around: Neighbourhood,
     smoothness: float,
 ) -> Float32[np.ndarray, "k v 4"]:
-    """Corrections of every view at every vertex, codes (a fourth channel is empty).
+    """Computes what is added to each view at each vertex (sRGB codes; the fourth channel is empty) so that neighbouring
+    views meet without a step.
 
     Args:
         weights: 0 where a view does not see a vertex.

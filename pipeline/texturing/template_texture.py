@@ -24,7 +24,8 @@ Tile = tuple[int, int]
 
 
 def corner_tiles(mesh: PolygonMesh) -> Int[np.ndarray, "p 2"]:
-    """Returns the tile of each polygon, by the middle of its corners; (-1, -1) where it has no coordinates."""
+    """Returns the UDIM tile that the middle of each polygon's texture coordinates lies in; (-1, -1) for a polygon
+    without texture coordinates."""
     if not len(mesh.uv):
         return np.full((len(mesh.sizes), 2), -1)
     first = np.cumsum(mesh.sizes) - mesh.sizes
@@ -35,7 +36,7 @@ def corner_tiles(mesh: PolygonMesh) -> Int[np.ndarray, "p 2"]:
 
 
 def skin_polygons(mesh: PolygonMesh, surface_binding: SurfaceBinding) -> Bool[np.ndarray, " p"]:
-    """Returns polygons whose corners all lie on the skin."""
+    """Returns which polygons of the template have all their corners on the skin."""
     skin = np.zeros(len(surface_binding.rest), bool)
     skin[surface_binding.skin] = True
     return np.logical_and.reduceat(skin[mesh.corners], np.cumsum(mesh.sizes) - mesh.sizes)
@@ -44,8 +45,8 @@ def skin_polygons(mesh: PolygonMesh, surface_binding: SurfaceBinding) -> Bool[np
 def template_textures(
     atlas: Atlas, mesh: PolygonMesh, surface_binding: SurfaceBinding
 ) -> dict[Tile, UInt8[np.ndarray, "s s 3"]]:
-    """Returns the images of the tiles that the template's skin lies in, sRGB; none where it has no texture
-    coordinates."""
+    """Returns the texture images (sRGB) of a template by UDIM tile, for the tiles that its skin lies in; none where the
+    template has no texture coordinates."""
     tiles, on_skin = corner_tiles(mesh), skin_polygons(mesh, surface_binding)
     found = np.unique(tiles[on_skin & (tiles[:, 0] >= 0)], axis=0)
     if not 0 < len(found) <= MAX_TILES:

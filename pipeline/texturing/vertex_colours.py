@@ -52,7 +52,8 @@ Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """Holds sRGB colours, the number of images behind each (0 = filled), and what was found of the cameras."""
+    """Holds the sRGB colour of each vertex, the number of photographs it came from (0 = filled), and the gains and
+    offsets of the cameras."""
 
     colours: UInt8[np.ndarray, "v 3"]
     views: UInt8[np.ndarray, " v"]
@@ -77,9 +78,12 @@ def texture(
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
 ) -> Texture:
-    """Returns colours of the mesh from the photographs of the usable views; ``depths`` are its depth maps in them. With
-    ``around``, the mesh's edges, a view is also chosen for every vertex; with ``dim_share``, the
-    colour below which that share of a vertex' weight lies is told, too."""
+    """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
+    in these views (mm).
+
+    With ``around``, the edges of the mesh, the result also names a view for each vertex. With ``dim_share`` it also
+    has, for each vertex, the colour in a dim view: views that hold this share of the vertex' weight are no brighter.
+    """
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
         return _reference(mesh_world, normals, capture, silhouettes, views, depths)
@@ -123,8 +127,8 @@ def texture(
 def underexposed_views(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"], share: float
 ) -> Float32[np.ndarray, "v 3"]:
-    """Returns the colour of the view that is as bright as ``share`` of each vertex' weight; black where no view sees
-    it."""
+    """Returns for each vertex the colour (linear) in a dim view: the views that are no brighter hold ``share`` of the
+    vertex' weight. Black where no view sees the vertex."""
     order = np.argsort(np.where(weights > 0, colours.sum(axis=2), np.inf), axis=0)
     passed = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
     rank = np.argmax(passed >= share * passed[-1], axis=0)
@@ -134,8 +138,8 @@ def underexposed_views(
 
 
 def gain_confidence(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-    """Returns the share that a camera's word has left: what had to be made much brighter brings its noise along, and a
-    dim view is often a shadowed one."""
+    """Returns the factor, 1 at most, by which a camera's weight is lowered for its gain: an image that had to be
+    brightened much brings its noise along, and is often in shadow."""
     return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
 
 
@@ -150,7 +154,7 @@ def decide(
     around: Neighbourhood,
     settings: TextureSettings,
 ) -> Decision:
-    """Returns a view for each vertex, and what levels the seams between them."""
+    """Chooses a view for each vertex and computes the corrections that level the seams between views."""
     chosen = settings.selection
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
@@ -163,7 +167,7 @@ def decide(
 
 
 def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
-    """Returns the cameras that may colour a head."""
+    """Returns the cameras that have a photograph and a usable silhouette, so that they may colour the head."""
     return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
 
 
@@ -214,8 +218,8 @@ def reference_colours(
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
-    """Returns the paper's codes of points of a surface, the weight behind each (0: nobody sees it) and the number of
-    images."""
+    """Computes the colours of surface points as section 4.5 of the paper does. Returns their codes, the weight behind
+    each (0: no camera sees the point) and the number of images."""
     total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
     views = np.zeros(len(normals), np.uint8)
     for camera in rig:

@@ -38,7 +38,8 @@ def select_views(
     around: Neighbourhood,
     settings: SelectionSettings,
 ) -> tuple[Int32[np.ndarray, " v"], Int32[np.ndarray, "v c"], Float32[np.ndarray, "v c"]]:
-    """Returns a view for each vertex, -1 where none sees it; the views that came into question, and their quality.
+    """Chooses a view for each vertex, -1 where none sees it. Also returns the candidate views of each vertex and their
+    quality.
 
     Args:
         weights: of the views by angle and distance, 0 = not seen.
@@ -88,20 +89,20 @@ def add_similar_views(
     around: Neighbourhood,
     settings: SelectionSettings,
 ) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
-    """Returns the chosen views, and beside them others that differ from them by noise alone: their mean has less of it.
-    Where they differ by more, in eyes, brows and lips, blending would blur.
+    """Adds to the chosen view of each vertex other views that differ from it by noise alone, so that their mean has
+    less noise. Views that differ by more, as in eyes, brows and lips, are left out: blending them would blur.
 
     Args:
         labels: the chosen view of each vertex, -1 = none.
-        views: those that come into question.
-        quality: of them.
-        detail: what levelled views show beyond what all agree on, codes.
+        views: the candidate views of each vertex.
+        quality: of the candidate views.
+        detail: codes of the levelled views.
         weights: 0 where a view does not see a vertex.
         around: the mesh's edges.
         settings: of the selection.
 
     Returns:
-        Views (-1: none) and shares, the chosen one first.
+        Views (-1: none) and their shares in the mean, the chosen one first.
     """
     off = differences(labels, views, detail, weights, around.starts, around.indices)
     informative = off[(off >= 0) & (views != labels[:, None])]

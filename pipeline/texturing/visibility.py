@@ -30,7 +30,7 @@ NOISE_MARGIN = 2.0  # by which the median power is multiplied: its own scatter i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """Holds one camera's view of every point: weight (0 = not seen) and linear colour (0 to 1)."""
+    """Holds how one camera sees each point: its weight (0 = not seen) and linear colour (0 to 1)."""
 
     weights: Float32[np.ndarray, " v"]
     colours: Float32[np.ndarray, "v 3"]
@@ -46,7 +46,8 @@ def see_points(
     *,
     settings: TextureSettings,
 ) -> Sight:
-    """Returns what ``camera`` gives each point of a surface, world frame, of which it has the depth map ``depth``."""
+    """Returns the weight and linear colour that ``camera`` gives each point of a surface (world frame, mm). ``depth``
+    is the surface's depth map in that camera."""
     weights = see_weights(camera, silhouette, depth, points, normals, settings)
     pixels = project_points(camera, points)
     colours = sample_colours(image, pixels, weights, LINEAR, settings.footprint_px)
@@ -54,9 +55,10 @@ def see_points(
 
 
 def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
-    """Returns 1 below the end of the scale, next to nothing at it: how much brighter a place is no camera says there,
-    and one that is exposed longer than the others makes it darker than it is. Where all are clipped it is white all the
-    same.
+    """Returns a factor for the weight of each colour: 1 well below the end of the scale, falling to almost 0 at it.
+
+    At the end of the scale no camera says how much brighter a point is, and a view with a longer exposure would make it
+    too dark. Where all views are clipped the result is white all the same.
     """
     past = (colours.max(axis=1) - CLIPS[0]) / (CLIPS[1] - CLIPS[0])
     return np.clip(1.0 - past, POOR, 1.0).astype(np.float32)
@@ -70,7 +72,7 @@ def see_weights(
     normals: Float[np.ndarray, "v 3"],
     settings: TextureSettings,
 ) -> Float32[np.ndarray, " v"]:
-    """Tells how well ``camera`` sees each point of a surface; 0 where it does not."""
+    """Returns how well ``camera`` sees each point of a surface (world frame, mm), 0 where it does not see the point."""
     pixels, depths = project_points(camera, points), camera_depths(camera, points)
     towards = camera.centre_world - points
     facing = np.einsum("vi,vi->v", normals, towards) / np.sqrt(np.einsum("vi,vi->v", towards, towards))
@@ -88,11 +90,11 @@ def see_weights(
 def sharpened(
     image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], settings: TextureSettings
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the photograph with some of the lens's blur, and of the sampling window's, taken back where there is
-    detail.
+    """Returns the photograph with part of the blur of the lens and of the sampling window taken back where the
+    photograph has detail.
 
-    An unsharp mask would lift noise with it, so that it is held back as a Wiener filter does: by the share of what it
-    would lift, over some pixels, that is more than noise. Most of a head is smooth: the median over it is noise.
+    An unsharp mask would raise the noise, too. It is therefore scaled as a Wiener filter is: by the share of the local
+    power that is more than noise. Most of a head is smooth, so the median power over the head is taken for noise.
     """
     box = box_around(inside, 0)
     if not settings.sharpening or not inside[box].size:

@@ -38,7 +38,7 @@ COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "syn
 
 
 class NoCalibration(EigenheadError):
-    """Reports that a capture folder needs cameras.json."""
+    """Reports that the rig has no calibration, so that no capture folder, which holds cameras.json, can be written."""
 
     def __init__(self) -> None:
         super().__init__(compose("rig-without-calibration"))
@@ -46,8 +46,8 @@ class NoCalibration(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class RigCheck:
-    """Holds a table that a person can act on: one row of text per camera under ``COLUMNS``, and what concerns the
-    rig."""
+    """Holds the result of a check: ``rows`` has the texts of each camera under ``COLUMNS``, ``faults`` everything that
+    is wrong."""
 
     rows: tuple[tuple[str, ...], ...]
     faults: tuple[Fault, ...]
@@ -59,7 +59,7 @@ class RigCheck:
 
 
 def check(config: RigConfig, make_driver: MakeDriver = driver_for) -> RigCheck:
-    """`eigenhead rig check`: opens everything and takes a test shot that is not kept."""
+    """Opens all devices of a rig and takes a test shot that is not kept (`eigenhead rig check`)."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         shot = session.shoot()
@@ -67,7 +67,8 @@ def check(config: RigConfig, make_driver: MakeDriver = driver_for) -> RigCheck:
 
 
 def preview(config: RigConfig, out: Path, make_driver: MakeDriver = driver_for) -> tuple[Fault, ...]:
-    """`eigenhead rig preview`: a contact sheet of every camera into ``out`` (.jpg or .png); the faults in it."""
+    """Writes a contact sheet of every camera to ``out``, a .jpg or .png file (`eigenhead rig preview`). Returns the
+    faults of the shot."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         shot = session.shoot()
@@ -82,10 +83,11 @@ def capture(
     *,
     report: Progress = lambda stage, fraction: None,
 ) -> Shot:
-    """`eigenhead rig capture`: one shot into the capture folder ``out``; ``report`` hears of "warm up", "shot", "done".
+    """Takes one shot and writes it as the capture folder ``out`` (`eigenhead rig capture`). ``report`` is called with
+    "warm up", "shot" and "done".
 
-    Raises ShotFailed, and writes nothing, where the shot is no complete capture; NoCalibration; InputError where
-    ``out`` is there already. Warnings are in the shot that is returned, and in shot.json of the folder.
+    Raises ShotFailed, and writes nothing, where the shot is no complete capture; NoCalibration; and InputError where
+    ``out`` exists and is not empty. Warnings are in the shot that is returned and in the folder's shot.json.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(str(out), [compose("folder-exists")])
@@ -99,7 +101,8 @@ def capture(
 
 
 def capture_with(session: RigSession, out: Path) -> Shot:
-    """Calls ``capture`` with a session that is open and warm."""
+    """Takes one shot with a session that is open and warm, and writes it as the capture folder ``out``. Raises
+    ShotFailed and NoCalibration."""
     if session.rig is None:
         raise NoCalibration
     shot = session.shoot()
@@ -112,10 +115,12 @@ def capture_with(session: RigSession, out: Path) -> Shot:
 def board_shots(
     config: RigConfig, out: Path, count: int, make_driver: MakeDriver = driver_for, *, pause_s: float = 4.0
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[Fault, ...]]]:
-    """`eigenhead rig board`: shots of a calibration board into ``out/<camera>/<shot>.png``, for `eigenhead calibrate`.
+    """Takes ``count`` shots of a calibration board and writes ``out/<camera>/<shot>.png``, for `eigenhead calibrate`
+    (`eigenhead rig board`).
 
-    Yields, for each shot, its name, the cameras whose pictures were written, and the faults; waits ``pause_s`` before
-    each, for the board to be moved. Names go on after those that are there. Raises ShotFailed where no camera delivers.
+    Yields for each shot its name, the cameras whose pictures were written, and the faults. Waits ``pause_s`` before
+    each shot, so that the board can be moved. Names of shots that ``out`` already holds are not used again. Raises
+    ShotFailed where no camera delivers.
     """
     taken = {path.stem for path in out.glob("*/*.png")}
     names = (name for name in map("shot{:03}".format, itertools.count()) if name not in taken)
@@ -130,11 +135,12 @@ def board_shots(
 
 
 def board_shot(session: RigSession) -> Shot:
-    """Takes one shot of a calibration board, with a session that is open and warm: needs no calibration and no clean
+    """Takes one shot of a calibration board with a session that is open and warm. Needs neither calibration nor clean
     plates.
 
-    Holds the pictures of the cameras that deliver, and the faults without those of views that the board itself hides.
-    Raises ShotFailed where no camera delivers."""
+    Returns the pictures of the cameras that deliver, and the faults but those that the board itself causes by hiding
+    the background. Raises ShotFailed where no camera delivers.
+    """
     shot = session.shoot()
     faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)
     spoilt = {fault.camera for fault in faults if fault.is_error}
@@ -145,14 +151,16 @@ def board_shot(session: RigSession) -> Shot:
 
 
 def take_plates(config: RigConfig, make_driver: MakeDriver = driver_for) -> Plates:
-    """Takes new clean plates of the empty studio, beside rig.toml. Raises ShotFailed; the old ones then stay."""
+    """Takes new clean plates of the empty studio and puts them to use. Raises ShotFailed, and leaves the old plates in
+    use."""
     with RigSession(config, make_driver) as session:
         session.warm_up()
         return session.take_plates()
 
 
 def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
-    """Writes a capture folder with the plates and shot.json (the certificate); it appears when it is complete."""
+    """Writes a shot as a capture folder with clean plates and certificate (shot.json). The folder appears only when it
+    is complete."""
     out.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
@@ -171,7 +179,7 @@ def write_shot(out: Path, shot: Shot, plates: Plates, rig: Rig) -> None:
 def contact_sheet(
     names: tuple[str, ...], images: Mapping[str, ImageRgb], faults: tuple[Fault, ...], tile_width: int = 320
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Returns all cameras in one picture, each with its name and the codes of its faults."""
+    """Returns one picture (RGB) of all cameras, each with its name and the codes of its faults."""
     tile_height = tile_width * 3 // 4
     columns = math.ceil(math.sqrt(len(names)))
     rows = math.ceil(len(names) / columns)

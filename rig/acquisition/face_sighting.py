@@ -19,11 +19,11 @@ EXPLAINING = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class FaceSighting:
-    """Holds where the face was seen, and where it looks.
+    """Holds which pictures show the subject's face and which way the face looks.
 
-    ``searched`` counts the pictures that were looked at; ``missing``: cameras that the face is turned to and that do
-    not show it; ``left_deg``, ``up_deg``: how far it looks to the subject's left and up, seen from ``front``. None
-    where there is no face, or where the cameras stand all around and none is the front.
+    ``searched``: number of pictures searched; ``missing``: cameras that the face is turned to but whose pictures do not
+    show it; ``left_deg`` and ``up_deg``: how far the face looks to the subject's left and up, seen from the camera
+    ``front``. Both are None where there is no face, or where the cameras stand all around and none is the front.
     """
 
     searched: int
@@ -36,7 +36,8 @@ class FaceSighting:
 
 
 def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tuple[Message, ...]:
-    """Says which cameras do not show the face, and where it looks; what ``faults`` explain is left out."""
+    """Returns remarks on which cameras do not show the face, and which way it looks. Cameras with a fault among
+    ``EXPLAINING`` are left out; there are no remarks where the whole rig has one."""
     explained = {fault.camera for fault in faults if fault.code in EXPLAINING}
     if sighting is None or None in explained:
         return ()

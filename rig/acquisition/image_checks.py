@@ -31,7 +31,8 @@ _SCALE_MOST = 0.03  # a camera 1.2 m away would have to be moved 36 mm along its
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """Mean value and the shares of pixels at both ends (every channel 255; every channel at most 2)."""
+    """Holds the mean value of a picture (0 to 255) and the shares of clipped pixels (every channel 255) and black ones
+    (every channel at most 2)."""
 
     mean: float
     clipped_share: float
@@ -40,10 +41,11 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """States how the background of a picture lies on a clean plate.
+    """Holds how well the background of a picture agrees with a clean plate.
 
-    ``found`` is the share of the plate's textured patches that are found again, all moved alike; ``moved_px`` the
-    largest movement that their common similarity gives to a corner of the image, 0 where nothing was found.
+    ``patches``: number of textured patches of the plate; ``found``: share of them that are found in the picture, all
+    moved by one similarity; ``moved_px``: the farthest that this similarity moves a corner of the image, 0 where
+    nothing was found.
     """
 
     patches: int
@@ -52,12 +54,12 @@ class Registration:
 
     @property
     def conclusive(self) -> bool:
-        """Tells whether the plate has texture enough to say anything."""
+        """Tells whether the plate has enough texture for ``found`` and ``moved_px`` to mean anything."""
         return self.patches >= _PATCHES_LEAST
 
 
 def exposure(image: ImageRgb) -> Exposure:
-    """Returns the exposure of a picture."""
+    """Measures the mean value of a picture and the shares of clipped and black pixels."""
     red, green, blue = cv2.split(image)
     low, high = cv2.min(cv2.min(red, green), blue), cv2.max(cv2.max(red, green), blue)
     clipped, lit = np.count_nonzero(low == 255), np.count_nonzero(high > 2)
@@ -65,17 +67,20 @@ def exposure(image: ImageRgb) -> Exposure:
 
 
 def noise_of(plates: Sequence[ImageRgb]) -> float | None:
-    """Returns the standard deviation of the temporal noise, from pictures of one still scene; None of a single one.
+    """Computes the standard deviation of the temporal noise from pictures of one still scene. Returns None for a single
+    picture.
 
-    From differences of neighbours in time (variance 2 sigma^2): the variance within blocks of 16 px, which light that
-    drifts leaves alone, and the median over the blocks, which something that moves in a corner leaves alone.
+    The differences of successive pictures have the variance 2 sigma^2. It is taken within blocks of 16 px, so that
+    drifting light does not count, and the median is taken over the blocks, so that a movement in a corner does not
+    count.
     """
     variances = [_block_variance(after, before) for before, after in itertools.pairwise(plates)]
     return float(np.sqrt(np.median(variances) / 2)) if variances else None
 
 
 def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
-    """Tells whether something moved between the clean plates: a 16 px block that changed by 8 standard deviations."""
+    """Tells whether something moved between clean plates: whether a block of 16 px changed by more than 8 standard
+    deviations."""
     first = cv2.resize(plates[0].astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
     limit = max(8.0 * noise * np.sqrt(2) / 16, 4.0)  # a block's mean has 1/16 of the noise; 4 values are no person
     for plate in plates[1:]:
@@ -87,7 +92,7 @@ def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
 
 
 def blur_px(image: ImageRgb) -> float | None:
-    """Returns the standard deviation of the edge spread; None where the picture has no edges.
+    """Measures the standard deviation of the edge spread (px). Returns None where the picture has no edges.
 
     A step of height A blurred to a standard deviation s has the gradient energy A^2 / (2 sqrt(pi) s) across it. Two
     more blurs of known size, s1 and s2, give energies whose ratio q = sqrt((s^2 + s2^2) / (s^2 + s1^2)) no longer
@@ -113,7 +118,7 @@ def blur_px(image: ImageRgb) -> float | None:
 
 
 def register(image: ImageRgb, plate: ImageRgb) -> Registration:
-    """Looks for the background of ``plate`` in ``image``, which a subject may hide in part.
+    """Finds the background of ``plate`` in ``image``, which a subject may hide in part, and returns how far it moved.
 
     Textured patches of the plate are searched for near their places by normalised correlation, which brightness and
     contrast do not change; those that a common similarity explains (RANSAC) were found.

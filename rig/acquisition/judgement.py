@@ -23,19 +23,19 @@ MOVED_DARK_PX = 3.0  # the same with the lamps off: up to 2.6 px without any mov
 
 
 def plate_level(plate: ImageRgb | None) -> float:
-    """Returns the mean value that a picture before this clean plate should have."""
+    """Returns the mean value (0 to 255) that a picture should have, from its clean plate."""
     return LEVEL_WITHOUT_PLATES if plate is None else max(float(plate[::4, ::4].mean()), 1.0)
 
 
 def examine_picture(image: ImageRgb, plate: ImageRgb | None) -> PictureCheck:
-    """Measures one picture."""
+    """Measures the exposure and blur of one picture, and how its background agrees with the clean plate."""
     light = exposure(image)
     black = light.mean < BLACK_LEVEL * plate_level(plate)
     return PictureCheck(light, blur_px(image), None if plate is None or black else register(image, plate))
 
 
 def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, PictureCheck]:
-    """Measures every picture, in parallel: OpenCV lets go of the interpreter."""
+    """Measures every picture, in parallel. Returns the measurements by camera."""
     with ThreadPoolExecutor(4) as pool:
         found = pool.map(lambda name: examine_picture(images[name], plates.first.get(name)), images)
         return dict(zip(images, found, strict=True))
@@ -44,7 +44,8 @@ def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, Picture
 def judge(
     images: Mapping[str, ImageRgb], checks: Mapping[str, PictureCheck], plates: Plates, shot: ShotConfig
 ) -> list[Fault]:
-    """Returns the faults that can be seen in the pictures of a shot."""
+    """Returns the faults that the pictures of a shot show, found by measurement and by comparison
+    with the clean plates."""
     levels = {name: plate_level(plates.first.get(name)) for name in checks}
     return judge_checks(
         checks, levels, shot, lambda name, registration: _whose_view(name, images[name], registration, plates)
@@ -57,7 +58,7 @@ def judge_checks(
     shot: ShotConfig,
     whose_view: OtherView = lambda name, registration: None,
 ) -> list[Fault]:
-    """Returns the faults that measured pictures have.
+    """Returns the faults that follow from the measurements of pictures.
 
     Args:
         levels: mean value that each camera's picture should have; the light of those that are absent is not judged.

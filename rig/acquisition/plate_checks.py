@@ -18,7 +18,7 @@ SEEN_SHARE = 0.5  # of the cameras: a person in the seat is seen by all; what on
 
 
 class PlatesRefused(ShotFailed):
-    """Refuses new plates that show somebody; they are kept as ``version``, and the old ones stay in use."""
+    """Reports that new clean plates show somebody. They are kept as ``version``, and the old plates stay in use."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
         super().__init__(faults)
@@ -26,8 +26,8 @@ class PlatesRefused(ShotFailed):
 
 
 def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str], shot: ShotConfig) -> list[Fault]:
-    """Returns what the pictures of an empty studio alone show. ``live``: cameras whose pictures are of today, not
-    recorded."""
+    """Returns the faults that pictures of the empty studio show by themselves. ``live``: cameras whose pictures come
+    from a sensor and are not recorded."""
     faults = []
     for name, images in taken.items():
         if name in live and any(np.array_equal(images[0], other) for other in images[1:2]):
@@ -40,8 +40,8 @@ def plate_faults(taken: Mapping[str, Sequence[ImageRgb]], live: Collection[str],
 
 
 def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fault]:
-    """Cameras whose new plate differs from the one in use as a person in the seat would make it; none where fewer than
-    ``SEEN_SHARE`` of them do."""
+    """Returns a fault for each camera whose new plate differs from the plate in use as if a person sat there. Returns
+    none where fewer than ``SEEN_SHARE`` of the cameras do."""
     compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]
     seen = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
     faults = [

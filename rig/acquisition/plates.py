@@ -32,7 +32,8 @@ UNFINISHED_S = 3600.0  # no version takes so long to write
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plates:
-    """Holds the files of each camera, the first of them as an image, and the noise (values; None of a single plate)."""
+    """Holds the clean plates by camera: their files, the first of them as an image, and the noise (standard deviation
+    of the values; None for a single plate)."""
 
     files: Mapping[str, tuple[Path, ...]]
     first: Mapping[str, ImageRgb]
@@ -47,7 +48,7 @@ NO_PLATES = Plates({}, {}, {}, None)
 
 
 def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
-    """Returns the plates of ``folder``; cameras without any are left out. Raises InputError for a file that is no
+    """Reads the clean plates in ``folder``; cameras without any are left out. Raises InputError for a file that is no
     picture."""
     files = {name: found for name in names if (found := _files(folder, name))}
     with ThreadPoolExecutor(4) as pool:
@@ -67,8 +68,8 @@ def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
 
 @dataclass(frozen=True, slots=True)
 class PlatesVersion:
-    """Clean plates that are kept: ``taken`` is UTC, ISO 8601, ``refused`` the faults for which they were not put to
-    use."""
+    """Describes a set of clean plates that is kept. ``taken``: UTC, ISO 8601; ``refused``: the faults for which the
+    plates were not put to use."""
 
     id: str
     taken: str
@@ -78,12 +79,14 @@ class PlatesVersion:
 
 
 def write_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]]) -> Plates:
-    """Puts new plates to use; those of ``folder`` become a version. They stay until the new ones are complete."""
+    """Writes new clean plates and puts them to use. The plates in ``folder`` become a version, once the new ones are
+    complete."""
     return use_plates(folder, keep_plates(folder, images), tuple(images))
 
 
 def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refused: tuple[Message, ...] = ()) -> str:
-    """Writes plates as a version beside those in use; its id. ``refused``: why they are not put to use."""
+    """Writes clean plates as a version beside those in use, and returns the version's id. ``refused``: why they are not
+    put to use."""
     moment = datetime.now(UTC)
     identity = moment.strftime("%Y%m%dT%H%M%S%fZ")
     _remove_unfinished(folder)
@@ -103,7 +106,8 @@ def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refuse
 
 
 def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
-    """Puts a kept version to use; those in use become a version. Raises InputError for one that is not kept."""
+    """Puts a kept version of the clean plates to use; the plates in use become a version. Raises InputError for a
+    version that is not kept."""
     wanted, kept = _versions(folder) / version, {found.id: found for found in plates_versions(folder)}
     if version in kept and kept[version].in_use:
         return read_plates(folder, names)
@@ -133,7 +137,7 @@ def _remove_unfinished(folder: Path) -> None:
 
 
 def plates_versions(folder: Path) -> list[PlatesVersion]:
-    """Returns the plates in use and those kept beside them, newest first."""
+    """Returns the clean plates in use and the versions kept beside them, newest first."""
     kept = [path for path in _versions(folder).glob("*Z") if path.is_dir()] if _versions(folder).is_dir() else []
     found = [_version_of(path) for path in kept]
     if folder.is_dir():
@@ -160,7 +164,8 @@ def _versions(folder: Path) -> Path:
 
 
 def link_plates(plates: Plates, background: Path) -> None:
-    """Puts the plates' files into a capture's background/, as links where the file system can."""
+    """Links the files of clean plates into the background/ of a capture, or copies them where the file system has no
+    links."""
     for name, files in plates.files.items():
         for i, file in enumerate(files):
             target = (

@@ -49,7 +49,7 @@ class _Release:
 
 
 class RigSession:
-    """Owns the rig's devices. A context manager; ``close`` leaves no thread but those that hang in a driver."""
+    """Owns the devices of a rig while a block runs. ``close`` ends all threads but those that hang in a driver."""
 
     def __init__(self, config: RigConfig, make_driver: MakeDriver = driver_for) -> None:
         self.config = config
@@ -82,7 +82,7 @@ class RigSession:
         self.close()
 
     def open(self) -> None:
-        """Opens cameras and box, all at once. Cameras that do not open are faults of the shots."""
+        """Opens the cameras and the trigger box at once. A camera that does not open is a fault of each shot."""
         for feed in self._feeds.values():
             feed.start()
         self._open_box()
@@ -91,7 +91,7 @@ class RigSession:
             feed.wait_opened(deadline_s)
 
     def close(self) -> tuple[str, ...]:
-        """Switches the lamps off and closes everything. Returns the cameras whose driver hangs. Safe to call twice."""
+        """Switches the lamps off and closes all. Returns the cameras whose driver hangs. Safe to call twice."""
         if self._box is not None:
             if not self.config.lights.keep_on:
                 self._try_box(lambda box: box.set_lights(0))
@@ -106,15 +106,15 @@ class RigSession:
         return hanging
 
     def states(self) -> Mapping[str, FeedState]:
-        """Returns what is known of each camera at this moment; those without a driver are left out."""
+        """Returns what is known of each camera now, by name. Cameras without a driver are left out."""
         return {name: feed.state() for name, feed in self._feeds.items()}
 
     def trigger_error(self) -> Message | None:
-        """Tells why the box cannot be used; None where it can, or where there is none to use."""
+        """Returns why the trigger box cannot be used; None where it can, or where rig.toml names none."""
         return None if self._box_error is None else self._box_error.message
 
     def warm_up(self) -> None:
-        """Switches the lamps on and drops every camera's first frames: exposure and lamps settle meanwhile."""
+        """Switches the lamps on and lets every camera's first frames pass, while exposure and lamps settle."""
         with self._busy:
             self._lights_on()
             deadline_s = time.monotonic() + self.config.shot.timeout_s
@@ -124,15 +124,14 @@ class RigSession:
             self._look(deadline_s + self.config.shot.timeout_s)
 
     def look(self, only: Collection[str] | None = None) -> Mapping[str, ImageRgb]:
-        """Returns a picture of each camera (``only``: of these, which alone are waited for) that has one, of no
-        particular moment."""
+        """Returns a picture of each camera that shows one, of no given moment. ``only``: cameras to ask (None: all)."""
         with self._busy:
             self._lights_on()
             frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s, only)
             return {name: frame.image for name, frame in frames.items()}
 
     def shoot(self) -> Shot:
-        """Takes one synchronised shot. Never raises for a device: the shot's faults say what is wrong."""
+        """Takes one synchronised shot. No device makes it raise: what is wrong is told by the shot's faults."""
         with self._busy:
             self._lights_on()
             self._glance()
@@ -143,8 +142,8 @@ class RigSession:
             return shot
 
     def take_plates(self) -> Plates:
-        """Takes the clean plates of the empty studio and puts them to use. Raises ShotFailed, the old plates then stay;
-        PlatesRefused where the new ones show somebody whom the old ones do not."""
+        """Takes clean plates of the empty studio and puts them to use. Raises ShotFailed, or PlatesRefused if they show
+        somebody whom the old plates do not; the old plates then stay in use."""
         with self._busy:
             self._lights_on()
             self._silent_until_s.clear()
@@ -166,7 +165,7 @@ class RigSession:
             return self.plates
 
     def use_plates(self, version: str) -> Plates:
-        """Puts plates that were kept to use again. Raises InputError."""
+        """Puts a kept version of the clean plates to use again. Raises InputError for a version that is not kept."""
         with self._busy:
             self.plates = use_plates(self.config.plates_folder, version, self.config.names)
             return self.plates

@@ -77,7 +77,7 @@ class FaultDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Holds one fault: a code of ``FAULTS``, the camera (None: the rig), and what was measured."""
+    """Holds one fault: its code (``FAULTS``), the camera that has it (None: the whole rig), and what was measured."""
 
     code: str
     camera: str | None
@@ -85,16 +85,16 @@ class Fault:
 
     @property
     def is_error(self) -> bool:
-        """Tells whether it ends the capture."""
+        """Tells whether the fault makes the capture fail; the others are warnings."""
         return self.code not in WARNINGS
 
     @property
     def remedy(self) -> Message:
-        """Returns what an operator should do."""
+        """Returns what an operator should do about the fault."""
         return REMEDIES[self.code]
 
     def document(self) -> FaultDocument:
-        """Returns the JSON form."""
+        """Returns the fault as plain values for JSON."""
         return {
             "code": self.code,
             "camera": self.camera,
@@ -104,11 +104,11 @@ class Fault:
         }
 
     def measured(self) -> Message:
-        """Returns what was measured, with the camera."""
+        """Returns a message with the camera and what was measured."""
         return compose("fault-measured", camera=self.camera or "rig", measured=self.detail)
 
     def message(self) -> Message:
-        """Returns all of it in one sentence."""
+        """Returns one message with the camera, the fault, what was measured and the remedy."""
         camera = self.camera or "rig"
         return compose("fault-told", camera=camera, fault=self.code, measured=self.detail, remedy=self.remedy)
 
@@ -117,12 +117,12 @@ class Fault:
 
 
 def read_fault(document: Mapping[str, Any]) -> Fault:
-    """Reads ``Fault.document``; in that of an earlier version the detail is a text alone."""
+    """Reads a fault from ``Fault.document``, also from an earlier version's, in which the detail is a text."""
     return Fault(document["code"], document["camera"], read_message(document.get("detail_message", document["detail"])))
 
 
 class ShotFailed(EigenheadError):
-    """Reports a shot that is no capture; ``faults`` names everything that was found."""
+    """Reports a shot that is no capture. ``faults`` holds all that was found wrong."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         self.faults = tuple(faults)
@@ -131,8 +131,8 @@ class ShotFailed(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class CameraSync:
-    """Holds one camera's line of the certificate. ``skew_s``: arrival less trigger, output delay and configured
-    latency."""
+    """Holds the timing of one camera in a shot. ``skew_s``: how long after its due time the frame arrived; due is the
+    trigger plus output delay and configured latency."""
 
     camera: str
     status: Status
@@ -149,7 +149,7 @@ class CameraSyncDocument(TypedDict):
 
 
 class SyncDocument(TypedDict):
-    """Holds a certificate in JSON; times in milliseconds."""
+    """Holds a certificate as plain values for JSON; times are in milliseconds."""
 
     trigger_utc: str
     fired: bool
@@ -168,7 +168,7 @@ class CheckDocument(TypedDict):
 
 
 class ShotDocument(TypedDict):
-    """``shot.json`` (``eigenhead-shot/1``)."""
+    """Holds the content of ``shot.json`` (``eigenhead-shot/1``)."""
 
     format: str
     sync: SyncDocument
@@ -178,8 +178,8 @@ class ShotDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class SyncCertificate:
-    """States how far the pictures of a shot belong to one moment. ``trigger_s`` is time.monotonic; None: nothing
-    fired."""
+    """Holds how far the pictures of a shot belong to one moment. ``trigger_s`` is that moment (time.monotonic, s), None
+    where nothing fired."""
 
     trigger_s: float | None
     trigger_utc: str
@@ -189,18 +189,18 @@ class SyncCertificate:
 
     @property
     def spread_s(self) -> float | None:
-        """Returns the largest less smallest skew; None where fewer than two frames came."""
+        """Returns the largest less the smallest skew (s). Returns None where fewer than two frames arrived."""
         skews = [camera.skew_s for camera in self.cameras if camera.skew_s is not None]
         return max(skews) - min(skews) if len(skews) > 1 else None
 
     def lines(self) -> list[str]:
-        """Returns one line a camera, for people to read."""
+        """Returns one line of text for each camera: its name, status and skew."""
         width = max(len(line.camera) for line in self.cameras)
         skews = {line.camera: "" if line.skew_s is None else f"  {line.skew_s * 1000:+.1f} ms" for line in self.cameras}
         return [f"{line.camera:<{width}}  {line.status}{skews[line.camera]}" for line in self.cameras]
 
     def document(self) -> SyncDocument:
-        """Returns the JSON form, with times in milliseconds."""
+        """Returns the certificate as plain values for JSON; times are in milliseconds."""
         return {
             "trigger_utc": self.trigger_utc,
             "fired": self.trigger_s is not None,
@@ -221,14 +221,15 @@ class SyncCertificate:
 
 @dataclass(frozen=True, slots=True)
 class PictureCheck:
-    """Holds what was measured on one picture; ``registration`` is None without a clean plate, or in a black picture."""
+    """Holds what was measured on one picture. ``registration`` is None without a clean plate and
+    for a black picture."""
 
     exposure: Exposure
     blur_px: float | None
     registration: Registration | None
 
     def document(self) -> CheckDocument:
-        """Returns the JSON form."""
+        """Returns the measurements as plain values for JSON."""
         registration = self.registration
         return {
             "mean": round(self.exposure.mean, 2),
@@ -241,7 +242,7 @@ class PictureCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """Holds everything that one release of the rig gave."""
+    """Holds what one release of the rig gave: pictures, certificate, measurements and faults."""
 
     images: Mapping[str, ImageRgb]
     certificate: SyncCertificate
@@ -250,11 +251,11 @@ class Shot:
 
     @property
     def complete(self) -> bool:
-        """Tells whether it is worth reconstructing: every camera's picture, of one moment, of its own view."""
+        """Tells whether the shot is worth reconstructing: no fault is more than a warning."""
         return not any(fault.is_error for fault in self.faults)
 
     def document(self) -> ShotDocument:
-        """Returns what shot.json in the capture folder holds."""
+        """Returns the content of the capture folder's shot.json."""
         return {
             "format": "eigenhead-shot/1",
             "sync": self.certificate.document(),
@@ -265,10 +266,10 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Holds what the session knows of one camera's timing (s): when its frame was due, and how often it runs by itself.
+    """Holds when the frame of one camera was due (time.monotonic, s) and the period of the camera's live view (s).
 
-    ``triggered``: the box's output makes the frame; otherwise the next one counts, whenever it comes. A recorded
-    picture belongs to no moment of today.
+    ``triggered``: an output of the box releases the frame; otherwise the next frame counts, whenever it arrives.
+    ``recorded``: the picture comes from a recording and belongs to no moment of today.
     """
 
     due_s: float
@@ -286,7 +287,8 @@ def certify(
     uncertainty_s: float,
     skew_most_s: float,
 ) -> tuple[SyncCertificate, list[Fault]]:
-    """Returns the certificate, and the faults of time in it: "late-trigger", "late" and "dropped"."""
+    """Returns the certificate of a shot and its faults of time: "late-trigger", "late" and "dropped". ``frames`` and
+    ``timings`` are by camera."""
     skews = {name: frame.time_s - timings[name].due_s for name, frame in frames.items() if frame is not None}
     if trigger_s is None:
         skews = {}

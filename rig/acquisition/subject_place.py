@@ -26,10 +26,10 @@ OUTLINE_PX = 0.8  # how far the stored outline may lie from the found one
 
 @dataclass(frozen=True, slots=True)
 class SubjectPlace:
-    """Holds the subject in a picture.
+    """Holds where the subject is in a picture.
 
-    ``outline``: corners of its contour (pixels of the whole picture); ``share``: of the picture's area; ``cut_off``:
-    edges of the picture that cut the head's half of it (the bottom always cuts a bust).
+    ``outline``: corners of its contour (px of the picture); ``share``: share of the picture's area that it fills;
+    ``cut_off``: edges of the picture that cut off the upper half of the outline (the bottom edge always cuts a bust).
     """
 
     outline: tuple[tuple[float, float], ...]
@@ -38,8 +38,8 @@ class SubjectPlace:
 
 
 def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
-    """Returns the largest part of a picture that differs from the clean plate; None where nothing as large as a head
-    does."""
+    """Finds the subject: the largest part of a picture that differs from the clean plate. Returns None where nothing as
+    large as a head differs."""
     if image.shape != plate.shape:
         return None
     here, there = (np.float32(_reduced(picture)) + 1.0 for picture in (image, plate))
@@ -50,7 +50,8 @@ def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
 
 
 def subject_of_mask(mask: Bool[np.ndarray, "h w"]) -> SubjectPlace | None:
-    """Returns the same of a ready mask."""
+    """Returns where the subject is in a picture whose mask is known. Returns None where the mask shows nothing as large
+    as a head."""
     return _place(_reduced(mask.astype(np.uint8)) > 0, mask.shape)
 
 

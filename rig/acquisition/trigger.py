@@ -21,32 +21,33 @@ BUSY_S = 1.5  # the longest delay and the longest pulse, 1 s in all, with room f
 
 
 class TriggerError(EigenheadError):
-    """Reports that the trigger box could not do a request; the base of everything this module raises."""
+    """Reports that the trigger box could not do what was requested; the base of all errors of this module."""
 
 
 class TriggerUnplugged(TriggerError):
-    """Reports that the serial port is not there, or went away."""
+    """Reports that the serial port does not exist or went away."""
 
     def __init__(self, port: str, why: str) -> None:
         super().__init__(compose("trigger-unplugged", port=port, reason=why))
 
 
 class TriggerSilent(TriggerError):
-    """Reports that the port is there, but nothing answers."""
+    """Reports that the serial port exists, but nothing answers on it."""
 
     def __init__(self, port: str, body: str, waited_s: float) -> None:
         super().__init__(compose("trigger-silent", port=port, command=body.split()[0], waited_s=waited_s))
 
 
 class WrongDevice(TriggerError):
-    """Reports that something else than a trigger box is on the port."""
+    """Reports that the device on the serial port is no trigger box."""
 
     def __init__(self, port: str, said: str) -> None:
         super().__init__(compose("trigger-other-device", port=port, protocol=PROTOCOL, said=f"{said!r}"))
 
 
 class TriggerRefused(TriggerError):
-    """Reports that the box understood and refused: ``code`` is one of UNKNOWN, ARGUMENT, NOT-ARMED, BUSY."""
+    """Reports that the box understood a request and refused it. ``code`` is one of UNKNOWN,
+    ARGUMENT, NOT-ARMED, BUSY."""
 
     def __init__(self, body: str, code: Message | str) -> None:
         self.code = code
@@ -55,7 +56,7 @@ class TriggerRefused(TriggerError):
 
 @dataclass(frozen=True, slots=True)
 class BoxIdentity:
-    """What IDENTIFY answers."""
+    """Holds what the box answers to IDENTIFY."""
 
     firmware: str
     serial: str
@@ -65,7 +66,7 @@ class BoxIdentity:
 
 @dataclass(frozen=True, slots=True)
 class BoxStatus:
-    """What STATUS answers. ``bad_lines`` counts lines that the box dropped: noise on the cable."""
+    """Holds what the box answers to STATUS. ``bad_lines``: number of lines that it dropped for noise on the cable."""
 
     state: str
     shots: int
@@ -75,22 +76,24 @@ class BoxStatus:
 
 @dataclass(frozen=True, slots=True)
 class BoxClock:
-    """Host time (time.monotonic, s) at box microsecond ``box_us``, and half the width of what is known of it."""
+    """Holds one comparison of clocks: the host's time (time.monotonic, s) at the box's microsecond ``box_us``, and by
+    how much the host's time may be off (s)."""
 
     host_s: float
     box_us: int
     uncertainty_s: float
 
     def host_from_box(self, box_us: int) -> float:
-        """Returns the host time of a box time less than 35 minutes away, across the wrap of the 32-bit counter."""
+        """Returns the host's time (time.monotonic, s) at a box time less than 35 minutes away, also across the wrap of
+        the 32-bit counter."""
         difference = (box_us - self.box_us + CLOCK_PERIOD_US // 2) % CLOCK_PERIOD_US - CLOCK_PERIOD_US // 2
         return self.host_s + difference * 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Fired:
-    """Holds one release: when the box raised its outputs (time.monotonic, s), how well that is known, and the box's
-    count."""
+    """Holds one release: when the box raised its outputs (time.monotonic, s), by how much that may be off, when the
+    host asked for it, and the box's count of shots."""
 
     time_s: float
     uncertainty_s: float
@@ -99,7 +102,8 @@ class Fired:
 
 
 class TriggerBox:
-    """Talks to one trigger box. Every method raises TriggerError; a method that returns was acknowledged by the box.
+    """Talks to one trigger box. Every method raises TriggerError; when a method returns, the box has acknowledged the
+    request.
 
     ``port`` is a serial port (a /dev/serial/by-id path survives a reboot) or the pty of a simulated box. Opening waits
     up to ``boot_s``: many boards restart when their port is opened and need two seconds until they listen.
@@ -133,7 +137,7 @@ class TriggerBox:
         self.close()
 
     def close(self) -> None:
-        """Lets the port go. Safe to call twice and on an unplugged cable."""
+        """Closes the serial port. Safe to call twice and on an unplugged cable."""
         # pyserial's close restores nothing that could fail, but an unplugged descriptor may still raise
         try:
             self._serial.close()
@@ -141,23 +145,24 @@ class TriggerBox:
             return
 
     def set_delay(self, channel: int, delay_us: int) -> None:
-        """Sets the delay of one output behind the release, 0 to 500,000 us."""
+        """Sets how long after the release an output is raised, 0 to 500,000 us."""
         self._command(f"DELAY {channel} {delay_us}")
 
     def set_lights(self, mask: int) -> None:
-        """Switches the light outputs: bit n is light n."""
+        """Switches the light outputs: bit n of ``mask`` is light n."""
         self._command(f"LIGHTS {mask:X}")
 
     def arm(self, window_s: float) -> None:
-        """Allows one FIRE within ``window_s``; the box disarms itself when it has passed."""
+        """Allows one FIRE within ``window_s``; after that the box disarms itself."""
         self._command(f"ARM {round(window_s * 1000)}")
 
     def disarm(self) -> None:
-        """Takes the permission back."""
+        """Takes back the permission to fire that ``arm`` gave."""
         self._command("DISARM")
 
     def fire(self, mask: int, pulse_us: int) -> Fired:
-        """Raises the outputs of ``mask``, each after its delay, for ``pulse_us``. Needs a box that is armed."""
+        """Raises the outputs whose bits are set in ``mask``, each after its delay, for ``pulse_us``. The box must be
+        armed."""
         clock = self._clock or self.synchronise()
         asked_s = time.monotonic()
         words = self._command(f"FIRE {mask:X} {pulse_us}")
@@ -165,7 +170,7 @@ class TriggerBox:
         return Fired(clock.host_from_box(box_us), clock.uncertainty_s, asked_s, shot)
 
     def status(self) -> BoxStatus:
-        """Returns the state (IDLE, ARMED or FIRING), shots since power-up, lights, and lines lost to noise."""
+        """Returns the box's state (IDLE, ARMED or FIRING), shots since power-up, lights, and lines lost to noise."""
         fields = _fields(self._command("STATUS"))
         try:
             return BoxStatus(fields["STATE"], int(fields["SHOTS"]), int(fields["LIGHTS"], 16), int(fields["BAD"]))
@@ -173,7 +178,7 @@ class TriggerBox:
             raise WrongDevice(self.port, f"STATUS {fields}") from error
 
     def synchronise(self, rounds: int = 5) -> BoxClock:
-        """Compares the box's clock with time.monotonic.
+        """Compares the box's clock with time.monotonic and returns the best of ``rounds`` comparisons.
 
         Cristian's method (Distributed Computing 3, 1989): the box read its clock within the round trip; the shortest
         of several bounds it best. Half that trip is the uncertainty.

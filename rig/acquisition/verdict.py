@@ -26,7 +26,7 @@ SOUND_SHARE = 0.75  # eight of eleven still surround a head; with fewer a side o
 
 
 class SubjectDocument(TypedDict):
-    """``outline``: corners in pixels of the picture."""
+    """Holds where the subject is in a picture, as plain values. ``outline``: corners in pixels of the picture."""
 
     share: float
     cut_off: list[str]
@@ -46,8 +46,9 @@ class ViewDocument(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class ViewCheck:
-    """Holds one camera: its picture's measures (None where the shot has them), the mean value that it should have (None
-    without a clean plate), and the subject in it (``looked``: there was a clean plate or a mask to find it by)."""
+    """Holds the check of one camera's picture. ``picture``: measurements (None where the shot has them); ``level``:
+    mean value that it should have (None without a clean plate); ``place``: the subject; ``looked``: whether there was a
+    clean plate or a mask to find the subject by."""
 
     picture: PictureCheck | None
     level: float | None
@@ -55,7 +56,7 @@ class ViewCheck:
     looked: bool
 
     def document(self) -> ViewDocument:
-        """Returns the JSON form."""
+        """Returns the check as plain values for JSON."""
         measured: ViewDocument = {} if self.picture is None else {**_known(self.picture.document())}
         if self.looked:
             measured["subject"] = None if self.place is None else _place_document(self.place)
@@ -65,7 +66,8 @@ class ViewCheck:
 def check_view(
     image: ImageRgb, plate: ImageRgb | None, mask: Bool[np.ndarray, "h w"] | None, *, place_only: bool = False
 ) -> ViewCheck:
-    """Measures one camera's picture. ``place_only``: the shot that it is of has measured the rest."""
+    """Measures one camera's picture and finds the subject in it. ``place_only``: only the subject is looked for,
+    because the shot has measured the rest."""
     if mask is not None and mask.shape == image.shape[:2]:
         place = subject_of_mask(mask)
     else:
@@ -77,22 +79,23 @@ def check_view(
 
 
 def view_faults(views: Mapping[str, ViewCheck], limits: ShotConfig) -> list[Fault]:
-    """Returns everything that is wrong with the pictures of a capture."""
+    """Returns the faults of a capture's pictures, from the checks by camera."""
     pictures = {name: view.picture for name, view in views.items() if view.picture is not None}
     levels = {name: view.level for name, view in views.items() if view.level is not None}
     return without_consequences([*judge_checks(pictures, levels, limits), *_place_faults(views)])
 
 
 def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
-    """Leaves out what another fault of the same camera explains: before another background nobody is found."""
+    """Returns the faults but those that another fault of the same camera explains: before another background nobody is
+    found."""
     known = [*faults]
     displaced = {fault.camera for fault in known if fault.code in DISPLACED} - {None}
     return [fault for fault in known if not (fault.code in PLACE_FAULTS and fault.camera in displaced)]
 
 
 def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
-    """Returns ``good`` without a fault; ``poor`` where the rig itself is at fault, or too few cameras are without
-    one."""
+    """Returns the verdict on a capture: ``good`` without a fault; ``poor`` where the rig itself has one, or too few of
+    the ``cameras`` are without one; else ``usable``."""
     named = {fault.camera for fault in faults}
     if not named:
         return "good"

@@ -20,7 +20,7 @@ PACKET_SOCKET_DISABLED = 1  # ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED
 
 
 class AravisError(Exception):
-    """Aravis refused; the text is its own."""
+    """Reports that Aravis refused a call; the text is Aravis's."""
 
 
 class _GError(ctypes.Structure):
@@ -68,7 +68,8 @@ _MAY_FAIL: dict[str, tuple[Any, list[Any]]] = {
 
 
 class Aravis:
-    """The library. ``call`` runs one of its functions and raises AravisError where it reports a GError."""
+    """Wraps the library libaravis. ``call`` runs one of its functions and raises AravisError where that reports a
+    GError."""
 
     def __init__(self) -> None:
         self._aravis = ctypes.CDLL(LIBRARY)
@@ -84,7 +85,8 @@ class Aravis:
             function.restype, function.argtypes = result, [*arguments, POINTER(POINTER(_GError))]
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Returns the function's result; text results as str."""
+        """Calls the library's function ``name`` and returns its result; texts are returned as str.
+        Raises AravisError."""
         function = getattr(self._aravis, name)
         if name in _PLAIN:
             result = function(*arguments)
@@ -98,11 +100,11 @@ class Aravis:
         return result
 
     def release(self, pointer: int) -> None:
-        """Gives a reference back."""
+        """Gives a reference to a GObject back to the library."""
         self._gobject.g_object_unref(pointer)
 
     def pixels(self, buffer: int) -> UInt8[np.ndarray, " n"]:
-        """Returns a copy of the image bytes of a buffer."""
+        """Returns a copy of the bytes of the image in a buffer."""
         size = c_size_t()
         data = self._aravis.arv_buffer_get_image_data(buffer, byref(size))
         return np.frombuffer(ctypes.string_at(data, size.value), np.uint8)
@@ -110,5 +112,5 @@ class Aravis:
 
 @cache
 def library() -> Aravis:
-    """Returns the one loaded library. Raises OSError where it is not installed."""
+    """Returns the library, which is loaded once. Raises OSError where it is not installed."""
     return Aravis()

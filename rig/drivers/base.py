@@ -19,8 +19,8 @@ from rig.messages.message import Message, compose
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """Holds when a frame came (time.monotonic, s; the earliest moment that the driver can know) and its running
-    number."""
+    """Holds when a frame arrived (time.monotonic, s; the earliest moment that the driver can know) and the frame's
+    running number."""
 
     time_s: float
     sequence: int
@@ -28,7 +28,7 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """Holds one picture: RGB, upright, with its arrival."""
+    """Holds one picture, RGB and upright, with the time of its arrival (time.monotonic, s) and its running number."""
 
     image: ImageRgb
     time_s: float
@@ -44,35 +44,36 @@ class Driver(Protocol):
     """Its pictures come from a sensor, so that two equal ones mean a frozen stream."""
 
     def open(self, timeout_s: float) -> None:
-        """Finds the camera by its identity and starts it."""
+        """Finds the camera that has the identity in rig.toml and starts it."""
         ...
 
     def configure(self) -> tuple[Message, ...]:
-        """Applies the settings of rig.toml; one line for each that the camera did not take."""
+        """Applies the settings of rig.toml. Returns one message for each setting that the camera did not take."""
         ...
 
     def grab(self, timeout_s: float) -> Arrival:
-        """Waits for the next frame. Raises GrabTimeout, after which grab may be called again, or CameraLost.
+        """Waits for the next frame and returns when it arrived. Raises GrabTimeout, after which ``grab`` may be called
+        again, or CameraLost.
 
-        Where a library knows no such timeout it may take up to a second longer.
+        It may take up to a second longer than ``timeout_s`` where a vendor's library knows no such timeout.
         """
         ...
 
     def retrieve(self) -> ImageRgb:
-        """Returns the frame of the last grab, as the camera sees it (not rotated)."""
+        """Decodes the frame of the last ``grab`` and returns it as the camera sees it (not rotated)."""
         ...
 
     def trigger(self) -> None:
-        """Asks for a picture now: cameras whose ``trigger`` is "software". Others ignore it."""
+        """Asks the camera for a picture now, if its ``trigger`` in rig.toml is "software". Other cameras ignore it."""
         ...
 
     def close(self) -> None:
-        """Lets the camera go."""
+        """Releases the camera."""
         ...
 
 
 class DriverError(EigenheadError):
-    """Reports that a camera does not do what it should; the message starts with its name."""
+    """Reports that a camera does not do what it should. The message begins with the camera's name."""
 
     def __init__(self, camera: str, message: Message) -> None:
         self.camera = camera
@@ -80,21 +81,21 @@ class DriverError(EigenheadError):
 
 
 class CameraNotFound(DriverError):
-    """Reports that no camera has this identity."""
+    """Reports that no camera has the identity that rig.toml names."""
 
     def __init__(self, camera: CameraConfig, why: Message | str) -> None:
         super().__init__(camera.name, compose("camera-not-found", identity=f"{camera.identity!r}", reason=why))
 
 
 class CameraLost(DriverError):
-    """Reports that the camera went away, or sends what is no picture."""
+    """Reports that the camera went away, or that what it sends is no picture."""
 
     def __init__(self, camera: CameraConfig, why: Message | str) -> None:
         super().__init__(camera.name, compose("camera-lost", reason=why))
 
 
 class GrabTimeout(DriverError):
-    """Reports that no frame came in time; the camera may still be well."""
+    """Reports that no frame arrived in time. The camera may still be well."""
 
     def __init__(self, camera: CameraConfig, timeout_s: float) -> None:
         super().__init__(camera.name, compose("no-frame-within", seconds=timeout_s))
@@ -114,5 +115,5 @@ def grab_frame(driver: Driver, timeout_s: float) -> Frame:
 
 
 def upright(image: ImageRgb, rotation_deg: int) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Returns the picture turned clockwise by a multiple of 90 degrees."""
+    """Returns the picture turned clockwise by ``rotation_deg``, a multiple of 90 degrees."""
     return np.ascontiguousarray(np.rot90(image, -rotation_deg // 90)) if rotation_deg else image

@@ -24,7 +24,7 @@ _KEPT = 32  # frames that wait to be collected: half a second at 60 a second
 
 @dataclass(frozen=True, slots=True)
 class FeedState:
-    """Holds what is known of a camera at a moment. Times are time.monotonic, s."""
+    """Holds what is known of one camera at a moment. Times are those of time.monotonic, in seconds."""
 
     opened: bool
     frames: int  # since it was opened
@@ -35,7 +35,8 @@ class FeedState:
 
 
 class CameraFeed:
-    """Owns one driver. ``start`` returns at once; everything that waits takes a deadline (time.monotonic)."""
+    """Runs one camera's driver in a thread. ``start`` returns at once; methods that wait take a deadline
+    (time.monotonic, s)."""
 
     def __init__(self, camera: CameraConfig, driver: Driver, open_timeout_s: float) -> None:
         self.camera = camera
@@ -56,11 +57,11 @@ class CameraFeed:
         self._thread = threading.Thread(target=self._run, name=f"camera {camera.name}", daemon=True)
 
     def start(self) -> None:
-        """Begins to open the camera."""
+        """Starts the thread, which opens the camera."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Asks the thread to end; ``close`` waits for it."""
+        """Asks the thread to end without waiting for it; ``close`` waits."""
         self._stop.set()
 
     def close(self, deadline_s: float) -> bool:
@@ -71,7 +72,7 @@ class CameraFeed:
         return not self._thread.is_alive()
 
     def state(self) -> FeedState:
-        """Returns a snapshot."""
+        """Returns what is known of the camera at this moment."""
         with self._changed:
             gaps = [b - a for a, b in zip(list(self._arrivals_s)[:-1], list(self._arrivals_s)[1:], strict=True)]
             return FeedState(
@@ -84,36 +85,38 @@ class CameraFeed:
             )
 
     def wait_opened(self, deadline_s: float) -> bool:
-        """Tells whether the camera is open before the deadline. Returns early where opening failed."""
+        """Waits until the camera is open and tells whether it is. Returns at once where opening failed."""
         with self._changed:
             self._changed.wait_for(lambda: self._opened or self._error is not None, _left(deadline_s))
             return self._opened
 
     def wait_frames(self, count: int, deadline_s: float) -> bool:
-        """Tells whether the camera delivered ``count`` frames since it was opened, before the deadline."""
+        """Waits until the camera has delivered ``count`` frames since it was opened, and tells whether it has."""
         with self._changed:
             self._changed.wait_for(lambda: self._count >= count, _left(deadline_s))
             return self._count >= count
 
     def want(self, from_s: float) -> None:
-        """Keeps frames that arrive after ``from_s``, decoded, for ``collect``; earlier ones are dropped."""
+        """Keeps, decoded, the frames that arrive after ``from_s`` (time.monotonic), until ``collect`` takes one. Frames
+        kept before are dropped."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s, self._due_s = from_s, None
 
     def due(self, earliest_s: float) -> None:
-        """The first frame that arrives at ``earliest_s`` or later is the one; those after it stay undecoded."""
+        """Declares that the first frame that arrives at ``earliest_s`` (time.monotonic) or later is the wanted one.
+        Frames after it are not decoded."""
         with self._changed:
             self._due_s = earliest_s
 
     def unwant(self) -> None:
-        """Drops frames undecoded again."""
+        """Drops the frames that were kept; from now on frames are not decoded."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s = self._due_s = None
 
     def collect(self, earliest_s: float, deadline_s: float) -> Frame | None:
-        """Returns the first wanted frame that arrived at ``earliest_s`` or later; None where none came before the
+        """Returns the first kept frame that arrived at ``earliest_s`` or later. Returns None where none has come by the
         deadline."""
 
         def first() -> Frame | None:
@@ -124,7 +127,7 @@ class CameraFeed:
             return first()
 
     def trigger(self) -> None:
-        """Asks a camera with a software trigger for a picture; its own thread passes it on."""
+        """Asks a camera with a software trigger for a picture. The request is passed on by the camera's thread."""
         self._release.set()
 
     def _run(self) -> None:

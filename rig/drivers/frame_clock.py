@@ -4,7 +4,8 @@ import time
 
 
 class Pace:
-    """Beats ``fps`` times a second from its making; beats that nobody waited for are lost, as frames are."""
+    """Beats ``fps`` times a second from the moment it is made. Beats that nobody waited for are lost, as frames of a
+    camera are."""
 
     def __init__(self, fps: float) -> None:
         self._period_s = 1.0 / fps
@@ -12,7 +13,7 @@ class Pace:
         self.beat = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Sleeps until the next beat, or for ``timeout_s``; whether there was one."""
+        """Sleeps until the next beat, or for ``timeout_s``. Tells whether there was a beat."""
         passed = int((time.monotonic() - self._started_s) / self._period_s)
         due = max(self.beat + 1, passed)
         wait_s = self._started_s + due * self._period_s - time.monotonic()

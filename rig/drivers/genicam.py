@@ -52,7 +52,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class GenicamDriver:
-    """Drives one camera of Aravis."""
+    """Drives one camera through Aravis."""
 
     live = True
 

@@ -34,7 +34,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class GphotoDriver:
-    """Drives one camera of libgphoto2."""
+    """Drives one camera through libgphoto2."""
 
     live = True
 

@@ -26,11 +26,11 @@ _STALE_S = 5.0  # a kernel stamp further from now than this is of a clock that w
 
 
 class StreamTimeout(Exception):
-    """Reports that nothing came in time; reading may go on."""
+    """Reports that nothing arrived in time. Reading may go on."""
 
 
 class StreamBroken(Exception):
-    """Reports that the stream ended, or is no motion JPEG."""
+    """Reports that the stream ended, or is not motion JPEG."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -38,7 +38,7 @@ class StreamBroken(Exception):
 
 
 class MjpegStream:
-    """One open stream. Raises StreamTimeout, StreamBroken and OSError."""
+    """Reads one open stream of motion JPEG. Raises StreamTimeout, StreamBroken and OSError."""
 
     def __init__(self, url: str, timeout_s: float) -> None:
         deadline_s = time.monotonic() + timeout_s
@@ -58,7 +58,8 @@ class MjpegStream:
         self._socket.close()
 
     def next_part(self, timeout_s: float) -> tuple[float, bytes]:
-        """Returns the arrival (time.monotonic) of the next part, and its body. A part cut by a timeout is resumed."""
+        """Returns when the next part of the stream arrived (time.monotonic, s), and its body. A part that a timeout cut
+        is resumed by the next call."""
         deadline_s = time.monotonic() + timeout_s
         if self._part is None:
             self._take_until(self._boundary, deadline_s, HEAD_MOST)

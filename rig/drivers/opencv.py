@@ -24,7 +24,7 @@ _NEAR = 0.05
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """Returns the driver for an address or a device path."""
+    """Returns the driver for an address or a device path: MjpegDriver for http, else VideoCaptureDriver."""
     return MjpegDriver(camera) if camera.identity.startswith(_ADDRESSES) else VideoCaptureDriver(camera)
 
 
@@ -77,7 +77,7 @@ class MjpegDriver:
 
 
 class VideoCaptureDriver:
-    """Reads what cv2.VideoCapture opens: /dev/v4l/by-id/..., /dev/v4l/by-path/..., rtsp://..."""
+    """Reads the sources that cv2.VideoCapture opens: /dev/v4l/by-id/..., /dev/v4l/by-path/..., rtsp://..."""
 
     live = True
 
@@ -174,7 +174,7 @@ class VideoCaptureDriver:
 
 
 def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
-    """Decodes a picture to RGB pixels. Raises DriverError where it is damaged."""
+    """Decodes a JPEG file to RGB pixels. Raises DriverError where the file is damaged."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
     if image is None:
         raise DriverError(camera.name, compose("frame-no-picture", bytes=len(data)))

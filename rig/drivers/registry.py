@@ -14,6 +14,7 @@ class _DriverModule(Protocol):
 
 
 def driver_for(camera: CameraConfig, folder: Path) -> Driver:
-    """Returns the camera's driver, not opened yet. ``folder`` is where rig.toml lies. Raises DriverMissing."""
+    """Returns the driver that rig.toml names for a camera, not yet opened. ``folder`` is the folder of rig.toml. Raises
+    DriverMissing."""
     module = cast(_DriverModule, importlib.import_module(f".{camera.driver}", __package__))
     return module.make(camera, folder)

@@ -24,7 +24,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class ReplayDriver:
-    """Delivers one recorded picture at a steady rate."""
+    """Delivers one recorded picture again and again at a steady rate."""
 
     live = False
 

@@ -20,13 +20,14 @@ _FPS = 10.0
 
 
 def make(camera: CameraConfig, folder: Path) -> Driver:
-    """Returns the driver for a camera of the studio around a mesh file."""
+    """Returns the driver for a camera of the simulated studio with the head of a mesh file in it."""
     file, _, name = camera.identity.partition("#")
     return SimulatedDriver(camera, name or camera.name, mesh_file=folder / file)
 
 
 class SimulatedDriver:
-    """Photographs an ``ImageSource``, or the studio around ``mesh_file``, which is built when it is opened."""
+    """Photographs an ``ImageSource``, or the simulated studio with the head of ``mesh_file`` in it; the studio is built
+    when the driver is opened."""
 
     live = True
 

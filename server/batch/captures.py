@@ -30,7 +30,8 @@ NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class BatchCapture:
-    """``name``: of its result folder; ``settings``: what its row says, over those of the whole batch."""
+    """Holds one capture of a batch. ``name``: name of the result's folder; ``settings``: settings of this capture,
+    which override those of the batch."""
 
     name: str
     path: Path
@@ -40,9 +41,10 @@ class BatchCapture:
 
 
 def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
-    """Returns every capture below a folder, by name; ``out`` and results elsewhere are passed over.
+    """Finds all captures below a folder, sorted by name; ``out`` and folders of results are skipped.
 
-    Raises InputError where there is none, where the folder itself is one, and naming all that would share a name."""
+    Raises InputError where there is none, where the folder itself is one, and naming all that would share a name.
+    """
     if is_capture(folder) and (find_rig_file(folder) is not None or (folder / "images").is_dir()):
         raise InputError(folder.name, [compose("batch-folder-is-capture")])
     found = [BatchCapture(_name(path, folder), path) for path in _walk(folder, out.resolve())]
@@ -55,7 +57,7 @@ def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a file is an archive, or a folder holds cameras or photographs."""
+    """Tells whether a path is a capture: an archive, or a folder with cameras or enough photographs."""
     if path.is_file():
         return is_archive(path)
     if find_rig_file(path) is not None or (path / "images").is_dir():
@@ -64,12 +66,13 @@ def is_capture(path: Path) -> bool:
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a file's name is that of an archive."""
+    """Tells whether a file is an archive, by the ending of its name."""
     return path.name.lower().endswith(ARCHIVES)
 
 
 def read_list(path: Path) -> tuple[BatchCapture, ...]:
-    """Reads a list of captures, in its order. Raises InputError naming every fault with its line."""
+    """Reads a list of captures and returns them in the list's order. Raises InputError naming every
+    fault with its line."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:

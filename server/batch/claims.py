@@ -26,7 +26,7 @@ SUFFIX = ".json"
 
 
 class Claims:
-    """This process's claims in a folder that all who share the work see. Its methods are for any thread."""
+    """Manages the claims of this process in a folder that all processes of a batch share. Thread-safe."""
 
     def __init__(self, folder: Path, *, silent_s: float = HEARTBEAT_TIMEOUT_S) -> None:
         self.token = secrets.token_hex(8)
@@ -37,7 +37,8 @@ class Claims:
 
     @contextmanager
     def beating(self) -> Iterator[None]:
-        """Keeps the owner's file and its heartbeat while the block runs; claims can be taken within alone."""
+        """Keeps this process's owner file and its heartbeat while the block runs. Claims can be
+        taken only inside it."""
         self._show()
         beat = threading.Thread(target=self._beat, name="claims", daemon=True)
         beat.start()
@@ -49,20 +50,20 @@ class Claims:
             self._owner.unlink(missing_ok=True)
 
     def take(self, name: str) -> bool:
-        """Claims a name; False where somebody else has it."""
+        """Claims a name and tells whether that succeeded; it fails where another process holds the name."""
         return self._take(self._folder / name)
 
     def holds(self, name: str) -> bool:
-        """Whether the claim is still this process's own."""
+        """Tells whether this process still holds the claim on a name."""
         return _holder(self._folder / name) == self.token
 
     def release(self, name: str) -> None:
-        """Gives a claim back."""
+        """Gives up this process's claim on a name, if it still holds it."""
         if self.holds(name):
             (self._folder / name).unlink(missing_ok=True)
 
     def is_alive(self, token: str) -> bool:
-        """Whether an owner may still be at work."""
+        """Tells whether the process with this token may still be at work."""
         if token == self.token:
             return True
         path = self._owners / f"{token}{SUFFIX}"
@@ -80,7 +81,7 @@ class Claims:
         return True
 
     def forget_dead(self) -> None:
-        """Takes claims and files of owners away that are dead."""
+        """Removes the claims and the owner files of dead processes."""
         for path in self._folder.iterdir():
             holder = _holder(path)
             if holder and not self.is_alive(holder) and self._take(path):

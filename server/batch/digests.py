@@ -9,7 +9,8 @@ from rig.formats.picture_names import is_junk
 
 
 def capture_sha256(path: Path) -> str:
-    """Digest of an archive's bytes, or of the names and bytes of all files in a capture folder. Raises OSError."""
+    """Computes the SHA-256 of a capture: of an archive's bytes, or of the names and bytes of all files in a folder.
+    Raises OSError."""
     if not path.is_dir():
         return _file_sha256(path)
     digest = hashlib.sha256()

@@ -11,7 +11,7 @@ SIGKILL = 9
 
 
 def failure_of(error: EigenheadError | OSError, capture: Path, attempt: str, origin: Origin | None) -> FailureRecord:
-    """Returns the record of a failure; without ``origin`` the capture could not even be read."""
+    """Returns the record of a failure for the error that caused it. ``origin`` None: the capture could not be read."""
     if isinstance(error, WorkFailed):
         return FailureRecord(attempt, error.kind, _of_work(error), error.faults, origin, error.trace)
     if isinstance(error, EigenheadError):

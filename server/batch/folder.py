@@ -27,7 +27,7 @@ FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks") 
 
 
 class ForeignFiles(EigenheadError):
-    """A folder of the result's name that holds what no result has."""
+    """Reports that the folder of a result holds files that belong to no result."""
 
     def __init__(self, folder: Path, names: list[str]) -> None:
         super().__init__(compose("batch-foreign-files", folder=str(folder), names=names[:5]))
@@ -35,7 +35,7 @@ class ForeignFiles(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """What a result follows from; the version is no reason to make it again."""
+    """Holds what a result follows from, as SHA-256. Another ``version`` alone is no reason to make the result again."""
 
     input_sha256: str
     settings_sha256: str
@@ -43,7 +43,7 @@ class Origin:
     version: str
 
     def is_of(self, other: "Origin") -> bool:
-        """Whether both are of the same input, settings and model."""
+        """Tells whether two results follow from the same input, settings and model, whatever their version."""
         return (self.input_sha256, self.settings_sha256, self.model_sha256) == (
             other.input_sha256,
             other.settings_sha256,
@@ -53,7 +53,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class FailureRecord:
-    """Why the latest attempt at a capture failed. ``attempt``: whose it was."""
+    """Holds why the latest attempt at a capture failed. ``attempt``: token of the process that made it."""
 
     attempt: str
     kind: str
@@ -64,7 +64,8 @@ class FailureRecord:
 
 
 class BatchFolder:
-    """Paths and records of ``out``. Which process may write what is settled by claims."""
+    """Manages the paths and records of the folder ``out`` that a batch fills. Claims decide which process may write
+    what."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
@@ -75,7 +76,7 @@ class BatchFolder:
         return self.out / name
 
     def origin(self, name: str) -> Origin | None:
-        """Reads what a complete result follows from; None where there is none."""
+        """Reads what a result follows from. Returns None where there is no complete result."""
         folder = self.result(name)
         with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
             record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
@@ -86,11 +87,11 @@ class BatchFolder:
         return None
 
     def report(self, name: str) -> dict[str, Any]:
-        """Reads a result's report.json. Raises OSError and ValueError."""
+        """Reads the report.json of a result. Raises OSError and ValueError."""
         return json.loads((self.result(name) / REPORT).read_text(encoding="utf-8"))
 
     def new_attempt(self, token: str) -> Path:
-        """Makes an empty folder for a result on its way, ``result`` and ``scratch`` within."""
+        """Makes an empty folder for one attempt at a result, with the folders ``result`` and ``scratch`` in it."""
         number = 0
         while True:
             attempt = self.attempts / f"{token}.{number}"
@@ -104,9 +105,10 @@ class BatchFolder:
             return attempt
 
     def publish(self, name: str, attempt: Path, origin: Origin) -> None:
-        """Lays the finished result of an attempt down under its name, in place of an earlier one.
+        """Moves the finished result of an attempt to its final place, replacing an earlier result of that name.
 
-        Raises ForeignFiles, and OSError where another process has just laid its own down."""
+        Raises ForeignFiles, and OSError where another process has just published the same result.
+        """
         made, target = attempt / "result", self.result(name)
         self.check_replaceable(name)
         sizes = {path.relative_to(made).as_posix(): path.stat().st_size for path in _files(made)}
@@ -120,7 +122,8 @@ class BatchFolder:
         self.failure_file(name).unlink(missing_ok=True)
 
     def check_replaceable(self, name: str) -> None:
-        """Raises ForeignFiles where a result's folder has what belongs to no result: it is not ours to throw away."""
+        """Raises ForeignFiles where the folder of a result holds files that belong to no result, so that it must not be
+        replaced."""
         try:
             entries = sorted(path.name for path in self.result(name).iterdir())
         except FileNotFoundError:
@@ -129,13 +132,13 @@ class BatchFolder:
             raise ForeignFiles(self.result(name), foreign)
 
     def remove_attempts(self, is_alive: Callable[[str], bool]) -> None:
-        """Removes attempts of owners that are not alive."""
+        """Removes the attempts of processes that are no longer alive."""
         for path in self._attempts():
             if not is_alive(path.name.partition(".")[0]):
                 shutil.rmtree(path, ignore_errors=True)
 
     def failure(self, name: str) -> FailureRecord | None:
-        """Reads why a capture failed; None where it did not."""
+        """Reads why the latest attempt at a capture failed. Returns None where there is no such record."""
         with suppress(OSError, ValueError, KeyError, TypeError):
             record = json.loads(self.failure_file(name).read_text(encoding="utf-8"))
             origin = None if record["origin"] is None else Origin(**record["origin"])
@@ -144,7 +147,7 @@ class BatchFolder:
         return None
 
     def note_failure(self, name: str, failure: FailureRecord) -> None:
-        """Writes why the latest attempt failed. Raises OSError."""
+        """Writes why the latest attempt at a capture failed. Raises OSError."""
         document = {
             "format": FAILURE_FORMAT,
             "capture": name,
@@ -161,7 +164,7 @@ class BatchFolder:
         return self.work / "failures" / f"{file_name(name)}.json"
 
     def forget_failures_but_of(self, names: set[str]) -> None:
-        """Removes failures of captures that the batch has no more, and writes that a kill tore."""
+        """Removes the failure records of all captures but those named, and files that a kill left half written."""
         retained = {self.failure_file(name).name for name in names}
         with suppress(FileNotFoundError):
             for path in (self.work / "failures").iterdir():
@@ -169,7 +172,7 @@ class BatchFolder:
                     path.unlink(missing_ok=True)
 
     def remove_empty_folders(self) -> None:
-        """Removes what is empty of ``.batch``, unless others are at work in it."""
+        """Removes the empty folders in ``.batch``, unless other processes are at work there."""
         with suppress(OSError):
             for folder in (self.claims / "owners", self.claims):
                 folder.rmdir()
@@ -187,7 +190,7 @@ class BatchFolder:
 
 
 def file_name(name: str) -> str:
-    """Returns a file name for a capture's: readable, and another one for each."""
+    """Returns a readable file name for the name of a capture. Different names give different file names."""
     readable = re.sub(r"[^\w-]+", "-", name)[:60]
     return f"{readable}.{hashlib.sha256(name.encode('utf-8', 'surrogateescape')).hexdigest()[:16]}"
 

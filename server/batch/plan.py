@@ -17,7 +17,8 @@ from server.tasks.stage_durations import StageDurations
 
 @dataclass(frozen=True, slots=True)
 class BatchTask:
-    """A capture and all that its result follows from, but for its files. ``expected_s``: seconds by stage."""
+    """Holds one capture of a batch with all that its result follows from except its files. ``expected_s``: expected
+    seconds of each stage."""
 
     capture: BatchCapture
     settings: Mapping[str, object]
@@ -31,9 +32,10 @@ class BatchTask:
 def plan_batch(
     captures: Iterable[BatchCapture], settings: Mapping[str, object], model: str | None
 ) -> tuple[BatchTask, ...]:
-    """Plans a batch: ``settings`` are of all captures, and a capture's own go over them.
+    """Plans a batch: one task for each capture. ``settings`` apply to all captures; a capture's settings override them.
 
-    Raises UnknownModel, what is wrong with a template, and InputError naming the captures whose settings are wrong."""
+    Raises UnknownModel, the error of a wrong template, and InputError naming the captures whose settings are wrong.
+    """
     path = model_path(model or "default")
     check_template(settings_from_document(settings).outputs.template, model or "default")
     digest, durations, faults = model_sha256(path), StageDurations(), list[Message]()

@@ -7,11 +7,11 @@ Clock = Callable[[], float]
 
 
 class BatchProgress:
-    """Counts captures that end, and guesses by their mean what the others take.
+    """Counts the captures that are done and estimates the remaining time from their mean.
 
     Args:
-        captures: to be made, those that are there already left out.
-        workers: at once.
+        captures: number still to be made.
+        workers: number of captures at once.
         expected_s: of one capture, before one was made.
         clock: seconds that only grow.
     """
@@ -26,12 +26,12 @@ class BatchProgress:
         self._running[name] = self._clock(), 0.0
 
     def report(self, name: str, share: float) -> None:
-        """Takes in how far a capture is, from 0 to 1."""
+        """Records which share of a capture is done, from 0 to 1."""
         if name in self._running:
             self._running[name] = self._running[name][0], min(1.0, max(0.0, share))
 
     def end(self, name: str, *, failed: bool) -> None:
-        """Takes in that a capture ended; one that failed says nothing of how long others take."""
+        """Records that a capture ended. The time of one that failed does not count for the estimate."""
         since, _ = self._running.pop(name, (self._clock(), 0.0))
         self.ended += 1
         self.failed += failed
@@ -39,16 +39,16 @@ class BatchProgress:
             self._took.append(self._clock() - since)
 
     def leave(self, name: str) -> None:
-        """Takes in that another process has this capture."""
+        """Records that another process has this capture."""
         self._running.pop(name, None)
 
     def share(self) -> float:
-        """Returns what is done of all, from 0 to 1."""
+        """Returns the share of the whole batch that is done, from 0 to 1."""
         begun = sum(share for _, share in self._running.values())
         return min(1.0, (self.ended + begun) / max(1, self._captures))
 
     def remaining_s(self) -> float:
-        """Returns the seconds that are left, if all workers stay at work."""
+        """Estimates the remaining seconds, as if all workers stayed at work."""
         mean_s = sum(self._took) / len(self._took) if self._took else self._expected_s
         waiting = max(0, self._captures - self.ended - len(self._running))
         begun = [mean_s * (1.0 - share) for _, share in self._running.values()]
@@ -57,7 +57,7 @@ class BatchProgress:
 
 
 def told_time(seconds: float) -> str:
-    """Returns seconds, minutes or hours in words, no more exact than a guess is."""
+    """Returns a time as text, in seconds, minutes or hours, no more exact than an estimate is."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

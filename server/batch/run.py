@@ -35,7 +35,7 @@ TABLE = "table"  # the claim of who writes the tables
 
 
 class FolderWork(Protocol):
-    """What a worker runs for a capture: ``reconstruct_beside``."""
+    """Declares the function that a worker runs for a capture: ``reconstruct_beside``."""
 
     def __call__(
         self,
@@ -54,7 +54,7 @@ class FolderWork(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a capture ended: ``made`` now, ``kept`` from before or from another process, or ``failed``."""
+    """Holds how a capture ended: ``made`` now, ``kept`` from before or from another process, or ``failed``."""
 
     name: str
     state: Literal["made", "kept", "failed"]
@@ -63,7 +63,7 @@ class Outcome:
 
 
 class Observer(Protocol):
-    """Who is told how a batch goes, from several threads, one at a time."""
+    """Declares what is called as a batch goes on, from several threads but never two at a time."""
 
     def begin(self, pending: int) -> None: ...
     def start(self, name: str) -> None: ...
@@ -73,7 +73,7 @@ class Observer(Protocol):
 
 
 class BatchRun:
-    """One process's share of a batch."""
+    """Runs one process's share of a batch."""
 
     def __init__(
         self,
@@ -95,10 +95,11 @@ class BatchRun:
         self._outcomes: dict[str, Outcome] = {}
 
     def run(self, publish_table: Callable[[], object]) -> list[Outcome]:
-        """Makes what is missing and returns how each capture ended, in the order of the tasks.
+        """Makes the results that are missing and returns how each capture ended, in the order of the tasks.
 
-        ``publish_table`` is called at the end, by one process of all at a time. Raises OSError where the folder cannot
-        be written."""
+        ``publish_table`` is called at the end, never by two processes at a time. Raises OSError where the folder cannot
+        be written.
+        """
         try:
             with self._claims.beating():
                 self._sweep()

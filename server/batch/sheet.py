@@ -58,7 +58,8 @@ ul { margin: 4px 0 0; padding-left: 1.1em; font-size: 13px; } code { font-size: 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """A capture on the sheet. ``messages``: warnings, or why it failed; ``link``: of its folder, from the sheet."""
+    """Holds what the sheet shows of one capture. ``messages``: warnings, or why it failed; ``link``: path of its
+    folder, relative to the sheet."""
 
     name: str
     of: str
@@ -70,12 +71,13 @@ class Card:
 
 
 def severity(code: str) -> str:
-    """Returns ``severe``, ``warning`` or ``remark``."""
+    """Returns how serious a warning with this code is: ``severe``, ``warning`` or ``remark``."""
     return "severe" if code in SEVERE else "remark" if code in REMARKS else "warning"
 
 
 def card_class(card: Card) -> str:
-    """Returns what colours a card: the worst that is told of it."""
+    """Returns the class by which a card is coloured: the state of a capture that is not done, else
+    its worst warning."""
     if card.state != "done":
         return card.state
     found = {severity(message["code"]) for message in card.messages}
@@ -83,7 +85,7 @@ def card_class(card: Card) -> str:
 
 
 def sheet_html(title: str, cards: Sequence[Card]) -> str:
-    """Returns the sheet; those that need a look come first."""
+    """Returns the sheet as HTML. Captures that need attention come first."""
     order = ("failed", "severe", "warning", "good", "missing")
     ranked = sorted(cards, key=lambda card: (order.index(card_class(card)), card.name))
     return "\n".join(
@@ -99,7 +101,7 @@ def sheet_html(title: str, cards: Sequence[Card]) -> str:
 
 
 def summary(cards: Iterable[Card]) -> str:
-    """Returns the counts of the sheet's first line."""
+    """Returns the first line of the sheet: how many captures are good, have warnings, failed or are missing."""
     words = {
         "good": "without a warning that matters", "warning": "with warnings", "severe": "that may be wrong",
         "failed": "failed", "missing": "not made yet",
@@ -110,8 +112,8 @@ def summary(cards: Iterable[Card]) -> str:
 
 
 def views_of(turntable: Path) -> bytes | None:
-    """Returns right profile, front and left profile of a result's turntable.png as one JPEG; None where it cannot be
-    read."""
+    """Returns right profile, front and left profile from a result's turntable.png as one JPEG file. Returns None where
+    the picture cannot be read."""
     drawn = cv2.imread(str(turntable), cv2.IMREAD_COLOR)
     if drawn is None:
         return None
@@ -123,7 +125,7 @@ def views_of(turntable: Path) -> bytes | None:
 
 
 def figures_of(row: Mapping[str, object]) -> str:
-    """Returns a line of what is asked of a head first."""
+    """Returns the figures of a head that people ask for first, as one line: breadth, length and deviation (mm)."""
     names = {"head_breadth_mm": "breadth", "head_length_mm": "length", "quality_median_mm": "deviation"}
     found = [(word, row.get(name)) for name, word in names.items()]
     return ", ".join(f"{word} {value:.1f} mm" for word, value in found if isinstance(value, float))

@@ -18,9 +18,10 @@ SHEET = "sheet.html"
 
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
-    """Writes table and sheet of all captures of a batch, those of other shards too, and returns the files.
+    """Writes the table and the sheet of all captures of a batch, other shards' included. Returns the files.
 
-    Raises OSError."""
+    Raises OSError.
+    """
     folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(_expressions(tasks))
     rows, cards = [], []

@@ -21,7 +21,8 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """``unit``: "" where there is none; ``words``: what docs/batch.md says of it."""
+    """Describes one column of the table. ``unit``: "" where there is none; ``words``: its
+    description in docs/batch.md."""
 
     name: str
     kind: Literal["text", "number", "count", "flag"]
@@ -63,7 +64,7 @@ ORIGIN = (
 
 
 def measurement_columns() -> tuple[Column, ...]:
-    """Returns two columns a distance of Farkas: its value and its standard deviation."""
+    """Returns two columns for each of Farkas's distances: the value and its standard deviation (mm)."""
     return tuple(
         column
         for name, (first, second) in DISTANCES.items()
@@ -75,7 +76,7 @@ def measurement_columns() -> tuple[Column, ...]:
 
 
 def landmark_columns() -> tuple[Column, ...]:
-    """Returns six columns a landmark: its place in the world frame, and the standard deviation of each coordinate."""
+    """Returns six columns for each landmark: its coordinates in the world frame and their standard deviations (mm)."""
     places = (
         Column(f"{name}_{axis}_mm", "number", "mm", f"{axis} of {name}, world frame") for name in NAMES for axis in AXES
     )
@@ -88,7 +89,7 @@ def landmark_columns() -> tuple[Column, ...]:
 
 
 def expression_columns(names: Iterable[str]) -> tuple[Column, ...]:
-    """Returns two columns an expression of the model: its weight and its standard deviation."""
+    """Returns two columns for each of the named expressions: its weight and the weight's standard deviation."""
     return tuple(
         column
         for name in names
@@ -100,7 +101,7 @@ def expression_columns(names: Iterable[str]) -> tuple[Column, ...]:
 
 
 def columns_of(expressions: Iterable[str]) -> tuple[Column, ...]:
-    """Returns all columns in their order; ``expressions``: names of the models that the batch uses."""
+    """Returns all columns in their order. ``expressions``: names of the expressions of the models in use."""
     shown = expression_columns(expressions)
     return (*WHOSE, *QUALITY, *measurement_columns(), *shown, *ORIGIN, *landmark_columns())
 
@@ -113,7 +114,8 @@ def row_of(
     origin: Origin | None = None,
     failure: FailureRecord | None = None,
 ) -> Row:
-    """Returns the row of a capture that is done (``report`` and ``origin``), failed, or neither."""
+    """Returns the table's row of a capture that is done (``report`` and ``origin``), that failed (``failure``), or
+    neither."""
     row: Row = {column.name: None for column in columns}
     row |= {"capture": capture.name, "subject": capture.subject or None, "session": capture.session or None}
     row["state"] = "missing"

@@ -13,7 +13,7 @@ CSV, PARQUET = "heads.csv", "heads.parquet"
 
 
 def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) -> list[Path]:
-    """Writes the table and returns its files; without pyarrow the CSV file alone. Raises OSError."""
+    """Writes the table as CSV and, where pyarrow is installed, as Parquet. Returns the files. Raises OSError."""
     files = [folder / CSV]
     write_atomically(files[0], csv_bytes(columns, rows))
     if has_parquet():
@@ -25,7 +25,7 @@ def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) ->
 
 
 def has_parquet() -> bool:
-    """Whether Parquet files can be written here."""
+    """Tells whether Parquet files can be written here."""
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError:
@@ -34,7 +34,8 @@ def has_parquet() -> bool:
 
 
 def csv_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
-    """Returns RFC 4180 in UTF-8, with all digits of every number; an empty cell is no value."""
+    """Returns the table as CSV (RFC 4180, UTF-8), with all digits of every number. An empty cell
+    stands for no value."""
     stream = io.StringIO(newline="")
     writer = csv.writer(stream)
     writer.writerow([column.name for column in columns])
@@ -43,7 +44,7 @@ def csv_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
 
 
 def parquet_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
-    """Returns a Parquet file whose fields say their unit and meaning in their metadata. Needs pyarrow."""
+    """Returns the table as a Parquet file; the metadata of each field has its unit and description. Needs pyarrow."""
     import pyarrow
     import pyarrow.parquet
 

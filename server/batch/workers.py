@@ -10,12 +10,12 @@ CGROUP = Path("/sys/fs/cgroup")
 
 
 def worker_count(cores: int, free_bytes: int, captures: int) -> int:
-    """Computes how many workers there are by default: one a core, as far as memory goes, and at least one."""
+    """Computes the default number of workers: one for each core, as far as memory allows, and at least one."""
     return max(1, min(cores, free_bytes // WORKER_BYTES, captures))
 
 
 def threads_of_worker(cores: int, workers: int) -> int:
-    """Computes how many threads of a loop each worker has, so that all of them fill the cores."""
+    """Computes how many threads each worker's loops may use, so that all workers together fill the cores."""
     return max(1, cores // workers)
 
 
@@ -25,7 +25,7 @@ def usable_cores() -> int:
 
 
 def free_memory(meminfo: Path = Path("/proc/meminfo"), cgroup: Path | None = None) -> int:
-    """Returns the bytes that are free: of the machine, and of the control group that a scheduler or container set."""
+    """Returns the free bytes of memory: of the machine, or of this process's control groups if these have less."""
     free = [_available(meminfo)]
     group = _own_group() if cgroup is None else cgroup
     while group.is_relative_to(CGROUP) or cgroup is not None:

@@ -19,8 +19,8 @@ TRIMMED = 0.8  # share of the nearest pairs that a round uses: necks end at diff
 
 
 def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
-    """Returns one number a vertex from a binary little-endian PLY whose first element are the vertices. Raises NotFound
-    where the file has no such property."""
+    """Returns one number for each vertex from a binary little-endian PLY file, whose first element must be the
+    vertices. Raises NotFound where the file has no such property."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
     count, fields, element = 0, [], ""
@@ -37,9 +37,10 @@ def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
 
 
 def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.ndarray, " v"]:
-    """Computes the distance (mm) of every vertex of a result's head to the surface of ``other``.
+    """Computes the distance (mm) of every vertex of a result's head to the surface of the mesh ``other``.
 
-    Heads of different captures stand in different places: ``align`` moves ours rigidly onto theirs first.
+    Heads of different captures stand in different places: with ``align`` the result's head is first moved rigidly onto
+    the other one.
     """
     mine, theirs = read_mesh(result / "head.ply"), read_mesh(other)
     points = moved_onto(mine, theirs) if align else mine.vertices
@@ -47,8 +48,8 @@ def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.nd
 
 
 def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Returns our vertices after the rigid motion with the least squares to theirs: to the same vertices where both
-    heads come from one model, else to the nearest ones, the farthest fifth left out."""
+    """Returns the vertices of ``mine`` after the rigid motion that brings them closest to ``theirs``: to the same
+    vertices if both heads have as many, else to the nearest ones, the farthest fifth left out."""
     if len(mine.vertices) == len(theirs.vertices):
         return _rigid(mine.vertices, theirs.vertices, mine.vertices)
     points = mine.vertices - mine.vertices.mean(0) + theirs.vertices.mean(0)

@@ -23,7 +23,7 @@ Corners = dict[str, list[list[float]]]  # of a shot, by camera: shares of the im
 
 
 class Coverage(TypedDict):
-    """Holds what was seen of the board by one camera."""
+    """Holds how one camera's picture was covered by the board so far."""
 
     name: str
     views: int
@@ -34,8 +34,8 @@ class Coverage(TypedDict):
 
 
 def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: Mapping[str, object]) -> Corners:
-    """Runs in a child: corners of the board in each image of a capture, as shares of width and height; none where the
-    board is not seen. Raises InputError for a board that cannot be."""
+    """Finds the corners of the board in each image of a capture, in a child process. Returns them by camera, as shares
+    of width and height; none where the board is not seen. Raises InputError for an impossible board."""
     described = board_from_document(board)
     found = {}
     for number, path in enumerate(sorted((Path(files) / "images").iterdir())):
@@ -50,7 +50,8 @@ def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: 
 
 
 def covered(corners: Float[np.ndarray, "n 2"]) -> float:
-    """Returns the share of an image's cells that hold a corner."""
+    """Returns the share of a picture's cells that hold a corner of the board. Corners are shares of
+    width and height."""
     if len(corners) == 0:
         return 0.0
     cells = np.clip((corners * CELLS).astype(int), 0, np.array(CELLS) - 1)
@@ -58,8 +59,8 @@ def covered(corners: Float[np.ndarray, "n 2"]) -> float:
 
 
 def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
-    """Returns one line a camera: views with the board, share of the image covered, its corners, and whether that is
-    enough."""
+    """Returns for each camera how many pictures show the board, which share of the picture is covered, the corners, and
+    whether that is enough."""
     lines: list[Coverage] = []
     for name in cameras:
         seen = [shot[name] for shot in shots if shot.get(name)]
@@ -82,7 +83,7 @@ def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
 
 
 def advice(lines: list[Coverage]) -> Message:
-    """Returns the next thing to do."""
+    """Returns a message of what the person with the board should do next."""
     if not lines or not any(line["views"] for line in lines):
         return compose("board-hold")
     blind = [line["name"] for line in lines if line["views"] == 0]

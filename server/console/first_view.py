@@ -27,14 +27,14 @@ GAMMA = 2.2  # near enough to sRGB's curve for a picture that is there for half 
 
 
 def first_view(result: Path) -> UInt8[np.ndarray, "s s 3"]:
-    """Raises InputError where there is no head."""
+    """Draws the head of a result as the page Result shows it first (RGB). Raises InputError where there is no head."""
     head, _ = read_head_ply(result / "head.ply")
     mesh = Mesh(placed(result).apply(head.vertices), head.faces, head.colours)
     return drawn(mesh)
 
 
 def drawn(mesh: Mesh) -> UInt8[np.ndarray, "s s 3"]:
-    """Returns a head with colours (head frame, mm) on the view's ground, twice supersampled."""
+    """Draws a coloured head (head frame, mm) on the page's background, at twice the size and then reduced."""
     vertices = mesh.vertices
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
@@ -48,8 +48,8 @@ def drawn(mesh: Mesh) -> UInt8[np.ndarray, "s s 3"]:
 
 
 def lit(mesh: Mesh) -> UInt8[np.ndarray, "v 3"]:
-    """Computes colours as the view's lights show a rough surface: three.js multiplies linear colour by light over
-    pi."""
+    """Computes the vertices' colours in the lights of the page, as three.js does for a rough surface: linear colour
+    times light over pi."""
     normals = vertex_normals(mesh.vertices, mesh.faces)
     light: Float[np.ndarray, " v"] = np.full(len(normals), AMBIENT)
     for *place, power in LIGHTS:

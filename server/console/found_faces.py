@@ -23,7 +23,7 @@ _finding: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
 
 def found_faces(service: Service, identity: str) -> FacesDocument:
-    """Returns the faces in a capture's pictures. Blocks.
+    """Returns the faces in a capture's pictures, found at the first call and then kept. Blocks.
 
     Raises NotFound, Conflict for a shot of the board, InputError and WorkFailed as the work did, and Unavailable where
     it takes too long.

@@ -32,8 +32,8 @@ OUTSIDE = 0.25  # of the image: guides go so far beyond its rim
 
 
 def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) -> Float[np.ndarray, "n 2"]:
-    """Returns where ``target`` sees the ray of a pixel of ``source``: a curve in pixels, empty where it sees none of
-    it."""
+    """Returns the curve (px) at which the camera ``target`` sees the line of sight through a pixel of the camera
+    ``source``; empty where it sees none of it."""
     camera = rig[source]
     ray = camera.rays_world(np.asarray(pixel, float)[None])[0]
     middle = float((rig.centre_world() - camera.centre_world) @ ray)
@@ -43,9 +43,12 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
 
 
 class Helps(TypedDict):
-    """By point and camera: the curves of the other views' rays (of the shown point), where the triangulated point is
-    seen, how far off (px) what was picked is, and where the model's landmarks would be; ``contradictions``: what a job
-    would leave out, by point."""
+    """Holds what helps to pick points, by point and then by camera, in pixels.
+
+    ``guides``: curves of the other views' lines of sight; ``reprojected``: where the triangulated point is seen;
+    ``off_px``: how far the picked pixel is from there; ``predicted``: where the model's landmarks would be.
+    ``contradictions``: by point, what a job would leave out.
+    """
 
     guides: dict[str, dict[str, list[list[list[float]]]]]
     reprojected: dict[str, dict[str, list[float]]]
@@ -56,7 +59,8 @@ class Helps(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """Holds what follows from one point's picks; ``position`` (mm) is None where its rays meet nowhere."""
+    """Holds what follows from the pixels picked for one point. ``position`` (world frame, mm) is None where the lines
+    of sight do not meet."""
 
     position: Float[np.ndarray, " 3"] | None
     reprojected: dict[str, list[float]]
@@ -65,8 +69,8 @@ class Located:
 
 
 class Guides:
-    """Helps for the picks in one rig's pictures. What a change leaves alone is not computed again: a click costs one
-    point, and the curves of the one that is shown, however many there are."""
+    """Computes what helps to pick points in the pictures of one rig. Only what a change affects is computed again, so
+    that a click costs the same however many points there are."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -77,7 +81,8 @@ class Guides:
     def helps(
         self, points: Pixels, landmarks: Landmarks, shown: Collection[str], views: Collection[str] | None = None
     ) -> Helps:
-        """``shown``: the points of which curves are wanted; ``views``: the cameras in which, None for all."""
+        """Returns what helps to pick ``points``. ``shown``: points whose curves are wanted; ``views``: cameras in which
+        (None: all)."""
         targets = self._rig.names if views is None else [name for name in self._rig.names if name in views]
         located = {name: self._of(name, views) for name, views in points.items()}
         places = {name: found.position for name, found in located.items() if found.position is not None}
@@ -124,7 +129,7 @@ class Guides:
 
 
 def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) -> Located:
-    """Triangulates one point, and asks what a job would leave out of it."""
+    """Triangulates one point from the pixels picked in several views, and finds what a job would leave out of them."""
     try:
         found = triangulate(views, rig, noise_px=CLICK_NOISE_PX)
     except NoPoint:
@@ -136,7 +141,7 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
 
 
 def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
-    """Helps for all points, from nothing."""
+    """Returns what helps to pick all points, without an earlier computation to build on."""
     return Guides(rig).helps(points, landmarks, list(points))
 
 
@@ -147,7 +152,8 @@ def _picks(points: Pixels, shown: Collection[str]) -> set[tuple[str, tuple[float
 def predicted(
     rig: Rig, located: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> dict[str, dict[str, list[float]]]:
-    """Returns the model's landmarks in every view, once three points that are not on a line place its mean head."""
+    """Returns the pixels of the model's landmarks in every view, the mean head being placed by at least three located
+    points. Returns none where the points do not place it."""
     names = [name for name in located if name in landmarks]
     if len(names) < POINTS_LEAST:
         return {}
@@ -160,13 +166,14 @@ def predicted(
 
 
 def nearest_views(rig: Rig, front: str, count: int) -> list[str]:
-    """``front`` and the cameras that look from most nearly the same side."""
+    """Returns the names of ``count`` cameras: ``front`` and those that look most nearly in the same direction."""
     axes = {camera.name: camera.camera_from_world.rotation[2] for camera in rig}
     return sorted(axes, key=lambda name: (name != front, -float(axes[name] @ axes[front])))[:count]
 
 
 def mean_landmarks(context: WorkerContext, report: Progress, *, model: str, names: list[str]) -> dict[str, list[float]]:
-    """Landmarks of a model's mean head (head frame, mm); runs in a child, because a model is large."""
+    """Returns the landmarks of a model's mean head (head frame, mm). Runs in a child process,
+    because a model is large."""
     from pipeline.head_model.model import load_model
 
     loaded = load_model(model)

@@ -28,7 +28,7 @@ _drawing = threading.Lock()
 
 
 def result_folder(service: Service, job_id: str) -> Path:
-    """Raises Conflict where the job has no result."""
+    """Returns the folder of a job's result. Raises Conflict where the job has none."""
     state = service.jobs.state(job_id)
     if state != "succeeded":
         raise Conflict("no-result", compose("job-without-result", state=state))
@@ -36,7 +36,8 @@ def result_folder(service: Service, job_id: str) -> Path:
 
 
 def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
-    """Raises Conflict where the job has no result, NotFound or InputError where that has no head (any more)."""
+    """Returns the file of a picture of a job's head, which is drawn at the first call. Raises Conflict where the job
+    has no result, and NotFound or InputError where the result has no head."""
     result = result_folder(service, job_id)
     kept = result.parent / name
     if not kept.is_file():
@@ -50,14 +51,14 @@ def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
 
 
 def draw_first_view(service: Service, job_id: str) -> None:
-    """Of a head that is about to be opened, so that it is there when the page asks for it."""
+    """Draws the first view of a head that is about to be opened, so that it is ready when the page asks for it."""
     with suppress(EigenheadError, OSError):  # removed meanwhile, or a result without a head: the page tells
         head_picture(service, job_id, "first-view.jpg")
 
 
 @cache
 def warm_up() -> None:
-    """The first picture of a service loads what reads and draws it: a second that nobody should wait for at a head."""
+    """Loads what reads and draws heads, so that the first head does not have to wait a second for that."""
     corners = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]])
     corner = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
     with suppress(OSError), TemporaryDirectory() as folder:  # on a full disk the first head waits

@@ -25,17 +25,18 @@ KEY_ID = "key_id"
 
 
 def service_of_pages() -> Service:
-    """Returns the running service: pages live as long as it."""
+    """Returns the running service, which lives as long as the pages do."""
     return pages.state.eigenhead.state.service
 
 
 def sign_in(service: Service, token: str) -> Caller | None:
-    """Returns the caller whose key ``token`` is. Blocks."""
+    """Returns the caller whose API key is ``token``, None for an unknown key. Blocks."""
     return service.keys.caller(token.strip())
 
 
 def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
-    """Returns who the browser with this user storage is; None where a key is still to be given. Blocks."""
+    """Returns the caller behind a browser, from its user storage. Returns None where an API key must be given first.
+    Blocks."""
     keys = {key.id: key for key in service.keys.all()}
     if not keys and service.settings.is_private:
         return Caller(LOCAL, frozenset(SCOPES))
@@ -44,7 +45,7 @@ def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
 
 
 def permit(caller: Caller | None, scope: str) -> Caller:
-    """``caller``, if it may do ``scope``. Raises Unauthenticated, Forbidden."""
+    """Returns ``caller`` if it has the scope. Raises Unauthenticated for None, and Forbidden."""
     if caller is None:
         raise Unauthenticated("key-missing", compose("sign-in-again"))
     if not caller.may(scope):
@@ -53,7 +54,7 @@ def permit(caller: Caller | None, scope: str) -> Caller:
 
 
 def cookie_secret(data: Path) -> str:
-    """Signs the session cookie; made once, so that a restart signs nobody out."""
+    """Returns the secret that signs session cookies. It is made once, so that a restart signs nobody out."""
     path = data / "console" / "secret"
     if not path.is_file() or not path.stat().st_size:  # an empty one is left where a full disk met the first start
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -62,15 +63,15 @@ def cookie_secret(data: Path) -> str:
 
 
 def is_foreign(scope: Scope, settings: ServiceSettings) -> bool:
-    """Tells whether a page elsewhere made a browser send this: its Origin is another host than the one that it asks,
-    and not the public one."""
+    """Tells whether a page of another site made a browser send this request: its Origin is neither the requested host
+    nor the public address."""
     headers = Headers(scope=scope)
     origin, host = headers.get("origin"), headers.get("host", "")
     return origin is not None and origin not in (settings.public_url, f"http://{host}", f"https://{host}")
 
 
 def is_rebound(scope: Scope, settings: ServiceSettings) -> bool:
-    """Tells whether a request to a service that listens on loopback alone names another host than that and the public
+    """Tells whether a request to a service that listens only on loopback names another host than loopback or the public
     one (DNS rebinding)."""
     host = Headers(scope=scope).get("host", "")
     name = host.rpartition(":")

@@ -30,10 +30,10 @@ log = structlog.get_logger()
 
 
 class Source(Protocol):
-    """Where pictures come from. Blocks."""
+    """Declares where the pictures of the live view come from. Methods block."""
 
     def frames(self) -> list[LiveFrame]:
-        """Returns one row a camera: name, jpeg (None without a picture), mean, clipped, perhaps blur_px and fault."""
+        """Returns the present picture of each camera (``jpeg`` None where it shows nothing) with its measurements."""
         ...
 
     def close(self) -> None: ...
@@ -52,7 +52,8 @@ class StudioSource:
 
 
 class RigSource:
-    """Real cameras, all in one look; one of them a look is judged for sharpness, which takes its full size."""
+    """Takes pictures of real cameras, of all at once. Each time one camera's picture is judged for sharpness, which
+    needs its full size."""
 
     def __init__(self, rig: RigBackend) -> None:
         self._rig, self._looks = rig, 0
@@ -85,7 +86,8 @@ def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
 
 
 class LiveView:
-    """The newest look, numbered. The thread starts with the first who watches and ends ``KEEP_S`` after the last."""
+    """Holds the newest pictures of all cameras, numbered. A thread takes them from when somebody watches until
+    ``KEEP_S`` after the last one left."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -96,7 +98,8 @@ class LiveView:
         self.fault: Message | None = None
 
     async def stream(self) -> AsyncIterator[bytes]:
-        """Looks as they come: 4 bytes of header length, 4 of body length, a JSON header, the JPEGs in its order."""
+        """Yields the pictures of all cameras as they are taken: 4 bytes of header length, 4 of body length, a JSON
+        header, and the JPEG files in the header's order."""
         seen = 0
         while True:
             self._watch()
@@ -149,7 +152,8 @@ class LiveView:
 
 
 def look_bytes(frames: list[LiveFrame], fault: Message | None) -> bytes:
-    """Returns a look on the wire; ``bytes`` in the header is the length of each camera's JPEG."""
+    """Encodes the pictures of all cameras as ``LiveView.stream`` sends them. ``bytes`` in the header is the length of
+    each JPEG file."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
     text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document()}).encode()
     body = b"".join(f["jpeg"] or b"" for f in frames)

@@ -22,7 +22,8 @@ MM = 1000.0
 
 
 class CameraView(TypedDict):
-    """Holds a pinhole camera (pixels); ``camera_from_head``: rows of a 4 x 4 matrix, metres, head frame of head.glb."""
+    """Holds a pinhole camera (px). ``camera_from_head``: rows of a 4 x 4 matrix (metres), from the head frame of
+    head.glb."""
 
     name: str
     width: int
@@ -35,7 +36,8 @@ class CameraView(TypedDict):
 
 
 def camera_views(rig: Rig, report: Report) -> list[CameraView]:
-    """Returns every camera of the capture. ``report`` places the head: x_world = R x_head + s t, at its true size."""
+    """Returns every camera of a capture as seen from the head, whose pose ``report`` has: x_world = R x_head + s t, at
+    its true size."""
     place = report["world_from_head"]
     shift = np.array(place["translation"]) * place["scale"]
     world_from_head = RigidTransform(np.array(place["rotation"]), shift)
@@ -43,7 +45,7 @@ def camera_views(rig: Rig, report: Report) -> list[CameraView]:
 
 
 def rig_of(capture: Path) -> Rig:
-    """Returns the rig of a capture's files. Raises InputError."""
+    """Reads the rig from the files of a capture. Raises InputError."""
     found = find_rig_file(capture)
     if found is None:
         raise InputError("capture", [compose("no-cameras-json")])
@@ -51,7 +53,7 @@ def rig_of(capture: Path) -> Rig:
 
 
 def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
-    """Returns the photograph without the lens's distortion, at most ``WIDTH_MOST`` wide."""
+    """Returns the photograph with the lens's distortion removed, at most ``WIDTH_MOST`` pixels wide."""
     lens = camera.intrinsics
     if camera.recorded is not None:
         image = camera.recorded.undistort(image, lens.matrix(), smooth=True)
@@ -66,8 +68,8 @@ def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
 
 
 def straightened_face(face: FoundFace, camera: Camera) -> FoundFace:
-    """Returns a face with the pixels that ``straightened`` shows it at, at full size; points that the lens does not
-    hold are left out."""
+    """Returns a face with its pixels as in the straightened photograph at full size. Points outside the lens are left
+    out."""
     lens, pixels = camera.intrinsics, np.array(face["points"])
     if camera.recorded is not None:
         straight = camera.recorded.undistorted(pixels, lens.matrix())

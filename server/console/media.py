@@ -42,7 +42,8 @@ _drawing = threading.Lock()
 
 
 def session(scope: str) -> Any:
-    """Makes a dependency: the service and the caller of the browser's session, if it may do ``scope``."""
+    """Returns a dependency that gives the service and the caller of the browser's session. It raises what ``permit``
+    does."""
 
     async def authenticate() -> tuple[Service, Caller]:
         service, stored = service_of_pages(), dict(pages.storage.user)
@@ -72,7 +73,7 @@ async def live(who: Reader) -> StreamingResponse:
 
 @pages.get("/console/captures/{capture_id}/{camera}.jpg")
 def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
-    """Returns a small JPEG of an image; a capture never changes."""
+    """Returns a small JPEG file of an image of a capture. Browsers may keep it, because captures never change."""
     service = who[0]
     name = _image_name(service.store.capture(capture_id), camera)
     path = service.store.cache_of(capture_id) / "small" / f"{Path(name).stem}.jpg"
@@ -89,13 +90,13 @@ def front(who: Reader, capture_id: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/checks")
 def checks(who: Reader, capture_id: str) -> Response:
-    """Returns what was measured of a capture's pictures, by camera."""
+    """Returns the measurements of a capture's pictures, by camera."""
     return JSONResponse(who[0].store.checks(capture_id), headers=FOREVER)
 
 
 @pages.get("/console/captures/{capture_id}/holdings")
 def holdings(who: Reader, capture_id: str) -> Response:
-    """Returns what a removal of the capture takes, and what stays."""
+    """Returns what a removal of the capture would take and what would stay."""
     return JSONResponse(asdict(who[0].captures.holdings(capture_id)), headers={"Cache-Control": "no-store"})
 
 
@@ -106,7 +107,7 @@ def image(who: Reader, request: Request, capture_id: str, camera: str) -> Respon
 
 @pages.get("/console/captures/{capture_id}/{camera}.silhouette.png")
 def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
-    """Returns the outline of the subject, drawn for all cameras at the first look."""
+    """Returns the outline of the subject in a camera's picture. At the first request those of all cameras are drawn."""
     service = who[0]
     name = Path(_image_name(service.store.capture(capture_id), camera)).stem
     folder = service.store.cache_of(capture_id) / "outlines"
@@ -120,7 +121,7 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/faces")
 def faces(who: Reader, capture_id: str) -> Response:
-    """Returns the faces in a capture's pictures, with their points (pixels), found at the first look."""
+    """Returns the faces in a capture's pictures with their points (px). They are found at the first request."""
     return JSONResponse(found_faces(who[0], capture_id)["faces"], headers=FOREVER)
 
 
@@ -149,7 +150,8 @@ def overlay_file(who: Reader, request: Request, job_id: str, name: str) -> Respo
 
 @pages.get("/console/jobs/{job_id}/{surface}.{name}.f32")
 def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Literal["quality", "part"]) -> Response:
-    """Returns a number a vertex (float32) of head.ply or bust.ply: posterior standard deviation (mm), or part."""
+    """Returns a number for each vertex (float32) of head.ply or bust.ply: ``quality`` (posterior standard deviation,
+    mm) or ``part``."""
     path = result_folder(who[0], job_id) / f"{surface}.ply"
     if not path.is_file():
         raise NotFound(compose("thing-surface"), surface)
@@ -164,8 +166,7 @@ def portrait(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/first-view.jpg")
 def first_view(who: Reader, job_id: str) -> Response:
-    """Returns the head as the page Result shows it first; nothing of a head.ply that is not ours: the page does
-    without."""
+    """Returns the head as the page Result shows it first. Returns nothing for a head.ply of another program."""
     try:
         return FileResponse(head_picture(who[0], job_id, "first-view.jpg"), headers=FOREVER)
     except InputError:
@@ -174,8 +175,8 @@ def first_view(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/cameras")
 def cameras(who: Reader, job_id: str) -> Response:
-    """Returns the cameras that took the pictures, in the head's frame; none where the capture was removed, or the
-    result has no report that places the head."""
+    """Returns the cameras of a job's capture in the head's frame. Returns none where the capture was removed or the
+    report does not place the head."""
     service, found = who[0], []
     report = result_folder(who[0], job_id) / "report.json"
     with suppress(NotFound, FileNotFoundError, KeyError):
@@ -208,8 +209,8 @@ def faces_of_job(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/distance.f32")
 def distance(who: Reader, job_id: str, other: str) -> Response:
-    """Computes the distance (mm, float32) of every vertex to the surface of another job's head, or of the truth
-    (``truth``)."""
+    """Returns the distance (mm, float32) of every vertex to the surface of another job's head, or of the true head if
+    ``other`` is ``truth``."""
     service = who[0]
     job = service.jobs.get(job_id)
     mine = result_folder(service, job_id)
@@ -225,7 +226,7 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/all.zip")
 def all_files(who: Reader, request: Request, job_id: str) -> Response:
-    """Returns every file of the result in one archive."""
+    """Returns all files of a result in one archive."""
     return send_archive(request, result_folder(who[0], job_id), who[0].jobs.files(job_id), name=None)
 
 

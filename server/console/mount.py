@@ -28,9 +28,9 @@ FOLDERS = ("/_nicegui", "/console/", "/features/", "/result/")
 
 
 def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
-    """Serves the pages at ``/``; what is no page of ours is left to the API and its problem documents.
+    """Adds the pages to the service's app, at ``/``. Addresses that are no pages are left to the API.
 
-    NiceGUI's own app is one a process, so that a process has one service with pages: the last that was made.
+    NiceGUI has one app a process, so that of several services in a process the last one has the pages.
     """
     from server.console import media  # noqa: F401 - they add their routes to NiceGUI's app
     from server.console.pages import (  # noqa: F401
@@ -75,14 +75,15 @@ def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
 
 
 def path_below(scope: Scope) -> str:
-    """Returns the requested path, below where the service is mounted (``root_path``)."""
+    """Returns the path of a request, relative to where the service is mounted (``root_path``)."""
     path, root = scope["path"], scope.get("root_path", "")
     below = path.removeprefix(root)
     return below if below == "" or below.startswith("/") else path
 
 
 class PagesMount(Mount):
-    """The mount of the pages: it answers for their paths alone, and to nobody whom another web page sent."""
+    """Mounts the pages. Answers only for their paths, and refuses requests that another web page
+    made a browser send."""
 
     def __init__(self, mounted: Mount, settings: ServiceSettings) -> None:
         super().__init__(mounted.path, app=mounted.app)

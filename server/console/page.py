@@ -49,10 +49,10 @@ _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a captur
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """Holds what an event of a page does: ``function(page, event)`` in a thread, for callers with ``scope``. Page and
-    event are of the type that the function says: the page's own, and what its component sends.
+    """Describes what an event of a page does: ``function(page, event)``, in a thread, for callers with ``scope``.
+    ``page`` is the page that the event comes from, ``event`` what its component sends.
 
-    What it returns, if anything, is said in the corner.
+    A message that the function returns is shown in the corner.
     """
 
     scope: str
@@ -61,8 +61,8 @@ class Action:
 
 @dataclass
 class Cache:
-    """Values that all open pages share, so that they agree, and ten pages cost what one does. What takes long to make
-    is kept the longer, so that making it takes a tenth of the time at most, but no longer than ``KEEP_MOST_S``."""
+    """Keeps values that all open pages share, so that they agree and ten pages cost what one does. A value that takes
+    long to make is kept longer, up to ``KEEP_MOST_S``, so that making it takes a tenth of the time at most."""
 
     _values: dict[Any, tuple[float, float, Any]] = field(default_factory=dict)
     _locks: dict[Any, Lock] = field(default_factory=dict)
@@ -70,8 +70,8 @@ class Cache:
     _forgets: int = 0
 
     def get(self, key: Any, age_s: float, make: MAKE) -> Any:
-        """Returns the value of ``key``, made anew where it is older than ``age_s``. Blocks; raises what ``make``
-        does."""
+        """Returns the value of ``key``, made anew by ``make`` if it is older than ``age_s`` seconds. Blocks. Raises
+        what ``make`` raises."""
         with self._lock:
             key_lock = self._locks.setdefault(key, Lock())
         with key_lock:
@@ -86,7 +86,7 @@ class Cache:
             return value
 
     def forget(self, *kinds: str) -> None:
-        """Values whose key is, or begins with, one of ``kinds``."""
+        """Drops the values whose key is, or begins with, one of ``kinds``."""
         self._forgets += 1
         for key in list(self._values):
             if (key[0] if isinstance(key, tuple) else key) in kinds:
@@ -111,7 +111,8 @@ shared = Cache()
 
 
 class Page(Element):
-    """A Vue component with the property ``state``; its event ``act`` carries {name, ...} to an action."""
+    """Shows one page: a Vue component with the property ``state``, whose event ``act`` carries
+    {name, ...} to an action."""
 
     actions: Mapping[str, Action] = {}
 
@@ -130,19 +131,19 @@ class Page(Element):
         frame.on("follow", self._follow)
 
     def begin(self) -> None:
-        """Looks again and again from now on. A timer asks for the browser's connection, at which NiceGUI sends the page
-        as it stands: timers come after the first look, so that its state is sent with the page."""
+        """Starts to refresh the page's state regularly. NiceGUI sends a page when its first timer asks for the
+        browser's connection: timers start after the first refresh, so that the state is sent with the page."""
         ui.timer(REFRESH_S, self.refresh, immediate="loading" in self.props["state"])
         ui.timer(STATUS_S, self._refresh_status, immediate=True)
         self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
 
     def look(self) -> Mapping[str, object]:
-        """Returns the state document. Runs in a thread."""
+        """Returns the state of the page as a document. Runs in a thread."""
         raise NotImplementedError
 
     def preloads(self) -> Iterable[tuple[str, str]]:
-        """Returns what the browser is to fetch while it still reads the page: what as (``image``, ``fetch``) and
-        where."""
+        """Returns what the browser should fetch while it still reads the page: pairs of kind (``image``, ``fetch``) and
+        address."""
         return ()
 
     async def refresh(self) -> None:
@@ -171,7 +172,8 @@ class Page(Element):
             self.frame.show(status=status)
 
     def started(self, *jobs: str, opens: bool = False) -> None:
-        """Jobs that an action began: the browser's tab follows them; ``opens``: the head is shown when it is ready."""
+        """Notes jobs that an action began, so that the browser's tab follows them. ``opens``: the head is shown when it
+        is ready."""
         self._started = ([*jobs], opens)
 
     async def _follow(self, event: GenericEventArguments) -> None:
@@ -223,13 +225,13 @@ class Page(Element):
 
 
 class Chosen(TypedDict):
-    """Holds the event of an action on one thing."""
+    """Holds the event of an action on one thing: the thing's id."""
 
     id: str
 
 
 def undo(page: Page, event: Chosen) -> Message:
-    """Takes back what waits to be removed, from whichever page."""
+    """Takes back a removal that is still waiting, whichever page began it."""
     removal = removals.waiting().get(event["id"])
     if removal is not None:
         permit(page.caller, removal.scope)
@@ -243,13 +245,14 @@ UNDO = Action("read", undo)
 
 
 def remove_later(identity: str, remove: Callable[[], None], title: Message, scope: str) -> None:
-    """Out of sight of all pages at once; ``remove`` runs when nobody took it back."""
+    """Hides a thing from all pages at once, and calls ``remove`` after a while unless somebody takes that back."""
     removals.add(identity, remove, title, scope)
     shared.clear()
 
 
 def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: Message, scope: str) -> None:
-    """Many things at once, taken back at once."""
+    """Hides several things from all pages at once, and removes them after a while unless somebody takes that back, for
+    all together."""
 
     def remove_each() -> None:
         done = each(ids, remove)
@@ -272,13 +275,13 @@ def as_problem(error: Exception) -> Problem:
 
 
 async def signed_in() -> Caller | None:
-    """Returns who opens the page; None where a key is to be asked for first."""
+    """Returns the caller who opens the page. Returns None where an API key must be given first."""
     stored = dict(pages.storage.user)
     return await anyio.to_thread.run_sync(caller_of, service_of_pages(), stored, limiter=_threads)
 
 
 async def show(name: str, page: type[Page], **initial: str | None) -> RedirectResponse | None:
-    """Draws ``page`` for who is signed in, or asks for a key first."""
+    """Shows ``page`` to a caller who is signed in; others are sent to the page that asks for an API key."""
     caller = await signed_in()
     if caller is None:
         return RedirectResponse("/sign-in")
@@ -293,7 +296,8 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
 
 
 class Followed(TypedDict):
-    """How far a job is that was started in this tab of the browser; ``gone`` is the state of one that was removed."""
+    """Holds the progress of a job that was started in this tab of the browser. The state of a job that was removed is
+    ``gone``."""
 
     id: str
     state: str
@@ -314,8 +318,8 @@ def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
 
 
 class Status(TypedDict):
-    """Holds what the frame shows of the service; ``faults``: what to do, by what is wrong; ``starting``: what is not
-    there yet; ``empty``: nobody took or uploaded a capture."""
+    """Holds what all pages show of the service. ``faults``: what to do, by the part that is not well; ``starting``:
+    parts that are not there yet; ``empty``: there is no capture."""
 
     starting: list[str]
     faults: dict[str, MessageDocument]
@@ -326,7 +330,7 @@ class Status(TypedDict):
 
 
 def status_of(service: Service, caller: Caller) -> Status | None:
-    """Returns what the frame shows of the service; None where the caller's key is gone."""
+    """Returns what all pages show of the service. Returns None where the caller's API key was removed."""
     if caller_of(service, {"key_id": caller.key}) is None:
         return None
 

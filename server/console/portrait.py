@@ -20,7 +20,8 @@ MARGIN = 1.12  # of the head's box, for hair
 
 
 def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """In the colours of the photographs, from half left. Raises FileNotFoundError where there is no head."""
+    """Draws a small picture (RGB) of a result's bust or head from half left, in the colours of the photographs. Raises
+    FileNotFoundError where there is no head."""
     name = "bust.ply" if (result / "bust.ply").is_file() else "head.ply"
     head_from_world = placed(result)
     head = head_from_world.apply(read_mesh(result / "head.ply").vertices)
@@ -34,7 +35,7 @@ def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def placed(result: Path) -> RigidTransform:
-    """head_from_world as the report has it; where it says nothing the head stays as it lies."""
+    """Returns head_from_world as the report of a result has it, the identity where it has none."""
     try:
         place = json.loads((result / "report.json").read_text())["world_from_head"]
     except (FileNotFoundError, KeyError):

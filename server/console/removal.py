@@ -18,7 +18,8 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Removal:
-    """``scope`` is what a key needs that takes it back; ``ids``: all that goes."""
+    """Holds a removal that can still be taken back. ``scope``: what a caller needs to do that; ``ids``: all that is
+    removed."""
 
     title: Message
     scope: str
@@ -28,7 +29,7 @@ class Removal:
 
 @dataclass
 class Removals:
-    """Holds what waits to be removed, by id."""
+    """Holds the removals that can still be taken back, by id."""
 
     wait_s: float = UNDO_S
     _waiting: dict[str, Removal] = field(default_factory=dict)
@@ -40,7 +41,8 @@ class Removals:
     def add(
         self, identity: str, remove: Callable[[], None], title: Message, scope: str, also: Iterable[str] = ()
     ) -> None:
-        """``also``: further ids that go, and are taken back, with it."""
+        """Adds a removal; ``remove`` is called when the time to take it back has passed. ``also``: ids of further
+        things that are removed with it."""
         timer = threading.Timer(self.wait_s, self._remove, (identity, remove))
         timer.daemon = True
         with self._lock:
@@ -49,7 +51,7 @@ class Removals:
                 timer.start()
 
     def undo(self, identity: str) -> bool:
-        """Tells whether the thing was still there to be taken back."""
+        """Takes a removal back. Tells whether it was still waiting."""
         with self._lock:
             removal = self._waiting.pop(identity, None)
         if removal is not None:

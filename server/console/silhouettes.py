@@ -16,7 +16,8 @@ LINE_PX = 3
 
 
 def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, target: str) -> None:
-    """Writes ``target``/<camera>.png, the outline with a tint of the subject on nothing. Raises InputError."""
+    """Draws the subject's outline in each picture of a capture as ``target``/<camera>.png, transparent outside. Raises
+    InputError."""
     from pipeline.settings import SegmentationSettings
     from server.storage.silhouette_cache import segment_once
     from server.tasks.photographs import read_scaled_capture
@@ -30,7 +31,7 @@ def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, 
 
 
 def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
-    """RGBA of at most ``WIDTH``: the outline solid, the inside lightly tinted."""
+    """Returns an RGBA picture of a mask, at most ``WIDTH`` wide: the outline solid, the inside lightly tinted."""
     factor = min(1.0, WIDTH / mask.shape[1])
     size = (round(mask.shape[1] * factor), round(mask.shape[0] * factor))
     small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)

@@ -28,7 +28,8 @@ SUBJECT_SEED = 1  # the same person as in the rig's own previews
 
 
 def frames(context: WorkerContext, look: int) -> list[LiveFrame]:
-    """Returns one frame a camera; now and then one of them has blur_px."""
+    """Returns the present picture of each camera of the simulated studio. Now and then one camera's blur is measured,
+    too."""
     views = context.keep("live", _draw)
     rng = context.keep("noise", np.random.default_rng)
     names = list(views)

@@ -6,7 +6,8 @@ from server.tasks.child import WorkerContext
 
 
 def frames(context: WorkerContext, report: Progress, *, look: int) -> list[LiveFrame]:
-    """Returns one frame a camera; now and then one of them has blur_px."""
+    """Returns the present picture of each camera of the simulated studio. Now and then one camera's blur is measured,
+    too."""
     from server.console import studio_drawing
 
     return studio_drawing.frames(context, look)

@@ -6,7 +6,7 @@ from server.storage.face_cache import PixelsOfPoints
 
 
 def open_suggestions(suggested: PixelsOfPoints, points: PixelsOfPoints) -> PixelsOfPoints:
-    """Returns the suggestions of views in which the point is not set: what somebody picked stays theirs."""
+    """Returns the suggestions (px, by point and camera) without those for views in which the point is set already."""
     left = {
         name: {camera: at for camera, at in views.items() if camera not in points.get(name, {})}
         for name, views in suggested.items()
@@ -17,7 +17,8 @@ def open_suggestions(suggested: PixelsOfPoints, points: PixelsOfPoints) -> Pixel
 def take_suggestions(
     points: PixelsOfPoints, suggested: PixelsOfPoints, point: str | None = None, camera: str | None = None
 ) -> PixelsOfPoints:
-    """Returns the points with the suggestions of one point in one view, of one in all, or of all."""
+    """Returns the points with suggestions added: those of one point in one view, of one point in all views, or all.
+    Points that are set stay."""
     taken = {name: dict(views) for name, views in points.items()}
     for name, view, at in _of(open_suggestions(suggested, points), point, camera):
         taken.setdefault(name, {})[view] = at
@@ -25,7 +26,7 @@ def take_suggestions(
 
 
 def drop_suggestions(suggested: PixelsOfPoints, point: str | None = None, camera: str | None = None) -> PixelsOfPoints:
-    """Returns the suggestions without those of one point in one view, of one in all, or of all."""
+    """Returns the suggestions without some: those of one point in one view, of one point in all views, or all."""
     left = {name: dict(views) for name, views in suggested.items()}
     for name, view, _ in _of(suggested, point, camera):
         left[name].pop(view)

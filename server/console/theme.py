@@ -28,7 +28,8 @@ Answer = Callable[[Any], Awaitable[Any]]
 
 
 class Frame(Element, component="static/frame.js"):
-    """Navigation, state of the service, messages, and the keys that work everywhere; a page lies in it."""
+    """Shows what surrounds every page: navigation, state of the service, messages, and the keys
+    that work everywhere."""
 
     def __init__(self, current: str) -> None:
         super().__init__()
@@ -36,14 +37,14 @@ class Frame(Element, component="static/frame.js"):
         self.props.update(links=links, current=current, status={}, removed=[], followed=[])
 
     def show(self, **changed: Any) -> None:
-        """``status`` of the service, what was ``removed`` and can be taken back, or how far the jobs are that are
-        ``followed``."""
+        """Shows the ``status`` of the service, things that were ``removed`` and can be taken back, or the progress of
+        ``followed`` jobs."""
         if any(self.props[name] != value for name, value in changed.items()):
             self.props.update(changed)
             self.update()
 
     def say(self, kind: str, message: Message, faults: Iterable[Message] = ()) -> None:
-        """A message in the corner: ``kind`` is done, warning or fault; ``faults`` are all listed."""
+        """Shows a message in the corner, with all ``faults``. ``kind``: done, warning or fault."""
         self.run_method("announce", kind, message.document(), documents_of(faults))
 
 

@@ -16,14 +16,14 @@ class PresetLine(TypedDict):
 
 
 class TemplateLine(TypedDict):
-    """``models``: names of the one that carries it."""
+    """Holds a template as forms list it. ``models``: names of the model that carries it."""
 
     name: str
     models: list[str]
 
 
 class WorkForm(Chosen):
-    """``method`` is a preset's id."""
+    """Holds what a form asks before a job is sent. ``method``: id of a preset."""
 
     model: NotRequired[str | None]
     method: NotRequired[str | None]
@@ -39,7 +39,8 @@ def template_lines() -> list[TemplateLine]:
 
 
 def chosen_work(event: WorkForm) -> ReconstructionRequest:
-    """Returns model, preset and template of the form; what is not chosen is the service's default."""
+    """Returns the request that a form describes: model, preset and template. What is not chosen is left to the
+    service's defaults."""
     settings, template = dict(settings_of(event.get("method"))), event.get("template")
     if template:
         settings["outputs"] = cast(dict[str, object], settings.get("outputs", {})) | {"template": template}

@@ -11,7 +11,8 @@ from server.problem_types import URN
 
 @dataclass(frozen=True, slots=True)
 class RefusedOne:
-    """``type`` and ``detail`` are those of the problem that the action alone would have answered."""
+    """Holds why an action was refused for one thing. ``type`` and ``detail`` are those of the problem that the action
+    alone would have given."""
 
     id: str
     type: str
@@ -25,7 +26,7 @@ class Bulk:
 
 
 def each(ids: Iterable[str], action: Callable[[str], object]) -> Bulk:
-    """Does ``action`` to every id once; what it refuses to one holds no other up."""
+    """Does ``action`` once for every id. Where it is refused for one id, the others are still done."""
     done, refused = [], []
     for identity in dict.fromkeys(ids):
         try:

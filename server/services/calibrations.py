@@ -35,14 +35,14 @@ WORKFLOW = "calibrate"
 
 
 class Calibrations:
-    """The calibrations of a service. Methods block."""
+    """Manages the calibrations of a service. Methods block."""
 
     def __init__(self, store: Store, client: DBOSClient, queue: str, events: EventLog) -> None:
         self._store, self._client, self._queue, self._events = store, client, queue, events
 
     def add(self, folder: Path, source: str, label: str) -> Calibration:
-        """Accepts ``folder`` (images/, and board.toml where they show one) and queues the work. Raises InputError for
-        a label that cannot be."""
+        """Takes over ``folder`` (images/, and board.toml if they show a board) and queues its calibration. Raises
+        InputError for an invalid label."""
         check_texts({"label": label})
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
@@ -55,7 +55,7 @@ class Calibrations:
         return self.get(identity)
 
     def add_shots(self, board: Mapping[str, object], captures: list[str], label: str) -> Calibration:
-        """Queues a calibration from shots that the rig took of the board. Raises NotFound and InputError."""
+        """Queues a calibration from captures that show the board. Raises NotFound and InputError."""
         from calibration.board.board import board_from_document, write_board
 
         described = board_from_document(board)
@@ -67,8 +67,8 @@ class Calibrations:
             return self.add(target, "rig", label)
 
     def add_scene(self, captures: list[str], scale: Mapping[str, object] | None, label: str) -> Calibration:
-        """Queues a calibration from captures of anything; ``scale``: a ``scale.json``. Raises NotFound and
-        InputError."""
+        """Queues a calibration from captures of any scene. ``scale``: the content of a ``scale.json``. Raises NotFound
+        and InputError."""
         with self._store.incoming() as folder:
             target = folder / "calibration"
             target.mkdir()
@@ -79,7 +79,7 @@ class Calibrations:
             return self.add(target, "rig", label)
 
     def get(self, identity: str) -> Calibration:
-        """Raises NotFound."""
+        """Returns a calibration with its progress or outcome. Raises NotFound."""
         record = self._store.calibration(identity)
         row = self._row(identity)
         state = STATES[row.status] if row else "queued"
@@ -112,7 +112,7 @@ class Calibrations:
         )
 
     def find(self) -> list[Calibration]:
-        """Lists ids, newest first."""
+        """Returns all calibrations, newest first."""
         found = []
         for identity in self._store.ids("calibrations"):
             with suppress(NotFound):  # removed since they were listed, or damaged
@@ -120,18 +120,18 @@ class Calibrations:
         return found
 
     def cameras_json(self, identity: str) -> Path:
-        """Raises NotFound, Conflict."""
+        """Returns the path of the cameras.json of a calibration that succeeded. Raises NotFound and Conflict."""
         return self.result(identity, "cameras.json")
 
     def result(self, identity: str, name: str) -> Path:
-        """Returns a file of a calibration that succeeded. Raises NotFound, Conflict."""
+        """Returns the path of a file of a calibration that succeeded. Raises NotFound and Conflict."""
         state = self.get(identity).state
         if state != "succeeded":
             raise Conflict("no-result", compose("calibration-without-result", state=state))
         return self._store.folder("calibrations", identity) / "result" / name
 
     def file(self, identity: str, name: str) -> StoredFile:
-        """Returns a file of a calibration that succeeded, with its sha256."""
+        """Returns a file of a calibration that succeeded, with its SHA-256. Raises NotFound and Conflict."""
         path = self.result(identity, name)
         return StoredFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
@@ -143,14 +143,14 @@ class Calibrations:
         self._client.delete_workflow(identity)
 
     def check_usable(self, identity: str) -> None:
-        """Raises Conflict for a calibration that is poor, naming what it lacks."""
+        """Raises Conflict for a calibration whose verdict is poor, naming what it lacks."""
         found = self.get(identity)
         if found.verdict == "poor":
             detail = compose("calibration-poor")
             raise Conflict("calibration-poor", detail, found.missing)
 
     def in_use(self) -> str | None:
-        """sha256 of the calibration in use."""
+        """Returns the SHA-256 of the cameras.json of the calibration in use, if any."""
         path = self._store.data / "rig" / "in_use"
         return path.read_text() if path.is_file() else None
 
@@ -173,7 +173,8 @@ class Calibrations:
 
 
 def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
-    """Makes the pictures of the named captures into ``folder``: one shot each. Raises NotFound and InputError."""
+    """Links the pictures of the named captures into ``folder``, each capture as one shot. Raises NotFound and
+    InputError."""
     for number, identity in enumerate(captures):
         record = store.capture(identity)
         files = store.folder("captures", identity) / "files"

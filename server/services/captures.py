@@ -39,7 +39,8 @@ POINTS = TypeAdapter(Points)
 
 @dataclass(frozen=True, slots=True)
 class CaptureMetadata:
-    """Holds what people say of a capture. Raises InputError for texts that cannot be stored."""
+    """Holds what people say of a capture: label, tags and the like. Raises InputError for texts
+    that cannot be stored."""
 
     session: str | None = None
     label: str = ""
@@ -51,7 +52,7 @@ class CaptureMetadata:
 
     @classmethod
     def of(cls, fields: Mapping[str, str | None]) -> "CaptureMetadata":
-        """Reads the fields of a form, in which commas stand between tags. Raises InputError."""
+        """Reads the metadata from the fields of a form, in which tags are separated by commas. Raises InputError."""
         tags = typed_tags(fields.get("tags") or "")
         return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "", tags)
 
@@ -72,7 +73,8 @@ class Captures:
         self._settings, self._library = settings, library
 
     def take(self, about: CaptureMetadata, *, seed: int | None = None, board: bool = False) -> CaptureRecord:
-        """Triggers the rig now. ``board``: pictures of the calibration board. Raises Unavailable, and DiskFull."""
+        """Takes a shot with the rig and stores it as a capture. ``board``: it shows the calibration board. Raises
+        Unavailable and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         if not board:
             self._check_consent(about.session)
@@ -86,8 +88,8 @@ class Captures:
             return self._add(capture, "rig", content, about, shot)
 
     def sample(self) -> CaptureRecord:
-        """Takes a shot of the simulated studio, also where the rig is a real one. It shows nobody, so that nobody is
-        asked for consent. Raises Unavailable, and DiskFull."""
+        """Takes a shot of the simulated studio, even if the rig is a real one. It shows no real person, so that no
+        consent is needed. Raises Unavailable and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         studio = SimulatedRig(self._store.data / "rig" / "none")
         try:
@@ -110,8 +112,8 @@ class Captures:
             studio.close()
 
     def accept(self, archive: Path, folder: Path, about: CaptureMetadata) -> CaptureRecord:
-        """Makes a received archive a capture; ``folder`` is the incoming folder. Raises InputError naming every
-        fault, Conflict where the service asks for consent."""
+        """Makes a capture from a received archive. ``folder`` is the incoming folder. Raises InputError naming every
+        fault, and Conflict where consent is missing."""
         self._check_consent(about.session)
         limits = self.archive_limits(archive)
         (folder / "capture").mkdir()
@@ -125,18 +127,18 @@ class Captures:
         return self._add(folder / "capture", "upload", content, about)
 
     def archive_limits(self, archive: Path) -> ArchiveLimits:
-        """Returns what an archive may unpack to. Raises DiskFull where there is no room for it."""
+        """Returns how large the content of an archive may be. Raises DiskFull where there is no room for it."""
         self._store.reserve(archive.stat().st_size, self._settings.free_bytes)
         s = self._settings
         return ArchiveLimits(members=s.archive_members, total_bytes=s.archive_bytes, ratio=s.archive_ratio)
 
     def page(self, query: CaptureQuery, limit: int = 100, cursor: str | None = None) -> Found[CaptureRecord]:
-        """Raises InputError for a cursor of another list."""
+        """Returns one page of the captures that match a query. Raises InputError for a cursor of another list."""
         page = self._library.captures(query, limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[CaptureRecord]:
-        """Returns the captures with these ids, in their order, those of them that there are."""
+        """Returns the captures with these ids, in their order; ids of no capture are left out."""
         found = []
         for identity in ids:
             with suppress(NotFound):  # removed since the index was asked, or damaged
@@ -149,8 +151,8 @@ class Captures:
     def edit(
         self, identity: str, changes: Mapping[str, str | None], *, tags: Sequence[str] | None = None
     ) -> CaptureRecord:
-        """Changes label, expression, session or ``tags``; what is left out stays. Raises NotFound, and InputError for
-        texts and tags that cannot be."""
+        """Changes label, expression, session or ``tags`` of a capture; fields that are left out stay. Raises NotFound,
+        and InputError for invalid texts and tags."""
         check_texts({name: changes.get(name) for name in ("label", "expression")})
         checked = None if tags is None else checked_tags(tags)
         if changes.get("session") is not None:
@@ -168,11 +170,11 @@ class Captures:
         return self._store.change_capture(identity, change)
 
     def tag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
-        """Adds ``tags`` to those of a capture. Raises NotFound, and InputError where these are too many then."""
+        """Adds ``tags`` to a capture. Raises NotFound, and InputError where the capture would have too many."""
         return self._store.change_capture(identity, lambda r: replace(r, tags=checked_tags([*r.tags, *tags])))
 
     def untag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
-        """Takes ``tags`` away from a capture, in whatever case. Raises NotFound, InputError."""
+        """Removes ``tags`` from a capture, whatever their case. Raises NotFound and InputError."""
         gone = {tag.casefold() for tag in checked_tags(tags)}
 
         def change(record: CaptureRecord) -> CaptureRecord:
@@ -181,12 +183,12 @@ class Captures:
         return self._store.change_capture(identity, change)
 
     def tags(self, limit: int = 200) -> list[str]:
-        """Returns the tags that captures bear, the most frequent first."""
+        """Returns the tags of all captures, the most frequent first."""
         return self._library.tags(limit)
 
     def image(self, identity: str, kind: str, camera: str) -> StoredFile:
-        """Returns a camera's file of a kind (images, background), found in the record, never by putting a request's
-        text into a path. Raises NotFound."""
+        """Returns a camera's file of a kind ("images", "background") with its path from the capture's record, never
+        from the text of a request. Raises NotFound."""
         record = self._store.capture(identity)
         for name, digest in record.inputs.items():
             path = Path(name)
@@ -196,8 +198,8 @@ class Captures:
         raise NotFound(compose("thing-camera-file"), camera, compose("hint-capture-inputs"))
 
     def features(self, identity: str) -> Points:
-        """Returns the stored feature points, by point and camera. Raises NotFound, also where their file is gone or
-        damaged."""
+        """Returns the stored feature points (px), by point and camera. Raises NotFound, also where their file is
+        missing or damaged."""
         if not self._store.capture(identity).features:
             return {}
         path = self._store.folder("captures", identity) / "files" / "features.json"
@@ -207,7 +209,8 @@ class Captures:
             raise NotFound(compose("thing-feature-points"), identity, compose("hint-put-again")) from error
 
     def put_features(self, identity: str, points: Points) -> CaptureRecord:
-        """Stores feature points. Raises NotFound, and InputError naming every point that the capture cannot have."""
+        """Stores feature points (px by point and camera). Raises NotFound, and InputError naming every point that does
+        not fit the capture."""
         refuse_board(self._store.capture(identity))
         folder = self._store.folder("captures", identity) / "files"
         try:
@@ -225,7 +228,7 @@ class Captures:
         return self._store.change_capture(identity, change)
 
     def check_unused(self, identity: str) -> CaptureRecord:
-        """Returns the record of a capture that no job needs. Raises Conflict."""
+        """Returns the record of a capture if no job needs the capture. Raises Conflict otherwise."""
         record = self._store.capture(identity)
         if active := self._jobs.active(capture=identity):
             detail = compose("capture-in-use")
@@ -233,17 +236,17 @@ class Captures:
         return record
 
     def remove(self, identity: str) -> None:
-        """Removes a capture with its images; its jobs and their results stay. Raises Conflict while a job needs it."""
+        """Removes a capture with its images. Its jobs and their results stay. Raises Conflict while a job needs it."""
         self.check_unused(identity)
         self._store.remove_capture(identity)
 
     def holdings(self, identity: str) -> Holdings:
-        """Returns what a removal would take and what would stay. Raises NotFound."""
+        """Returns what would be removed with a capture and what would stay. Raises NotFound."""
         return holdings(self._store, self._jobs, identity)
 
     def erase(self, identity: str) -> None:
-        """Cancels the capture's jobs, then removes its images, heads, caches and what the job database holds of them,
-        with or without a session. Raises NotFound, and Unavailable while a worker still writes."""
+        """Cancels the jobs of a capture, then removes all traces of it: images, heads, caches and rows of the job
+        database. Raises NotFound, and Unavailable while a worker still writes."""
         self._store.capture(identity)
         erase_captures(self._store, self._jobs, [identity])
         self._library.scrub()
@@ -299,13 +302,15 @@ class Captures:
 
 
 def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
-    """Returns the faults in a real rig's certificate; the simulated studio's pictures are judged as uploads are."""
+    """Returns the faults in the certificate of a real rig's shot. Pictures of the simulated studio are judged as
+    uploads are."""
     if shot is None or "checks" not in shot:
         return ()
     return tuple(read_fault(document) for document in cast(ShotDocument, shot)["faults"])
 
 
 def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:
-    """Returns what the shot and the check of its files measured of each camera."""
+    """Returns the measurements of each camera's picture, those of the shot and those of the check
+    of its files together."""
     taken = cast(Mapping[str, ViewDocument], {} if shot is None else shot.get("checks", {}))
     return {name: {**taken.get(name, {}), **view} for name, view in content.checks.items()}

@@ -14,8 +14,11 @@ CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 
 @dataclass(frozen=True, slots=True)
 class Holdings:
-    """Holds what there is of a capture. A removal takes the pictures (``bytes``: their files and caches); ``heads``,
-    results with photographs in their overlays, and the other ``jobs`` stay until it is erased."""
+    """Holds what is stored of a capture.
+
+    A removal takes the pictures (``bytes``: size of their files and caches). ``heads``, the results whose overlays show
+    photographs, and the other ``jobs`` stay until the capture is erased.
+    """
 
     pictures: int
     bytes: int
@@ -26,7 +29,7 @@ class Holdings:
 
 
 def holdings(store: Store, jobs: Jobs, capture: str) -> Holdings:
-    """Raises NotFound."""
+    """Returns what is stored of a capture. Raises NotFound."""
     record = store.capture(capture)
     of_capture = jobs.find(capture=capture, limit=100_000)
     heads = tuple(job.id for job in of_capture if job.state == "succeeded")
@@ -41,8 +44,8 @@ def holdings(store: Store, jobs: Jobs, capture: str) -> Holdings:
 
 
 def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: Collection[str] = ()) -> None:
-    """Cancels the jobs of the captures (and ``others``), then removes results, images, caches and what the job database
-    holds. Asked again, it goes on where it was cut short. Raises Unavailable while a worker still writes."""
+    """Cancels the jobs of the captures and ``others``, then removes results, images, caches and rows of the job
+    database. If it was interrupted, a second call completes it. Raises Unavailable while a worker still writes."""
     of_captures = {job.id for capture in captures for job in jobs.find(capture=capture, limit=100_000)} | {*others}
     active = [job for job in of_captures if jobs.state(job) not in FINISHED]
     for job in of_captures:

@@ -17,7 +17,7 @@ log = structlog.get_logger()
 
 
 class JobFailed(EigenheadError):
-    """A job that cannot succeed; what the engine stores as the workflow's error."""
+    """Reports a job that cannot succeed. The job engine stores it as the error of the workflow."""
 
     def __init__(self, kind: str, detail: Message | Kept, errors: Iterable[Message | Kept] = ()) -> None:
         super().__init__(_read(detail))
@@ -40,7 +40,7 @@ def _read(kept: Message | Kept) -> Message:
 
 
 def failure(row: WorkflowStatus) -> Failure:
-    """Returns why the job of a row failed."""
+    """Returns why the job of a workflow's row failed."""
     error = row.error
     if isinstance(error, JobFailed):
         return Failure(URN + error.kind, error.detail, error.errors)

@@ -18,7 +18,7 @@ from server.tasks.egl import try_egl
 
 
 def readiness(service: Service) -> dict[str, Check]:
-    """EGL, disk, database, workers, rig; what is damaged or gone stands there without ending readiness."""
+    """Checks EGL, disk, database, workers and rig, and returns one finding for each."""
     return {
         "database": _database(service),
         "disk": _disk(service),
@@ -86,7 +86,7 @@ def _records(service: Service) -> Check:
 
 
 def exposition(service: Service) -> bytes:
-    """Returns the metrics of this moment, in Prometheus' text format."""
+    """Returns the current metrics in the text format of Prometheus."""
     jobs = service.jobs.counts()
     captures, damaged = len(service.store.ids("captures")), len(service.store.list_quarantined())
     return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)
@@ -94,7 +94,8 @@ def exposition(service: Service) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Info:
-    """Holds what a client may want to know before it sends anything: limits, how much waits, the settings' defaults."""
+    """Holds what a client may want to know before it sends anything: limits, the length of the
+    queue, default settings."""
 
     version: str
     cores: int

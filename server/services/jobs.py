@@ -55,12 +55,12 @@ log = structlog.get_logger()
 
 
 def migrate(settings: ServiceSettings) -> None:
-    """Makes the job engine's tables, which its client does not."""
+    """Creates the tables of the job engine, which the engine's client does not."""
     DBOS.migrate(system_database_url=settings.url)
 
 
 class Jobs:
-    """The jobs of one service. Every method blocks on the database: call it from a thread."""
+    """Manages the jobs of one service. Every method blocks on the database: call it from a thread."""
 
     def __init__(self, settings: ServiceSettings, store: Store, engine: sa.Engine, library: Library) -> None:
         self._settings, self._store, self._engine, self._library = settings, store, engine, library
@@ -84,10 +84,11 @@ class Jobs:
         queue: str | None = None,
         priority: int = 100,
     ) -> Job:
-        """Queues a reconstruction of a capture and returns the job. A known idempotency key returns the first job.
+        """Queues a reconstruction of a capture and returns the job. With a known idempotency key it returns the job of
+        the first request.
 
         Raises InputError for work that cannot be done, InvalidInput for a webhook that may not be called, NotFound,
-        DiskFull, Conflict where the key's first request was another one, TooMany.
+        DiskFull, TooMany, and Conflict where the key was used for another request.
         """
         wanted.check()
         capture = self._store.capture(capture_id)
@@ -108,7 +109,7 @@ class Jobs:
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
     def submit_session(self, session: str, wanted: ReconstructionRequest, *, key: str, priority: int) -> list[Job]:
-        """Queues a reconstruction of every capture of a session. Raises as ``submit`` does."""
+        """Queues a reconstruction of every capture of a session. Raises what ``submit`` raises."""
         wanted.check()  # a session without captures asks no job to
         self._store.session(session)
         return [self.submit(capture, wanted, key=key, priority=priority) for capture in self._library.heads_of(session)]
@@ -152,11 +153,11 @@ class Jobs:
         return first["capture_id"] == request["capture_id"] or (len(inputs) == 2 and inputs[0] == inputs[1])
 
     def get(self, job_id: str) -> Job:
-        """Raises NotFound."""
+        """Returns a job with its present state. Raises NotFound."""
         return self._jobs([self._known(job_id)])[0]
 
     def webhook(self, job_id: str) -> JobWebhook | None:
-        """Returns the job's own, if it was given one. Raises NotFound."""
+        """Returns the webhook that a job was submitted with, if any. Raises NotFound."""
         return (_request(self._known(job_id)) or {}).get("webhook")
 
     def state(self, job_id: str) -> str:
@@ -171,7 +172,7 @@ class Jobs:
         limit: int = 100,
         offset: int = 0,
     ) -> list[Job]:
-        """Lists ids, newest first."""
+        """Returns jobs, newest first, of one state, capture or session where these are given."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
             return []
@@ -182,32 +183,32 @@ class Jobs:
         return self._jobs(rows)
 
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
-        """Lists jobs; a word that names a state is looked for as that. Raises InputError for a cursor of another
-        list."""
+        """Returns one page of the jobs that match a query; a word that names a state selects jobs in that state. Raises
+        InputError for a cursor of another list."""
         page = self.index.page(_by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[Job]:
-        """Returns the jobs with these ids, in their order, those of them that there are."""
+        """Returns the jobs with these ids, in their order; ids of no job are left out."""
         if not ids:
             return []
         known = {row.workflow_id: row for row in self.client.list_workflows(name=WORKFLOW, workflow_ids=list(ids))}
         return self._jobs([known[job_id] for job_id in ids if job_id in known])
 
     def counts(self) -> dict[str, int]:
-        """Counts jobs by state."""
+        """Returns the number of jobs by state."""
         counts = dict.fromkeys(dict.fromkeys(STATES.values()), 0)
         for status, count in self.index.counts().items():
             counts[STATES[status]] += count
         return counts
 
     def of_captures(self, captures: Collection[str]) -> dict[str, list[tuple[str, str]]]:
-        """Returns the id and state of every job of some captures, newest first."""
+        """Returns the id and state of every job of each capture, newest first."""
         found = self.index.of_captures(captures)
         return {capture: [(job.id, STATES[job.status]) for job in jobs] for capture, jobs in found.items()}
 
     def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
-        """Lists the ids of queued and running jobs."""
+        """Lists the ids of queued and running jobs, of one capture, session or API key where these are given."""
         wanted = {k: v for k, v in {"capture": capture, "session": session, "key": key}.items() if v is not None}
         rows = self.client.list_workflows(
             name=WORKFLOW, status=STATUSES["queued"] + STATUSES["running"], load_input=False, load_output=False
@@ -215,8 +216,8 @@ class Jobs:
         return [row.workflow_id for row in rows if wanted.items() <= (row.attributes or {}).items()]
 
     def cancel(self, job_id: str) -> tuple[Job, bool]:
-        """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether it was cancelled
-        now. Raises NotFound."""
+        """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether this call
+        cancelled it. Raises NotFound."""
         before = self.state(job_id)
         if before not in FINISHED:
             self.client.cancel_workflow(job_id)
@@ -225,8 +226,8 @@ class Jobs:
         return job, before not in FINISHED and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
-        """Returns the size and sha256 of the files of a result, by name. Raises NotFound, and Conflict without a
-        result."""
+        """Returns size and SHA-256 of the files of a job's result, by name. Raises NotFound, and Conflict for a job
+        without result."""
         job = self.get(job_id)
         if job.state != "succeeded":
             raise Conflict("no-result", compose("job-without-result", state=job.state))
@@ -235,7 +236,7 @@ class Jobs:
         return job.files
 
     def log(self, job_id: str) -> str:
-        """Returns what its workers said of the job. Raises NotFound."""
+        """Returns the log that the workers wrote for a job. Raises NotFound."""
         self.state(job_id)
         try:
             return log_file(self._store.data / "jobs", job_id).read_text(encoding="utf-8", errors="replace")
@@ -243,7 +244,7 @@ class Jobs:
             raise NotFound(compose("thing-job-log"), job_id, compose("hint-not-begun")) from error
 
     def without_result(self) -> list[str]:
-        """Lists the ids of the jobs that succeeded and whose result is not in the data folder, newest first."""
+        """Lists the ids of succeeded jobs whose result is missing from the data folder, newest first."""
         there = set(self._store.ids("jobs"))
         done = self.index.newest_first(STATUSES["succeeded"])
         return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
@@ -252,15 +253,15 @@ class Jobs:
         return self._store.folder("jobs", job_id) / "result"
 
     def result_file(self, job_id: str, name: str) -> StoredFile:
-        """Returns a file of a result, found in the job's record. Raises NotFound, Conflict."""
+        """Returns a file of a job's result, looked up in the job's record. Raises NotFound and Conflict."""
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
         return StoredFile(self._result(job_id) / name, file["sha256"])
 
     def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> Job:
-        """Submits a new job for the same capture, which names the old one. What is None is as in that. Raises
-        InputError, NotFound, TooMany."""
+        """Submits a new job for the capture of an earlier job, which it names. Where ``wanted`` has None, the earlier
+        job's value is used. Raises InputError, NotFound and TooMany."""
         wanted.check()
         row = self._known(job_id)
         request = _request(row)
@@ -275,7 +276,7 @@ class Jobs:
         return self._enqueue(request, (row.attributes or {}).get("session"), key, row.queue_name, row.priority or 0)
 
     def delete(self, job_id: str) -> None:
-        """Removes a finished job with its files: the files first, which needs no room in the database."""
+        """Removes a finished job and its files. The files go first, which needs no room in the database."""
         if self.state(job_id) not in FINISHED:
             raise Conflict("job-active", compose("job-active"))
         self._store.remove(self._store.folder("jobs", job_id))
@@ -313,7 +314,7 @@ class Jobs:
         return compose("no-worker", queue=f"{queue!r}", queue_name=str(queue))
 
     def worker_may_start(self) -> bool:
-        """Tells whether the service is so young that its worker may still be loading."""
+        """Tells whether the service started so recently that its worker may still be loading."""
         return time.monotonic() - self._began < WORKER_START_S
 
     def _status(self, job_id: str, load: bool = True) -> WorkflowStatus | None:

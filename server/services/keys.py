@@ -24,7 +24,7 @@ LOCAL = "local"
 
 
 class KeylessAddress(EigenheadError):
-    """Refuses to listen to the network without a key."""
+    """Reports that the service refuses to listen to the network without an API key."""
 
     def __init__(self, where: str, data: Path) -> None:
         super().__init__(
@@ -36,7 +36,7 @@ class KeylessAddress(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks. ``key`` is the API key's id, or "local"."""
+    """Holds who sends a request. ``key`` is the id of the API key, or "local"."""
 
     key: str
     scopes: frozenset[str]
@@ -47,7 +47,7 @@ class Caller:
 
 @dataclass(frozen=True, slots=True)
 class ApiKey:
-    """Holds a key without its secret. ``created`` is in seconds since 1970."""
+    """Holds an API key without its secret. ``created``: seconds since 1970."""
 
     id: str
     name: str
@@ -62,7 +62,7 @@ class Keys:
         self._engine = engine
 
     def add(self, name: str, scopes: tuple[str, ...]) -> str:
-        """Makes a key and returns it; it cannot be shown again."""
+        """Makes an API key and returns it. The key cannot be shown again."""
         identity, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
         row = {"id": identity, "name": name, "digest": _digest(secret), "scopes": " ".join(scopes)}
         with self._engine.begin() as connection:
@@ -70,13 +70,13 @@ class Keys:
         return f"eh_{identity}_{secret}"
 
     def all(self) -> list[ApiKey]:
-        """Lists keys, oldest first."""
+        """Returns all API keys without their secrets, oldest first."""
         with self._engine.connect() as connection:
             rows = connection.execute(sa.select(api_keys).order_by(api_keys.c.created))
             return [ApiKey(r.id, r.name, tuple(r.scopes.split()), r.created) for r in rows]
 
     def remove(self, identity: str) -> None:
-        """Raises NotFound."""
+        """Removes an API key. Raises NotFound."""
         with self._engine.begin() as connection:
             if not connection.execute(sa.delete(api_keys).where(api_keys.c.id == identity)).rowcount:
                 raise NotFound(compose("thing-key"), identity)
@@ -86,7 +86,7 @@ class Keys:
             return connection.scalar(sa.select(sa.exists(sa.select(api_keys.c.id)))) or False
 
     def caller(self, token: str) -> Caller | None:
-        """Returns whose key ``token`` is; None if nobody's."""
+        """Returns the caller whose API key is ``token``. Returns None for an unknown key."""
         parts = token.split("_", 2)
         if len(parts) != 3 or parts[0] != "eh":
             return None
@@ -98,7 +98,7 @@ class Keys:
 
 
 def check_address(settings: ServiceSettings, keys: Keys) -> None:
-    """Raises KeylessAddress before the service listens where it must not."""
+    """Raises KeylessAddress if the service is to listen beyond its machine and has no API key."""
     if not settings.is_private and not keys.any():
         raise KeylessAddress(settings.public_url or settings.host, settings.data)
 

@@ -9,7 +9,7 @@ from rig.messages.message import Message, compose
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """``settings``: the document that it stands for."""
+    """Holds a named choice of settings. ``settings``: the settings' document that it stands for."""
 
     id: str
     title: Message
@@ -45,5 +45,5 @@ PRESETS = (
 
 
 def settings_of(preset: str | None) -> Mapping[str, object]:
-    """Returns the settings of a preset by its id; those of Standard for None and for an unknown id."""
+    """Returns the settings of the preset with this id. None and an unknown id give those of the preset Standard."""
     return next((known.settings for known in PRESETS if known.id == (preset or "")), {})

@@ -12,8 +12,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Found(Generic[T]):
-    """Holds one page of a list: ``next`` is the cursor of the page after it, None on the last; ``total`` counts what
-    all pages hold."""
+    """Holds one page of a list. ``next``: cursor of the next page, None on the last; ``total``: number of items on all
+    pages."""
 
     items: tuple[T, ...]
     next: str | None
@@ -31,9 +31,11 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Holds a job at this moment. ``notice`` says why a queued one cannot begin, or that a result is gone;
-    ``queue_position`` is how many jobs of its queue go before a queued one; ``files`` are those of a result, by
-    name."""
+    """Holds a job at one moment.
+
+    ``notice``: why a queued job cannot begin, or that its result is gone; ``queue_position``: how many jobs go before a
+    queued one; ``files``: size and SHA-256 of the result's files, by name.
+    """
 
     id: str
     name: str
@@ -59,7 +61,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Holds one subject's session with the ids of its captures."""
+    """Holds one session of a subject, with the ids of its captures."""
 
     id: str
     created: str
@@ -70,8 +72,11 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Holds one person: sessions of one name, newest first, with how many captures they have; ``id`` is the newest
-    session's. ``head``: the newest job with a result, ``heads`` how many there are; ``tags``: of their captures."""
+    """Holds one person: the sessions of one name, newest first, with their captures.
+
+    ``id``: that of the newest session; ``head``: the newest job with a result; ``heads``: number of such jobs;
+    ``tags``: those of the captures.
+    """
 
     id: str
     label: str
@@ -88,9 +93,11 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Holds a calibration and, once it succeeded, what it found. ``pictures``: their number by camera; ``kind``: of
-    what they are, board or scene; ``stage``, ``progress`` (0 to 1) and remaining seconds of one that runs; ``missing``:
-    what would make its verdict better."""
+    """Holds a calibration and, once it succeeded, its outcome.
+
+    ``pictures``: number by camera; ``kind``: what they show, board or scene; ``stage``, ``progress`` (0 to 1) and
+    remaining seconds while it runs; ``missing``: what would make its verdict better.
+    """
 
     id: str
     created: str
@@ -121,7 +128,8 @@ class RigCamera:
 
 @dataclass(frozen=True, slots=True)
 class RigState:
-    """Holds the rig at this moment; ``calibration`` is whose it is: "own", "studio", or None where there is none."""
+    """Holds the state of the rig at one moment. ``calibration``: "own" where the rig has a cameras.json, "studio" for
+    the simulated studio without one, else None."""
 
     id: str
     kind: str
@@ -133,8 +141,8 @@ class RigState:
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Holds what a camera was set to (None: left as the camera has it); ``unmet`` has a line for each it did not
-    take."""
+    """Holds the settings of a camera (None: the camera's own choice). ``unmet``: one message for each setting that the
+    camera did not take."""
 
     exposure_ms: float | None
     gain_db: float | None
@@ -144,7 +152,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class CleanPlates:
-    """Holds the cameras of which clean plates were taken, and how many of each."""
+    """Holds of which cameras clean plates were taken, and how many of each."""
 
     cameras: tuple[str, ...]
     plates: int
@@ -159,6 +167,6 @@ class Webhook:
 
 @dataclass(frozen=True, slots=True)
 class NewWebhook(Webhook):
-    """``secret`` signs the messages."""
+    """Holds a webhook that was just added. ``secret`` signs the messages."""
 
     secret: str

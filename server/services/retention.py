@@ -26,8 +26,8 @@ log = structlog.get_logger()
 
 
 def clear_caches(service: Service) -> int:
-    """Removes silhouettes, thumbnails and the like of all captures; what is asked for is made anew. Returns how many
-    captures' went."""
+    """Removes the caches of all captures that no job needs; they are made anew on demand. Returns how many captures had
+    one."""
     store, removed = service.store, 0
     for identity in store.ids("cache/captures"):
         if not service.jobs.active(capture=identity):
@@ -37,7 +37,7 @@ def clear_caches(service: Service) -> int:
 
 
 def sweep(service: Service) -> dict[str, int]:
-    """Makes one sweep. Returns how many of each kind went."""
+    """Removes everything whose time has come. Returns how many things of each kind were removed."""
     gone = {"leftovers": service.store.sweep(LEFTOVER_S), "uploads": service.uploads.sweep()}
     gone["jobs"] = _jobs(service)
     gone["captures"] = _captures(service)
@@ -52,8 +52,8 @@ def sweep(service: Service) -> dict[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class Upcoming:
-    """Holds a finished job or a capture that retention takes next. ``goes``: when, None where that hangs on the disk or
-    on what comes; ``why``: the setting."""
+    """Holds a finished job or a capture that retention removes next. ``goes``: when, None where that depends on free
+    space or on new jobs; ``why``: the setting."""
 
     kind: str
     id: str
@@ -63,8 +63,8 @@ class Upcoming:
 
 
 def upcoming(service: Service, limit: int = 10) -> list[Upcoming]:
-    """Returns what would go next if nothing came and nobody asked for it, jobs first. Captures that a job needs wait
-    for it."""
+    """Returns what retention would remove next if nothing new came, jobs first. Captures that a job
+    needs are left out."""
     return [*_jobs_next(service, limit), *_captures_next(service, limit)]
 
 

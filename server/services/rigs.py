@@ -43,30 +43,31 @@ SHOT_BYTES = 64 << 20
 
 
 class RigBackend(Protocol):
-    """Declares what the service needs of a rig. Blocks; call it from a thread."""
+    """Declares what the service needs of a rig. Methods block: call them from a thread."""
 
     def describe(self) -> RigState: ...
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument | SimulatedCertificate:
-        """Takes a shot into ``folder/files``; returns its certificate. Raises Unavailable naming what is missing.
+        """Takes a shot into ``folder/files`` and returns its certificate. Raises Unavailable naming what is missing.
 
-        ``board``: of the calibration board, for which a rig needs no calibration and not every camera."""
+        ``board``: the shot shows the calibration board, for which neither a calibration nor every camera is needed.
+        """
         ...
 
     def look(self) -> Mapping[str, ImageRgb]:
-        """Returns what all cameras see now; one that shows nothing is absent. Raises Unavailable."""
+        """Returns what each camera sees now; cameras that show nothing are left out. Raises Unavailable."""
         ...
 
     def preview(self, camera: str) -> bytes:
-        """Returns a JPEG of what the camera sees now. Raises NotFound or Unavailable."""
+        """Returns a JPEG file of what a camera sees now. Raises NotFound and Unavailable."""
         ...
 
     def camera_settings(self, camera: str) -> CameraSettings:
-        """Returns the requested exposure, gain and white balance. Raises NotFound."""
+        """Returns the exposure, gain and white balance that were requested of a camera. Raises NotFound."""
         ...
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
-        """Applies other settings from now on; a rig that is open is opened anew. Raises NotFound, InputError,
+        """Changes settings of a camera from now on; an open rig is opened anew. Raises NotFound, InputError and
         Conflict."""
         ...
 
@@ -75,7 +76,7 @@ class RigBackend(Protocol):
         ...
 
     def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
-        """Switches to other lamps from now on. Raises InputError, Conflict."""
+        """Changes which light outputs are on during a shot, from now on. Raises InputError and Conflict."""
         ...
 
     def take_background(self) -> CleanPlates:
@@ -83,23 +84,23 @@ class RigBackend(Protocol):
         ...
 
     def plates(self) -> list[PlatesVersion]:
-        """Returns the clean plates that are kept, newest first."""
+        """Returns the clean plates in use and those kept, newest first."""
         ...
 
     def use_plates(self, version: str) -> None:
-        """Puts clean plates that are kept to use. Raises NotFound."""
+        """Puts clean plates that were kept to use again. Raises NotFound."""
         ...
 
     def use(self, calibration: Path) -> None:
-        """Uses a cameras.json from now on. Raises Conflict where it is another rig's."""
+        """Uses the calibration in a cameras.json file from now on. Raises Conflict if it is of another rig."""
         ...
 
     def close(self) -> None: ...
 
 
 class SimulatedRig:
-    """Photographs the embedded studio, drawn in a child process with its own GL context. The truth of a shot is kept
-    beside it."""
+    """Takes shots of the simulated studio, rendered in a child process with a GL context of its own. The truth of a
+    shot is kept beside it."""
 
     def __init__(self, calibration: Path) -> None:
         self._calibration = calibration
@@ -113,7 +114,7 @@ class SimulatedRig:
         return _state("simulated", "simulated", cameras, [], calibrated)
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
-        """Photographs a person all the same: the studio has no board to show."""
+        """Takes a shot of a person even if ``board`` is set: the studio has no board to show."""
         with self._one_at_a_time:
             try:
                 shot = self._child.remote(simulated)(folder=str(folder), seed=seed)
@@ -149,7 +150,8 @@ class SimulatedRig:
         raise fixed_studio()
 
     def take_background(self) -> CleanPlates:
-        """Returns nothing: the studio takes clean plates with every shot."""
+        """Takes no pictures: the simulated studio takes clean plates with every shot. Returns its
+        cameras and a note."""
         return CleanPlates(self._rig().names, 2, compose("hint-studio-plates"))
 
     def plates(self) -> list[PlatesVersion]:
@@ -174,8 +176,8 @@ class SimulatedRig:
 
 
 class RealRig:
-    """Photographs with the cameras of a rig.toml: opened at the first need and kept open; a rig that cannot be opened
-    is tried again."""
+    """Takes shots with the cameras of a rig.toml. The rig is opened when first needed and stays open; where that fails,
+    it is tried again."""
 
     def __init__(self, path: Path, calibration: Path) -> None:
         self._from_file: RigConfig = read_rig_config(path)
@@ -353,13 +355,14 @@ def fixed_studio() -> Conflict:
 
 
 def open_rig(settings: ServiceSettings) -> RigBackend:
-    """Raises InputError naming every fault of rig.toml."""
+    """Returns the rig of the settings: simulated, or described by a rig.toml. Raises InputError naming every fault of
+    rig.toml."""
     calibration = settings.data / "rig" / "cameras.json"
     return SimulatedRig(calibration) if settings.rig is None else RealRig(settings.rig, calibration)
 
 
 def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
-    """Encodes RGB pixels as a JPEG of at most ``width``."""
+    """Encodes RGB pixels as a JPEG file, reduced to a width of at most ``width`` pixels."""
     small = reduced(image, width)
     done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
     assert done
@@ -367,7 +370,7 @@ def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
 
 
 def reduced(image: ImageRgb, width: int) -> ImageRgb:
-    """Returns the image, made smaller where it is wider than ``width``."""
+    """Returns the image, reduced to a width of ``width`` pixels where it is wider."""
     if image.shape[1] <= width:
         return image
     size = (width, max(1, round(image.shape[0] * width / image.shape[1])))

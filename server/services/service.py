@@ -28,8 +28,8 @@ from server.tasks.child import ChildProcessPool
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Holds one finding about the service: whether it is well, and what to do where it is not; ``starting``: it is not
-    well yet, and nothing is to be done."""
+    """Holds one finding about the service: whether it is well, and what to do where it is not. ``starting``: it is not
+    well yet, but nothing needs to be done."""
 
     ok: bool
     detail: Message
@@ -82,8 +82,8 @@ class Service:
         return self.calibrations.add(target, "upload", label)
 
     def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:
-        """Uses this calibration for every capture from now on. Returns the rig's state. Raises NotFound; Conflict, for
-        a poor one, too, unless ``poor`` says that it is to be used all the same."""
+        """Uses a calibration for every capture from now on and returns the rig's state. Raises NotFound, and Conflict;
+        also for a poor one, unless ``poor`` allows it."""
         if not poor:
             self.calibrations.check_usable(identity)
         self.rig.use(self.calibrations.cameras_json(identity))
@@ -91,7 +91,7 @@ class Service:
         return self.rig.describe()
 
     def cancel(self, job_id: str) -> Job:
-        """Cancels a job and tells the webhooks; a finished one stays as it is."""
+        """Cancels a job and announces that to the webhooks. A finished job stays as it is."""
         job, did = self.jobs.cancel(job_id)
         if did:
             self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue, job_webhook=self.jobs.webhook(job_id))

@@ -22,7 +22,7 @@ class Sessions:
         self._store, self._jobs, self._library = store, jobs, library
 
     def add(self, label: str, consent: str) -> Session:
-        """Raises InputError for texts that cannot be."""
+        """Begins a session and returns it. Raises InputError for invalid texts."""
         check_texts({"label": label, "consent": consent})
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         record = SessionRecord(new_id(), created, label, consent)
@@ -30,8 +30,8 @@ class Sessions:
         return _with_captures(record, [])
 
     def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Found[Session]:
-        """Lists sessions, newest first, each with the ids of its captures. Raises InputError for a cursor of another
-        list."""
+        """Returns one page of the sessions in which all words of ``sought`` occur, newest first. Raises InputError for
+        a cursor of another list."""
         page = self._library.sessions(sought, limit, cursor)
         captures = self._library.captures_of(page.ids)
         records = [record for identity in page.ids if (record := self._record(identity)) is not None]
@@ -46,8 +46,8 @@ class Sessions:
         *,
         tag: str | None = None,
     ) -> Found[Subject]:
-        """Returns people, by the names of their sessions; ``tag``: those with a capture that bears it. Raises
-        InputError for a cursor of another list."""
+        """Returns one page of subjects, each made of the sessions of one name. ``tag``: only subjects with a capture
+        that has this tag. Raises InputError for a cursor of another list."""
         page = self._library.subjects(sought, order, limit, cursor, tag)
         captures = self._library.captures_of([session for sessions in page.subjects for session in sessions])
         all_captures = [capture for some in captures.values() for capture in some]
@@ -62,7 +62,7 @@ class Sessions:
         return Found(tuple(found), page.next, page.total)
 
     def captures_of_subject(self, session: str | None) -> list[str]:
-        """Lists the ids of the captures of all sessions that bear the name of this one; none without a session."""
+        """Lists the ids of all captures of the subject of this session. Returns none for None."""
         if session is None or (record := self._record(session)) is None:
             return []
         sessions = self._library.sessions_of(subject_of(record))
@@ -75,21 +75,25 @@ class Sessions:
         return None
 
     def get(self, identity: str) -> Session:
-        """Raises NotFound."""
+        """Returns a session. Raises NotFound."""
         record = self._store.session(identity)
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
-        """Changes label or consent note; what is None stays. Raises NotFound, InputError."""
+        """Changes the label or the consent note of a session; None leaves it as it is. Raises
+        NotFound and InputError."""
         check_texts({"label": label, "consent": consent})
         changes = {name: text for name, text in (("label", label), ("consent", consent)) if text is not None}
         record = self._store.change_session(identity, lambda old: replace(old, **changes))
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def erase(self, identity: str) -> None:
-        """Cancels the jobs, then removes images, results, caches and what the job database holds of them. The session's
-        own record goes last, so that an erasure that was cut short can be asked for again. Raises NotFound, and
-        Unavailable while a worker still writes."""
+        """Cancels the jobs of a session, then removes all traces of it: images, results, caches and rows of the job
+        database.
+
+        The session's record goes last, so that an interrupted erasure can be repeated. Raises NotFound, and Unavailable
+        while a worker still writes.
+        """
         self._store.session(identity)
         self._erase_captures(identity)
         self._store.remove_session(identity)

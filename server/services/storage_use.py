@@ -29,7 +29,7 @@ KINDS = {  # folders of the data folder, by what they hold
 
 @dataclass(frozen=True, slots=True)
 class KindOfUse:
-    """``things``: captures, jobs, ...: what lies directly in the kind's folders."""
+    """Holds how many bytes a kind of data takes. ``things``: number of captures, jobs and so on."""
 
     kind: str
     bytes: int
@@ -38,8 +38,11 @@ class KindOfUse:
 
 @dataclass(frozen=True, slots=True)
 class StorageUse:
-    """``kinds`` are None while the data folder is looked through for the first time; ``at`` (s since 1970) says when it
-    was. ``spare``: what uploads and jobs leave free; ``failed``: jobs that ended without a result."""
+    """Holds how the disk of the data folder is used.
+
+    ``kinds``: None until the data folder was counted for the first time; ``at``: when that was (s since 1970);
+    ``spare``: bytes that uploads and jobs leave free; ``failed``: number of jobs without a result.
+    """
 
     data: str
     free: int
@@ -51,7 +54,7 @@ class StorageUse:
 
 
 class StorageCount:
-    """Looks through the data folder in a thread of its own, when asked and the last look is old."""
+    """Counts the bytes in the data folder, in a thread of its own, when ``use`` is called and the last count is old."""
 
     def __init__(self, store: Store, jobs: Jobs, settings: ServiceSettings) -> None:
         self._store, self._jobs, self._settings = store, jobs, settings
@@ -60,7 +63,7 @@ class StorageCount:
         self._at: float | None = None
 
     def use(self) -> StorageUse:
-        """Does not wait for a look that is under way."""
+        """Returns the last count, and starts a new one where that is old. Does not wait for it."""
         old = self._at is None or time.time() - self._at > COUNT_AGAIN_S
         if old and self._looking.acquire(blocking=False):
             threading.Thread(target=self._look, args=(self._store.data,), daemon=True).start()
@@ -76,7 +79,7 @@ class StorageCount:
         )
 
     def forget(self) -> None:
-        """Makes the next question count anew; until that is done, the old count is returned."""
+        """Makes the next call of ``use`` start a new count. Until that is done, ``use`` returns the old one."""
         self._at = None if self._found is None else 0.0
 
     def _look(self, data: Path) -> None:
@@ -87,8 +90,8 @@ class StorageCount:
 
 
 def count(data: Path) -> tuple[KindOfUse, ...]:
-    """Counts the bytes of all files, by kind; "other" is what else lies in the folder, the database and models
-    among it."""
+    """Counts bytes and things in the data folder, by kind. "other" is everything else in the folder, the database and
+    models included."""
     known = {folder for folders in KINDS.values() for folder in folders}
     found = []
     for kind, folders in KINDS.items():

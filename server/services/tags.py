@@ -13,7 +13,7 @@ UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")  # Unicode's classes of cont
 
 
 def checked_tags(tags: Iterable[str]) -> tuple[str, ...]:
-    """Returns the tags in one spelling (NFC, single blanks), each once whatever its case, in their order. Raises
+    """Returns the tags in one spelling (NFC, single blanks), in their order, each once whatever its case. Raises
     InputError naming every fault."""
     found: dict[str, str] = {}
     faults = []
@@ -37,5 +37,5 @@ def checked_tags(tags: Iterable[str]) -> tuple[str, ...]:
 
 
 def typed_tags(text: str) -> tuple[str, ...]:
-    """Reads tags as a person types them, with commas between. Raises InputError."""
+    """Splits tags that were typed with commas between them. Raises InputError."""
     return checked_tags(tag for tag in text.split(SEPARATOR) if tag.strip())

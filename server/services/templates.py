@@ -10,7 +10,7 @@ from pipeline.templates.names import list_templates
 
 @dataclass(frozen=True, slots=True)
 class TemplateAtHand:
-    """Holds a template by the name that a job gives it."""
+    """Holds a template that jobs can name."""
 
     id: str
     name: str
@@ -24,7 +24,8 @@ class TemplateAtHand:
 
 
 def templates_at_hand() -> list[TemplateAtHand]:
-    """Lists templates by name. Raises OSError where a model's file goes as it is read."""
+    """Returns the available templates, sorted by name. Raises OSError where a model's file
+    disappears while it is read."""
     found, digests = [], None
     for name, path in list_templates().items():
         try:

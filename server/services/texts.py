@@ -13,7 +13,8 @@ CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 def check_texts(texts: Mapping[str, str | None], subject: str = "form") -> None:
-    """Raises InputError naming, by its field, every text that is too long or has what no database keeps."""
+    """Raises InputError naming the field of every text that is too long or holds characters that
+    databases cannot store."""
     faults = []
     for name, text in texts.items():
         if text is not None and len(text) > TEXT_MOST:

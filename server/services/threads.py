@@ -10,8 +10,8 @@ T = TypeVar("T")
 
 
 class Threads:
-    """Pools apart from the one that the web framework's handlers use, so that fifty uploads that wait for their turn do
-    not keep a status request waiting."""
+    """Runs blocking functions in thread pools apart from the web framework's, so that fifty waiting uploads do not
+    delay a status request."""
 
     def __init__(self, disk: int = 8, checks: int = 2) -> None:
         self._disk, self._checks = anyio.CapacityLimiter(disk), anyio.CapacityLimiter(checks)

@@ -20,7 +20,8 @@ def too_large(settings: ServiceSettings) -> TooLarge:
 
 
 class ResumableUploads:
-    """The length of ``data`` is the offset: what a killed service had written is what the client continues from."""
+    """Manages resumable uploads. The length of the file ``data`` is the offset, so that a client can continue after the
+    service was killed."""
 
     def __init__(self, store: Store, settings: ServiceSettings) -> None:
         self._store, self._settings = store, settings
@@ -39,7 +40,7 @@ class ResumableUploads:
         return record
 
     def get(self, identity: str) -> UploadRecord:
-        """Raises NotFound, also for what expired."""
+        """Returns an upload. Raises NotFound, also for one that expired."""
         if not is_id(identity):
             raise NotFound(compose("thing-upload"), identity)
         with suppress(OSError, ValueError):
@@ -50,7 +51,7 @@ class ResumableUploads:
         raise NotFound(compose("thing-upload"), identity)
 
     def offset(self, record: UploadRecord) -> int:
-        """Counts the bytes that are here; all of them once the capture was made and the data let go."""
+        """Returns how many bytes were received: all, once the capture was made and the data deleted."""
         if record.capture is not None:
             return record.length
         return self.data(record).stat().st_size
@@ -59,7 +60,7 @@ class ResumableUploads:
         return self._store.folder("uploads", record.id) / "data"
 
     def save(self, record: UploadRecord) -> None:
-        """Raises NotFound."""
+        """Writes the record of an upload. Raises NotFound where the upload was removed."""
         path = self._store.folder("uploads", record.id) / "upload.json"
         try:
             write_atomically(path, json.dumps(UPLOAD.document(record)).encode(), parents=False)
@@ -68,7 +69,8 @@ class ResumableUploads:
 
     @contextmanager
     def lock(self, identity: str) -> Iterator[None]:
-        """Lets one at a time write to an upload or remove it, in this process or another. Raises Conflict, NotFound."""
+        """Locks an upload while the block runs, against writing and removal by others, in any process. Raises Conflict
+        and NotFound."""
         with ExitStack() as stack:
             try:
                 stream = stack.enter_context((self._store.folder("uploads", identity) / "upload.json").open("rb"))
@@ -84,7 +86,7 @@ class ResumableUploads:
         self._store.remove(self._store.folder("uploads", identity))
 
     def sweep(self) -> int:
-        """Removes what expired, but not under who writes to it."""
+        """Removes expired uploads to which nobody is writing. Returns how many."""
         removed = 0
         for identity in self._store.ids("uploads"):
             try:

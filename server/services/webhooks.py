@@ -33,15 +33,15 @@ TIMEOUT_S = 10.0
 
 
 class Webhooks:
-    """Keeps the addresses of webhooks and delivers to them."""
+    """Manages the webhooks of the service and delivers messages to them."""
 
     def __init__(self, engine: sa.Engine, origins: Collection[str] = ()) -> None:
         """``origins``: where a job's own webhook may be."""
         self._engine, self._origins = engine, origins
 
     def add(self, url: str) -> NewWebhook:
-        """Adds a webhook. Returns it with its secret, which is shown this once. Raises InvalidInput for what is no web
-        address."""
+        """Adds a webhook and returns it with its secret, which is not shown again. Raises InvalidInput for a text that
+        is no web address."""
         parsed(url)
         secret = "whsec_" + base64.b64encode(secrets.token_bytes(24)).decode()
         made = NewWebhook(secrets.token_hex(14), url, secret)
@@ -55,7 +55,7 @@ class Webhooks:
             return [Webhook(row.id, row.url) for row in rows]
 
     def remove(self, identity: str) -> None:
-        """Raises NotFound."""
+        """Removes a webhook. Raises NotFound."""
         with self._engine.begin() as connection:
             if not connection.execute(sa.delete(webhooks).where(webhooks.c.id == identity)).rowcount:
                 raise NotFound(compose("thing-webhook"), identity)
@@ -63,7 +63,8 @@ class Webhooks:
     def announce(
         self, job_id: str, state: str, enqueue: Callable[..., Any], job_webhook: JobWebhook | None = None
     ) -> None:
-        """Queues one delivery a webhook; doing it again for the same job and state changes nothing."""
+        """Queues one message for each webhook about the state of a job. Repeating the call for the same job and state
+        changes nothing."""
         for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
             identity = f"hook-{hook_id}-{job_id}-{state}"
             message: WebhookMessage = {
@@ -83,10 +84,11 @@ class Webhooks:
             enqueue(options, message)
 
     def post(self, message: WebhookMessage) -> int:
-        """Makes one attempt to deliver; a removed webhook needs none.
+        """Tries once to deliver a message. Returns the HTTP status of the answer, 0 without sending where the webhook
+        was removed.
 
-        Raises httpx.HTTPError where the other side does not take it, and InvalidInput where a job's own webhook may not
-        be called any more.
+        Raises httpx.HTTPError where the other side does not accept it, and InvalidInput where a job's webhook may no
+        longer be called.
         """
         if "own" in message:
             return self._post_own(message, message["own"])

@@ -13,8 +13,8 @@ from server.storage.records import CaptureRecord, JobWebhook
 
 @dataclass(frozen=True, slots=True)
 class ReconstructionRequest:
-    """Holds what a job shall do: a model's name and settings of the pipeline, None for the default ones; its name; and
-    the webhook that hears of its end beside the service's own."""
+    """Holds what a job is to do: a model's name and settings of the pipeline (None: the defaults), the job's name, and
+    a webhook that hears of its end beside those of the service."""
 
     model: str | None = None
     settings: Mapping[str, object] | None = None
@@ -22,8 +22,8 @@ class ReconstructionRequest:
     webhook: JobWebhook | None = None
 
     def check(self) -> None:
-        """Raises InputError naming a name that cannot be, an unknown model, every wrong setting and a template that the
-        model cannot have, before a job fails by it hours later."""
+        """Raises InputError naming an invalid name, an unknown model, every wrong setting and a template that the model
+        cannot have, so that no job fails by them hours later."""
         check_texts({"name": self.name}, "request")
         model, settings = self._model_faults(), self._settings_faults()
         if model and settings:
@@ -70,6 +70,6 @@ def _template_faults(name: str, model: str) -> list[Message]:
 
 
 def refuse_board(record: CaptureRecord) -> None:
-    """Raises Conflict for pictures of the calibration board, which show no head."""
+    """Raises Conflict for a capture that shows the calibration board and no head."""
     if record.board:
         raise Conflict("board-shot", compose("board-shot"))

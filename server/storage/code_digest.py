@@ -9,7 +9,7 @@ PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"
 
 @cache
 def code_digest(rooms: tuple[str, ...]) -> str:
-    """Returns the digest of all code in some rooms of the pipeline (paths below it)."""
+    """Returns the SHA-256 of all code in the named rooms (paths below ``pipeline``)."""
     digest = hashlib.sha256()
     for path in sorted(path for room in rooms for path in (PIPELINE / room).glob("*.py")):
         digest.update(path.read_bytes())

@@ -118,7 +118,7 @@ webhooks = sa.Table(
 
 
 def open_database(settings: ServiceSettings) -> sa.Engine:
-    """Returns an engine on the service's database, with its tables made. Raises DatabaseUnavailable."""
+    """Opens the service's database, creates its missing tables and returns the engine. Raises DatabaseUnavailable."""
     url = sa.make_url(settings.url)
     if url.get_backend_name() == "sqlite":
         file = Path(str(url.database))
@@ -155,8 +155,8 @@ def _add_columns(engine: sa.Engine) -> None:
 
 
 def scrub(engine: sa.Engine) -> None:
-    """Lets go of what removed rows have left in the database's files: names of people among it. Where somebody reads at
-    this moment, the files keep it until the next time."""
+    """Removes from the database's files what deleted rows left in them, names of people included. What somebody is
+    reading at this moment stays until the next call."""
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         if engine.dialect.name != "sqlite":
             tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
@@ -170,12 +170,13 @@ def scrub(engine: sa.Engine) -> None:
 
 
 def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElement[bool]:
-    """Returns the condition for workers that have not stopped and were heard of in the last ``silent_s``."""
+    """Returns the SQL condition that a worker has not stopped and sent a heartbeat within the last
+    ``silent_s`` seconds."""
     return sa.and_(workers.c.stopped.is_(None), workers.c.seen > now_sql(connection) - silent_s)
 
 
 def now_sql(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:
-    """Returns the seconds since 1970 on the database's clock."""
+    """Returns the SQL expression for the seconds since 1970 on the database's clock."""
     if engine.dialect.name == "sqlite":
         return sa.literal_column("((julianday('now') - 2440587.5) * 86400.0)", sa.Float)
     return sa.literal_column("extract(epoch from clock_timestamp())", sa.Float)

@@ -12,7 +12,7 @@ from server.storage.records import EventDocument
 
 @dataclass(frozen=True, slots=True)
 class JobEvent:
-    """Numbered within its job."""
+    """Holds one event of a job: its number within the job (``seq``), its time (s since 1970) and its content."""
 
     seq: int
     at: float
@@ -20,7 +20,7 @@ class JobEvent:
 
 
 class EventLog:
-    """The events table. Numbers count up from 1 within a job, also across workers that take it over."""
+    """Manages the table of events. Within a job they are numbered from 1, also across workers that take it over."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine

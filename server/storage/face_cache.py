@@ -25,8 +25,8 @@ PixelsOfPoints = dict[str, dict[str, list[float]]]  # by landmark and camera, as
 
 
 class FoundFace(TypedDict):
-    """Holds one face in the pixels of a picture's file; ``is_subject``: it is the one that the views agree on.
-    ``roll_deg``: how far its upright is turned clockwise."""
+    """Holds one face, in pixels of the picture's file. ``is_subject``: the views agree that it is the subject's;
+    ``roll_deg``: how far the face is turned clockwise in the picture."""
 
     box_px: list[float]
     roll_deg: float
@@ -36,15 +36,16 @@ class FoundFace(TypedDict):
 
 
 class FacesDocument(TypedDict):
-    """Holds the faces of every picture that was searched, and where the seven feature points are to be looked for
-    (none where no face is certain)."""
+    """Holds the faces of every picture that was searched, and the pixels suggested for the seven feature points (none
+    where no face is certain)."""
 
     faces: dict[str, list[FoundFace]]
     suggested: PixelsOfPoints
 
 
 def faces_once(folder: Path, inputs: Mapping[str, str], find: Callable[[], FacesDocument]) -> FacesDocument:
-    """Calls ``find``, unless ``folder`` holds what it found before. ``inputs``: sha256 of the capture's files."""
+    """Returns the faces of a capture: those kept in ``folder`` from an earlier call, else what ``find`` returns, which
+    is then kept. ``inputs``: SHA-256 of the capture's files."""
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     path = folder / (_key(inputs) + SUFFIX)

@@ -25,8 +25,8 @@ JobOrder = Literal["-created", "created", "-finished", "finished"]
 
 @dataclass(frozen=True, slots=True)
 class JobQuery:
-    """States which jobs are listed, in what order: all words of ``sought`` stand in name, model, method, level or id,
-    or are found in the capture; ``statuses`` are the engine's words."""
+    """Describes which jobs are listed and in what order. Every word of ``sought`` must occur in the job's name, model,
+    method, level or id, or in its capture; ``statuses`` are the engine's."""
 
     sought: str = ""
     statuses: Sequence[str] | None = None
@@ -37,14 +37,14 @@ class JobQuery:
 
 @dataclass(frozen=True, slots=True)
 class JobOfCapture:
-    """``status`` in the engine's words."""
+    """Holds the id of a job and its status in the engine's words."""
 
     id: str
     status: str
 
 
 class JobIndex:
-    """Lists the jobs of one workflow of the engine. Methods block."""
+    """Finds jobs of one of the engine's workflows. Methods block."""
 
     def __init__(self, engine: sa.Engine, workflow: str) -> None:
         self._engine, self._workflow = engine, workflow
@@ -56,7 +56,7 @@ class JobIndex:
         self._status = sa.table("workflow_status", *columns, schema=schema)
 
     def add(self, job_id: str, request: JobRequest, session: str | None) -> None:
-        """Adds a job; does nothing where it is known."""
+        """Adds a job to the index. Does nothing where the index has it already."""
         row = {"job_id": job_id, "capture_id": request["capture_id"], "session": session}
         with suppress(IntegrityError), self._engine.begin() as connection:
             connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
@@ -66,7 +66,7 @@ class JobIndex:
             connection.execute(sa.delete(job_index).where(job_index.c.job_id == job_id))
 
     def complete(self, requests_of: Callable[[list[str]], Mapping[str, JobRequest]]) -> int:
-        """Gives rows of earlier versions what they are searched by; returns how many there were."""
+        """Fills in the searched words of index rows that an earlier version wrote. Returns how many rows there were."""
         with self._engine.connect() as connection:
             bare = [*connection.scalars(sa.select(job_index.c.job_id).where(job_index.c.words.is_(None)))]
         for start in range(0, len(bare), AT_ONCE):
@@ -81,7 +81,7 @@ class JobIndex:
         return len(bare)
 
     def page(self, query: JobQuery, limit: int, cursor: str | None = None) -> CursorPage:
-        """Raises InputError for a cursor of another list."""
+        """Returns one page of the jobs that match a query. Raises InputError for a cursor of another list."""
         status = self._status.c
         rows = sa.select().select_from(self._status).where(status.name == self._workflow)
         if query.statuses is not None:
@@ -95,22 +95,23 @@ class JobIndex:
             return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
 
     def counts(self) -> dict[str, int]:
-        """Counts jobs by the engine's status."""
+        """Returns the number of jobs by the engine's status."""
         status = self._status.c
         query = sa.select(status.status, sa.func.count()).where(status.name == self._workflow).group_by(status.status)
         with self._engine.connect() as connection:
             return {row[0]: row[1] for row in connection.execute(query)}
 
     def newest_first(self, statuses: Sequence[str]) -> list[str]:
-        """Lists the ids of all jobs with one of the engine's statuses."""
+        """Lists the ids of all jobs that have one of the engine's ``statuses``, newest first."""
         status = self._status.c
         query = sa.select(status.workflow_uuid).where(status.name == self._workflow, status.status.in_(statuses))
         with self._engine.connect() as connection:
             return [*connection.scalars(query.order_by(status.created_at.desc()))]
 
     def places(self) -> dict[str, int]:
-        """Returns how many jobs of its queue go before each queued one: those that run, then lower priority numbers,
-        then who came first. The engine takes jobs of one millisecond in no order of its own; here the id settles it."""
+        """Returns for each queued job how many jobs of its queue go before it: those running, then those with a lower
+        priority number, then those queued earlier. Of jobs queued in the same millisecond the lower id counts as
+        earlier, although the engine takes them in any order."""
         status = self._status.c
         places: dict[str, int] = {}
         running = sa.select(status.queue_name, sa.func.count()).where(status.name == self._workflow)
@@ -126,7 +127,7 @@ class JobIndex:
         return places
 
     def of_captures(self, captures: Collection[str]) -> dict[str, list[JobOfCapture]]:
-        """Returns every job of some captures, newest first."""
+        """Returns the jobs of each of the captures, newest first."""
         found: dict[str, list[JobOfCapture]] = {capture: [] for capture in captures}
         status, listed = self._status.c, list(captures)
         joined = job_index.join(self._status, status.workflow_uuid == job_index.c.job_id)

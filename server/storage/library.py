@@ -31,8 +31,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class CaptureQuery:
-    """States which captures are listed, in what order: all words of ``sought`` stand in label, expression, tags,
-    session, verdict, source or id; ``tag``: those that bear it; ``before``: only those older than this id."""
+    """Describes which captures are listed and in what order. Every word of ``sought`` must occur in the capture's
+    label, expression, tags, session, verdict, source or id; ``tag``: only captures with this tag; ``before``: only
+    captures older than this id."""
 
     sought: str = ""
     session: str | None = None
@@ -45,7 +46,7 @@ class CaptureQuery:
 
 @dataclass(frozen=True, slots=True)
 class SubjectPage:
-    """Sessions by subject: one subject's, newest first, in the order of the page's subjects."""
+    """Holds one page of subjects, each as the ids of the subject's sessions, newest first."""
 
     subjects: tuple[tuple[str, ...], ...]
     next: str | None
@@ -53,7 +54,7 @@ class SubjectPage:
 
 
 class Library:
-    """Keeps the two index tables. Methods block."""
+    """Manages the index of captures and sessions in the database. Methods block."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
@@ -73,11 +74,11 @@ class Library:
         self._drop(session_index, [identity])
 
     def scrub(self) -> None:
-        """Lets go of what removed rows have left in the database's files."""
+        """Removes from the database's files what deleted rows left in them."""
         scrub(self._engine)
 
     def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> CursorPage:
-        """Raises InputError for a cursor of another list."""
+        """Returns one page of the captures that match a query. Raises InputError for a cursor of another list."""
         table = capture_index.c
         rows = sa.select().select_from(capture_index)
         if query.session is not None:
@@ -99,7 +100,7 @@ class Library:
             return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
 
     def captures_of(self, sessions: Collection[str]) -> dict[str, list[str]]:
-        """Lists the ids of the captures of some sessions, newest first."""
+        """Returns the ids of the captures of each session, newest first."""
         found: dict[str, list[str]] = {session: [] for session in sessions}
         query = sa.select(capture_index.c.session, capture_index.c.id).order_by(capture_index.c.id.desc())
         with self._engine.connect() as connection:
@@ -109,14 +110,14 @@ class Library:
         return found
 
     def tags(self, limit: int) -> list[str]:
-        """Returns the tags that captures bear, those of most captures first."""
+        """Returns the tags of all captures, the most frequent first."""
         table = capture_tags.c
         query = sa.select(sa.func.min(table.name, type_=sa.Text())).group_by(table.folded)
         with self._engine.connect() as connection:
             return [*connection.scalars(query.order_by(sa.func.count().desc(), table.folded).limit(limit))]
 
     def tags_of(self, captures: Collection[str]) -> dict[str, list[str]]:
-        """Returns the tags of some captures, by capture."""
+        """Returns the tags of each of the captures."""
         found: dict[str, list[str]] = {}
         query = sa.select(capture_tags.c.capture_id, capture_tags.c.name).order_by(capture_tags.c.folded)
         with self._engine.connect() as connection:
@@ -126,19 +127,20 @@ class Library:
         return found
 
     def heads_of(self, session: str) -> list[str]:
-        """Lists the ids of a session's captures that show a head, newest first."""
+        """Lists the ids of the captures of a session that show a head, newest first."""
         table = capture_index.c
         query = sa.select(table.id).where(table.session == session, table.board.is_(False)).order_by(table.id.desc())
         with self._engine.connect() as connection:
             return [*connection.scalars(query)]
 
     def sessions_of(self, subject: str) -> list[str]:
-        """Lists the ids of a person's sessions; ``subject`` as of ``subject_of``."""
+        """Lists the ids of the sessions of one subject; ``subject`` as ``subject_of`` returns it."""
         with self._engine.connect() as connection:
             return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
 
     def sessions(self, sought: str, limit: int, cursor: str | None = None) -> CursorPage:
-        """Lists ids, newest first. Raises InputError for a cursor of another list."""
+        """Returns one page of the sessions in which all words of ``sought`` occur, newest first. Raises InputError for
+        a cursor of another list."""
         rows = sa.select().select_from(session_index)
         for word in words_of(sought):
             rows = rows.where(sessions_with(word))
@@ -149,9 +151,11 @@ class Library:
     def subjects(
         self, sought: str, order: SubjectOrder, limit: int, cursor: str | None = None, tag: str | None = None
     ) -> SubjectPage:
-        """Lists subjects: sessions of one name are one person's; one without a name is somebody by itself. A subject is
-        as new as its newest session; ``tag``: those with a capture that bears it. Raises InputError for a cursor of
-        another list."""
+        """Returns one page of subjects. Sessions of one name are one subject; a session without a name is a subject by
+        itself. A subject is as new as its newest session.
+
+        ``tag``: only subjects with a capture that has this tag. Raises InputError for a cursor of another list.
+        """
         table = session_index.c
         newest, name = (
             sa.func.max(table.id).label("newest"),
@@ -178,7 +182,7 @@ class Library:
         return SubjectPage(tuple(there), page.next, page.total)
 
     def reconcile(self, store: Store) -> int:
-        """Makes the rows those of the records in the data folder; returns how many differed."""
+        """Makes the index agree with the records in the data folder. Returns how many rows differed."""
         mended = 0
         for table, kind in ((capture_index, "captures"), (session_index, "sessions")):
             with self._engine.connect() as connection:
@@ -236,24 +240,24 @@ class Library:
 
 
 def captures_with(word: str) -> sa.ColumnElement[bool]:
-    """Returns the condition for captures that a word of a search stands in, or in whose session it does."""
+    """Returns the SQL condition that a word of a search occurs in a capture or in its session."""
     sessions = sa.select(session_index.c.id).where(sessions_with(word))
     matches = sa.or_(contains(capture_index.c.words, word), is_or_ends(capture_index.c.id, word))
     return sa.or_(matches, capture_index.c.session.in_(sessions))
 
 
 def tagged(tag: str) -> sa.Select:
-    """Lists the ids of the captures that bear a tag, in whatever case."""
+    """Returns the SQL query for the ids of all captures with a tag, whatever its case."""
     return sa.select(capture_tags.c.capture_id).where(capture_tags.c.folded == folded(tag))
 
 
 def sessions_with(word: str) -> sa.ColumnElement[bool]:
-    """Returns the condition for sessions that a word of a search stands in."""
+    """Returns the SQL condition that a word of a search occurs in a session."""
     return sa.or_(contains(session_index.c.words, word), is_or_ends(session_index.c.id, word))
 
 
 def subject_of(record: SessionRecord) -> str:
-    """Returns what sessions of one person have alike: their name; one without a name stands by itself."""
+    """Returns the text by which sessions belong to one subject: the session's name, or its id where it has none."""
     return folded(record.label).strip() or record.id
 
 

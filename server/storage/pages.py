@@ -21,9 +21,9 @@ Value = str | int | None
 
 @dataclass(frozen=True, slots=True)
 class CursorPage:
-    """Holds the ids of one page, in their order.
+    """Holds the ids of one page of a list, in the list's order.
 
-    ``next`` is the cursor of the page after it, None on the last; ``total`` counts what all pages hold.
+    ``next``: cursor of the next page, None on the last; ``total``: number of items on all pages.
     """
 
     ids: tuple[str, ...]
@@ -33,7 +33,7 @@ class CursorPage:
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Rows sorted by ``column`` and, where that is equal, by ``identity``."""
+    """Describes the order of a list: by ``column`` and, where that is equal, by ``identity``."""
 
     column: sa.ColumnElement[str] | sa.ColumnElement[int]
     identity: sa.ColumnElement[str]
@@ -44,8 +44,8 @@ class Order:
         return tuple(column.desc() if self.descending else column.asc() for column in columns)
 
     def after(self, cursor: str) -> sa.ColumnElement[bool]:
-        """Returns the condition for rows that come after a cursor. Raises InputError for what is no cursor of such a
-        list."""
+        """Returns the SQL condition for rows that come after a cursor. Raises InputError for a cursor of another kind
+        of list."""
         place = place_of(cursor)
         if isinstance(place.value, str) != isinstance(self.column.type, sa.String):
             raise no_cursor()
@@ -60,7 +60,7 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a page ended, and how many rows the list had when its first page was made."""
+    """Holds where a page ended, and how many rows the list had when its first page was made."""
 
     value: str | int
     identity: str
@@ -72,7 +72,7 @@ def cursor_of(value: Value, identity: str, total: int) -> str:
 
 
 def place_of(cursor: str) -> Place:
-    """Returns what a cursor names. Raises InputError."""
+    """Reads a cursor: returns the place that it names. Raises InputError."""
     try:
         value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
         text = f"{value}{identity}".encode()  # half of a surrogate pair is JSON and nothing that a database takes
@@ -96,8 +96,8 @@ def no_cursor() -> InputError:
 def page_of(
     connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, *, searched: bool = False
 ) -> CursorPage:
-    """Returns one page of ``rows``, which select nothing yet. ``searched``: finding the rows is what takes long, so
-    that they are counted as they are found. Raises InputError."""
+    """Returns one page of ``rows``, a query without columns. ``searched``: finding the rows takes long, so that they
+    are counted in the same query. Raises InputError for a wrong cursor."""
     wanted = rows.with_only_columns(order.identity.label("id"), order.column.label("value"))
     if cursor is not None:
         total, wanted = place_of(cursor).total, wanted.where(order.after(cursor))
@@ -114,17 +114,17 @@ def page_of(
 
 
 def words_of(sought: str) -> Sequence[str]:
-    """Returns the words of a search, which must all be found."""
+    """Splits a search into its words, ``WORDS_MOST`` at most, all of which must occur."""
     return folded(sought).split()[:WORDS_MOST]
 
 
 def folded(*texts: str | None) -> str:
-    """Returns what searches compare: without case, and without what PostgreSQL keeps in no text."""
+    """Joins texts to the form that searches compare: lower case, without NUL."""
     return storable(" ".join(text for text in texts if text)).casefold()
 
 
 def storable(text: str) -> str:
-    """Removes NUL, which PostgreSQL keeps in no text; records of earlier versions may have it."""
+    """Removes NUL from a text, which PostgreSQL cannot store; records of earlier versions may have it."""
     return text.replace("\0", "")
 
 
@@ -133,6 +133,6 @@ def contains(column: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]
 
 
 def is_or_ends(identity: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
-    """Returns the condition for rows whose id is ``word`` or ends with it, as pages shorten ids; a short word stands in
-    too many ids."""
+    """Returns the SQL condition that an id is ``word`` or ends with it, since pages shorten ids to their ends. Never
+    true for a short word, which would match too many ids."""
     return identity.endswith(word, autoescape=True) if len(word) >= ID_LEAST else sa.false()

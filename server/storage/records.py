@@ -45,7 +45,7 @@ StoredFault = Annotated[Fault, PlainValidator(_read_fault), PlainSerializer(_wri
 
 @dataclass(frozen=True, slots=True)
 class CameraSize:
-    """Holds a camera of a capture and the size of its pictures."""
+    """Holds the name of a camera of a capture and the size of its pictures (px)."""
 
     name: str
     width: int
@@ -54,10 +54,12 @@ class CameraSize:
 
 @dataclass(frozen=True, slots=True)
 class CaptureContent:
-    """Holds what is in a capture's folder: ``inputs`` has the sha256 of every file. ``board``: pictures of the
-    calibration board, which show no head. ``checks``: what was measured of each camera's picture; ``warnings``: what
-    was said when its cameras were found from the photographs; ``face``: what a glance at the pictures told of the
-    subject's face (None where nobody looked)."""
+    """Holds what a capture's folder contains.
+
+    ``inputs``: SHA-256 of every file; ``board``: whether the pictures show the calibration board and no head;
+    ``checks``: measurements of each camera's picture; ``warnings``: those of the calibration, if the cameras were found
+    from the photographs; ``face``: what the pictures show of the subject's face (None where nobody looked).
+    """
 
     cameras: tuple[CameraSize, ...]
     front: str
@@ -72,9 +74,13 @@ class CaptureContent:
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
-    """Holds a capture: where it came from, what people say of it, what is in it, the certificate of the rig's shot, and
-    the verdict on it with its faults (None of what was not judged: the board, captures of earlier versions).
-    ``warnings``: what every result of it will be warned of, and what its pictures tell of the face."""
+    """Holds a capture: its source, what people wrote about it, its content, the certificate of its shot, and the
+    verdict on it.
+
+    ``verdict``: None where the capture was not judged (the board, captures of earlier versions); ``faults``: the
+    reasons for the verdict; ``warnings``: what each result of the capture will warn of, and what its pictures show of
+    the face.
+    """
 
     id: str
     created: str
@@ -105,7 +111,8 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationRecord:
-    """``pictures``: their number by camera; ``kind``: of what, board or scene."""
+    """Holds a calibration that was requested. ``pictures``: number of pictures by camera; ``kind``: what they show,
+    board or scene."""
 
     id: str
     created: str
@@ -117,8 +124,8 @@ class CalibrationRecord:
 
 @dataclass(frozen=True, slots=True)
 class UploadRecord:
-    """Holds a resumable upload: ``fields`` say of the capture what a form would, ``capture`` is its id once it was
-    made."""
+    """Holds a resumable upload. ``fields``: what a form would say of the capture; ``capture``: its
+    id, once it was made."""
 
     id: str
     length: int
@@ -130,14 +137,15 @@ class UploadRecord:
 
 @dataclass(frozen=True, slots=True)
 class RigAdjustment:
-    """Holds what differs from rig.toml: settings of cameras by name, and the lamps that are on during a shot."""
+    """Holds the settings that differ from rig.toml: those of cameras, by name, and the lamps that
+    are on during a shot."""
 
     cameras: dict[str, dict[str, float | None]]
     lights: tuple[int, ...] | None = None
 
 
 class RecordFormat(Generic[T]):
-    """How records of one kind are written: an object that names its format."""
+    """Writes and reads records of one kind, as JSON objects that name their format."""
 
     def __init__(self, kind: type[T], name: str) -> None:
         self._adapter, self.name = TypeAdapter(kind), name
@@ -146,7 +154,7 @@ class RecordFormat(Generic[T]):
         return {"format": self.name, **self._adapter.dump_python(record, mode="json")}
 
     def read(self, document: object) -> T:
-        """Raises ValueError for what is no such record."""
+        """Reads a record from its document. Raises ValueError for a document of another format or shape."""
         if not isinstance(document, dict) or document.get("format") != self.name:
             raise ValueError(f"no {self.name}")
         return self._adapter.validate_python(document)
@@ -182,20 +190,20 @@ _CHECKS = TypeAdapter(dict[str, _View])
 
 
 def read_checks(document: Any) -> dict[str, ViewDocument]:
-    """Returns what a ``checks.json`` says by camera. Raises ValueError for what is none."""
+    """Returns the measurements in a ``checks.json`` by camera. Raises ValueError for another document."""
     _CHECKS.validate_python(document)
     return document
 
 
 class JobWebhook(TypedDict):
-    """Holds the address that is told of one job; ``secret`` signs the messages."""
+    """Holds the address to which the end of one job is announced. ``secret`` signs the messages."""
 
     url: str
     secret: str | None
 
 
 class JobRequest(TypedDict):
-    """Holds what a job shall do, as the job engine keeps it."""
+    """Holds what a job is to do, as the job engine stores it."""
 
     capture_id: str
     model: str | None
@@ -206,15 +214,15 @@ class JobRequest(TypedDict):
 
 
 class FileEntry(TypedDict):
-    """Holds a file of a result, as the job engine keeps it."""
+    """Holds size and SHA-256 of a result's file, as the job engine stores them."""
 
     bytes: int
     sha256: str
 
 
 class CalibrationOutcome(TypedDict):
-    """Holds what a calibration found, as the job engine keeps it; ``sha256`` is of its cameras.json. Those of earlier
-    versions were not judged."""
+    """Holds the result of a calibration, as the job engine stores it. ``sha256`` is that of cameras.json. Outcomes of
+    earlier versions have no verdict."""
 
     verdict: NotRequired[str]
     missing: NotRequired[list[str]]
@@ -228,7 +236,7 @@ class CalibrationOutcome(TypedDict):
 
 
 class WebhookMessage(TypedDict):
-    """Holds one delivery, as the job engine keeps it, to a webhook of the service or to a job's own."""
+    """Holds one message to a webhook of the service or of a job, as the job engine stores it."""
 
     webhook: str
     own: NotRequired[JobWebhook]

@@ -19,9 +19,11 @@ RESULT_FILE = re.compile(
 
 @contextmanager
 def fresh_folder(out: Path) -> Iterator[Path]:
-    """Makes an empty folder that takes the place of ``out`` when the block ends well, and is gone when it does not.
+    """Makes an empty folder whose content replaces the result in ``out`` when the block ends without an error. After an
+    error the folder is removed.
 
-    Raises OSError at once where ``out`` cannot be written."""
+    Raises OSError at once where ``out`` cannot be written.
+    """
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(20, "Not a directory", str(out))
     out.parent.mkdir(parents=True, exist_ok=True)

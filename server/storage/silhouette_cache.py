@@ -47,7 +47,8 @@ QUICK = 1  # zlib's fastest level: 35 MB become 4.7 MB in 0.2 s, and no level ge
 def segment_once(
     folder: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress
 ) -> dict[str, Silhouette]:
-    """Calls ``segment``, unless ``folder`` holds what it found before. ``capture`` was read from files."""
+    """Returns the silhouettes of a capture: those kept in ``folder`` from an earlier call, else what ``segment``
+    returns, which is then kept. The capture must have been read from files."""
     path = folder / (_key(capture, settings) + SUFFIX)
     with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
         found = _decoded(path.read_bytes())

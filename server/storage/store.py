@@ -52,7 +52,7 @@ T = TypeVar("T")
 
 
 def new_id() -> str:
-    """Returns 28 hex digits that sort by time: 12 of milliseconds, 16 at random."""
+    """Returns a new id: 28 hex digits, 12 of the time in milliseconds and 16 random ones, so that ids sort by time."""
     return f"{time.time_ns() // 1_000_000:012x}{secrets.token_hex(8)}"
 
 
@@ -62,14 +62,14 @@ def is_id(text: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class StoredFile:
-    """Holds a file and the sha256 of what is in it."""
+    """Holds the path of a file and the SHA-256 of its content."""
 
     path: Path
     sha256: str
 
 
 class RecordIndex(Protocol):
-    """Hears of every record that is written or removed; ``changed``: its file's time, in ns."""
+    """Declares what is called when a record is written or removed. ``changed``: time of the record's file (ns)."""
 
     def put_capture(self, record: CaptureRecord, changed: int) -> None: ...
     def drop_capture(self, identity: str) -> None: ...
@@ -97,13 +97,14 @@ class Store:
         data.chmod(0o700)  # faces are biometric data
 
     def folder(self, kind: str, identity: str) -> Path:
-        """Returns where a capture, job, ... lies or would lie. Raises NotFound for what is no id."""
+        """Returns the folder in which a thing of this kind and id lies or would lie. Raises NotFound for a text that is
+        no id."""
         if not is_id(identity):
             raise NotFound(_THINGS.get(kind) or compose("thing-file"), identity)
         return self.data / kind / identity
 
     def ids(self, kind: str) -> list[str]:
-        """Lists ids, newest first."""
+        """Lists the ids of all things of a kind, newest first."""
         with suppress(FileNotFoundError):
             names = (entry.name.removesuffix(".json") for entry in os.scandir(self.data / kind))
             return sorted((name for name in names if is_id(name)), reverse=True)
@@ -111,7 +112,8 @@ class Store:
 
     @contextmanager
     def incoming(self) -> Iterator[Path]:
-        """Makes a folder to receive things in; it is gone afterwards, with everything that was not moved out of it."""
+        """Makes a folder in which things are received while the block runs. What was not moved out of it is removed at
+        the end."""
         folder = self.data / "incoming" / new_id()
         folder.mkdir(parents=True)
         try:
@@ -128,19 +130,20 @@ class Store:
             raise DiskFull
 
     def add_capture(self, folder: Path, record: CaptureRecord) -> None:
-        """Moves ``folder`` (with ``files/`` in it) to its place, with its record."""
+        """Moves ``folder``, which holds ``files/``, to its final place and writes the capture's record into it."""
         write_atomically(folder / "record.json", _encoded(CAPTURE.document(record)))
         move_durably(folder, self.folder("captures", record.id))
         self._tell(record)
 
     def found(self, kind: str, identity: str) -> CaptureRecord | SessionRecord | None:
-        """Returns the record of a capture or session ("captures", "sessions"), if it is there and whole."""
+        """Returns the record of a capture or session (``kind``: "captures", "sessions"). Returns None where it is
+        missing or damaged."""
         with suppress(NotFound):
             return self.capture(identity) if kind == "captures" else self.session(identity)
         return None
 
     def changes(self, kind: str) -> dict[str, int]:
-        """When (ns) the record of each capture or session was last written."""
+        """Returns when the record of each capture or session was last written (ns), by id."""
         found = {}
         for identity in self.ids(kind):
             with suppress(FileNotFoundError, NotADirectoryError):
@@ -177,11 +180,12 @@ class Store:
         return record
 
     def put_checks(self, folder: Path, checks: Mapping[str, ViewDocument]) -> None:
-        """Writes the checks into a capture's folder that is not yet in its place."""
+        """Writes the measurements of a capture's pictures into the capture's folder before it is moved to its final
+        place."""
         write_atomically(folder / "checks.json", _encoded(checks))
 
     def checks(self, identity: str) -> dict[str, ViewDocument]:
-        """Returns what was measured of a capture's pictures, by camera; nothing of one of an earlier version, or where
+        """Returns the measurements of a capture's pictures by camera; none for a capture of an earlier version or where
         the file is damaged. Raises NotFound."""
         with suppress(FileNotFoundError, ValueError, RecursionError):
             return read_checks(json.loads((self.folder("captures", identity) / "checks.json").read_bytes()))
@@ -197,8 +201,8 @@ class Store:
                 yield record
 
     def change_capture(self, identity: str, change: Callable[[CaptureRecord], CaptureRecord]) -> CaptureRecord:
-        """Puts what ``change`` makes of a capture's record, and perhaps writes beside it, in its place and returns it.
-        Raises NotFound."""
+        """Replaces the record of a capture by what ``change`` makes of it, and returns the new
+        record. Raises NotFound."""
         with self._change(compose("thing-capture"), identity):
             record = change(self.capture(identity))
             path = self.folder("captures", identity) / "record.json"
@@ -217,7 +221,7 @@ class Store:
                 raise NotFound(what, identity) from error
 
     def remove_capture(self, identity: str) -> None:
-        """Removes a capture with what was kept of it: that shows a face too."""
+        """Removes a capture and all that is cached of it, which shows the face as well."""
         with self._change(compose("thing-capture"), identity):
             self.remove(self.folder("captures", identity))
             self.remove(self.cache_of(identity))
@@ -225,7 +229,7 @@ class Store:
                 self._index.drop_capture(identity)
 
     def cache_of(self, identity: str) -> Path:
-        """Returns where silhouettes, thumbnails and the like of a capture are kept."""
+        """Returns the folder in which silhouettes, thumbnails and the like of a capture are cached."""
         return self.folder("cache/captures", identity)
 
     def add_session(self, record: SessionRecord) -> None:
@@ -235,14 +239,15 @@ class Store:
         self._tell(record)
 
     def change_session(self, identity: str, change: Callable[[SessionRecord], SessionRecord]) -> SessionRecord:
-        """Puts what ``change`` makes of a session's record in its place and returns it. Raises NotFound."""
+        """Replaces the record of a session by what ``change`` makes of it, and returns the new
+        record. Raises NotFound."""
         with self._change(compose("thing-session"), identity):
             record = change(self.session(identity))
             self.add_session(record)
         return record
 
     def remove_session(self, identity: str) -> None:
-        """Removes a session's record, and what a kill left of writing it; its captures are not its own."""
+        """Removes the record of a session, and half-written copies of it. The session's captures stay."""
         with self._change(compose("thing-session"), identity):
             path = self.folder("sessions", identity).with_suffix(".json")
             for part in [*unfinished(path.parent, path.name)]:
@@ -265,7 +270,7 @@ class Store:
                 yield self.session(identity)
 
     def remove(self, path: Path) -> None:
-        """Deletes a file or folder; it is out of sight at once even if the deletion is cut short."""
+        """Deletes a file or folder. It is out of sight at once, even if the deletion is interrupted."""
         target = self.data / "trash" / f"{new_id()}"
         try:
             path.rename(target)
@@ -276,8 +281,8 @@ class Store:
         shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(missing_ok=True)
 
     def sweep(self, older_s: float) -> int:
-        """Deletes what a crash left in ``incoming`` and ``trash``, and of files that were being written, if nobody
-        touched it for ``older_s``."""
+        """Deletes what a crash left in ``incoming`` and ``trash``, and half-written files, if untouched for ``older_s``
+        seconds. Returns how many were deleted."""
         removed = 0
         for kind in ("incoming", "trash"):
             for identity in self.ids(kind):
@@ -302,7 +307,7 @@ class Store:
                     yield from unfinished(Path(entry))
 
     def list_quarantined(self) -> list[str]:
-        """Lists the names of the damaged records that were moved out of the way."""
+        """Lists the names of damaged records that were moved to ``set-aside``."""
         return sorted(entry.name for entry in (self.data / "set-aside").iterdir())
 
     def _read(self, path: Path, wanted: RecordFormat[T], whole: Path) -> T | None:
@@ -323,7 +328,8 @@ class Store:
 
 
 def move_durably(folder: Path, target: Path) -> None:
-    """Renames a folder whose files were synced, and syncs the names. Raises OSError if ``target`` has content."""
+    """Renames a folder whose files were synced, and syncs the folders' entries. Raises OSError if ``target`` has
+    content."""
     for path in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
         _sync_folder(path)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -25,8 +25,8 @@ of the work corrects. Matching goes by pairs, so that more of them take longer."
 
 
 def expected(folder: Path) -> dict[str, float]:
-    """Returns the seconds of each stage of a calibration, before it has begun: larger pictures take longer, which its
-    own pace soon tells."""
+    """Estimates the seconds of each stage of a calibration before it begins, from the number of pictures. Larger
+    pictures take longer."""
     pictures = sum(path.is_file() for path in (folder / "images").rglob("*"))
     if not is_of_board(folder):
         return {stage: took * pictures for stage, took in SCENE_STAGES_S.items()}
@@ -40,8 +40,8 @@ def is_of_board(folder: Path) -> bool:
 def ingest_photographs(
     context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> None:
-    """Unpacks photographs of a scene, and scale.json where there is one, into ``folder`` and looks at both. Raises
-    InputError."""
+    """Unpacks an archive of photographs of a scene, with scale.json if there is one, into ``folder`` and checks both.
+    Raises InputError."""
     from calibration.scene.photographs import find_photographs
 
     target = Path(folder)
@@ -61,14 +61,14 @@ def ingest_photographs(
 
 
 def forget_scene(folder: Path) -> None:
-    """Removes the photographs of a scene, once the work on them ended: they may show a subject, of whom captures alone
-    know and can be erased."""
+    """Removes the photographs of a scene when the calibration has ended: they may show a subject, and only captures can
+    be erased on request."""
     if not is_of_board(folder):
         shutil.rmtree(folder / "images", ignore_errors=True)
 
 
 def check_scale(folder: Path) -> None:
-    """Raises InputError for a scale.json that does not belong to the photographs beside it."""
+    """Raises InputError for a scale.json that does not fit the photographs beside it."""
     from rig.formats.scale_json import read_scale
 
     if (folder / SCALE).is_file():
@@ -78,7 +78,7 @@ def check_scale(folder: Path) -> None:
 def ingest_board_pictures(
     context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits
 ) -> None:
-    """Unpacks board.toml and IMAGES/ into ``folder`` and looks at both. Raises InputError."""
+    """Unpacks an archive of board.toml and IMAGES/ into ``folder`` and checks both. Raises InputError."""
     from calibration.board.board import read_board
     from calibration.board.detection import list_pictures
 
@@ -108,7 +108,8 @@ def calibrate_folder(
     cache: str,
     front: str | None,
 ) -> CalibrationOutcome:
-    """Runs ``calibrate()``, or ``calibrate_scene()``, and writes its files. Returns what the record shows."""
+    """Calibrates from the board pictures or photographs in ``folder`` and writes the files of the calibration to
+    ``result``. Returns the outcome, as the record shows it. Raises InputError."""
     if not is_of_board(Path(folder)):
         return _calibrate_scene(report, Path(folder), Path(result), front)
     from calibration.board.board import read_board

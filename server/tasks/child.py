@@ -41,8 +41,8 @@ Report = Progress  # as the task of a reconstruction calls it
 
 
 class WorkFailed(EigenheadError):
-    """Reports that the work raised. ``kind`` tells a known failure (an error of this project, a full disk, no memory)
-    from a bug, whose ``trace`` is for the log."""
+    """Reports that work in a child process failed. ``kind`` names a known failure (an error of this project, full disk,
+    no memory) or a bug, whose ``trace`` is for the log."""
 
     def __init__(
         self, kind: str, message: Message | str, faults: Iterable[Message | str] = (), trace: str = ""
@@ -53,29 +53,33 @@ class WorkFailed(EigenheadError):
 
 
 class WorkerContext:
-    """Keeps what outlives one piece of work in the child: resources by name, made once, closed at the end."""
+    """Keeps resources in the child process from one piece of work to the next: each is made once, by name, and closed
+    at the end."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()
         self._things: dict[str, object] = {}
 
     def keep(self, name: str, make: Callable[[], Any]) -> Any:
-        """Returns the thing called ``name``; ``make`` may return a context manager, which is entered."""
+        """Returns the resource called ``name``, which ``make`` makes at the first call. If that is a context manager,
+        it is entered and its value returned."""
         if name not in self._things:
             thing: Any = make()
             self._things[name] = self._stack.enter_context(thing) if hasattr(thing, "__exit__") else thing
         return self._things[name]
 
     def close(self) -> None:
-        """Closes what is kept, the newest first."""
+        """Closes all resources, the newest first."""
         self._things.clear()
         self._stack.close()
 
 
 class Child:
-    """Runs work in one child process; a call starts it when there is none. Not for two threads at once.
+    """Runs pieces of work in one child process, which is started when the first one needs it. Not for two threads at
+    once.
 
-    ``variables``: of its environment, over those of this process."""
+    ``variables``: environment variables of the child, which override those of this process.
+    """
 
     def __init__(self, niceness: int = 0, variables: Mapping[str, str] = MappingProxyType({})) -> None:
         self._niceness, self._variables = niceness, dict(variables)
@@ -89,11 +93,11 @@ class Child:
         report: Progress = lambda stage, fraction: None,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Callable[P, T]:
-        """Returns ``work``, a function of a module, as it runs in the child: ``child.remote(work)(name=value)`` calls
-        ``work(context, report, name=value)`` there. What travels is the function's module and name.
+        """Returns a function that runs ``work`` in the child: ``child.remote(work)(name=value)`` calls ``work(context,
+        report, name=value)`` there. ``work`` must be a function of a module, since only its name is sent.
 
-        The call raises Cancelled within ``PATIENCE_S`` and one poll after ``cancelled()`` becomes true, InputError and
-        WorkFailed as the function did, and WorkFailed("crash") when the child died.
+        The returned function raises Cancelled within ``PATIENCE_S`` and one poll after ``cancelled()`` becomes true;
+        InputError or WorkFailed where ``work`` raised; and WorkFailed("crash") where the child died.
         """
 
         def call(*arguments: P.args, **named: P.kwargs) -> T:
@@ -119,7 +123,7 @@ class Child:
         self._kill()
 
     def start(self) -> None:
-        """Starts the process ahead of the first piece of work."""
+        """Starts the child process before the first piece of work needs it."""
         self._started()
 
     def _started(self) -> Connection:
@@ -168,7 +172,7 @@ class Child:
 
 
 class ChildProcessPool:
-    """Lends a few child processes to many threads: each takes one for its work and gives it back."""
+    """Lends a few child processes to many threads. Each thread takes one for its work and gives it back."""
 
     def __init__(self, count: int, niceness: int = 0) -> None:
         self._all = [Child(niceness) for _ in range(count)]
@@ -212,7 +216,7 @@ def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Mess
 
 
 def serve(connection: Connection) -> None:
-    """Runs the child's main loop: the first thread works (a GL context wants that), a second one listens."""
+    """Runs the main loop of a child process. The first thread works, as a GL context requires; a second one listens."""
     requests: queue.Queue[bytes] = queue.Queue()
     stop = threading.Event()
 
@@ -255,8 +259,8 @@ def _reporter(connection: Connection, stop: threading.Event) -> Progress:
 
 
 def function_at(address: str) -> Callable[..., Any]:
-    """Returns the function that "module:name" names. A module that begins with a dot lies in the package ``server``,
-    whatever that is called where the code runs."""
+    """Returns the function that "module:name" names. A module name that begins with a dot is relative to the package
+    ``server``."""
     module, _, name = address.partition(":")
     return getattr(importlib.import_module(module, SERVER), name)
 

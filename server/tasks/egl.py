@@ -5,7 +5,7 @@ from server.tasks.child import WorkerContext
 
 
 def try_egl(context: WorkerContext, report: Progress) -> str:
-    """Returns the name of the GL device. Raises the renderer's own error."""
+    """Opens a GL context and returns the name of its device. Raises the renderer's error where that fails."""
     from rig.render.context import GlContext  # without the renderer's NumPy: half the time
 
     gl = GlContext()

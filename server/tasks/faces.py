@@ -31,8 +31,8 @@ PICTURE_PX = 1600  # longer side: a face of an eighth of it has the networks' 19
 def find_capture_faces(
     context: WorkerContext, report: Progress, *, capture: str, images: Mapping[str, str]
 ) -> FacesDocument:
-    """Finds the faces in ``images`` (files below the folder ``capture``, by camera). Raises InputError, and
-    DamagedNetwork."""
+    """Finds the faces in pictures of a capture. ``images``: file of each camera's picture, below the folder
+    ``capture``. Raises InputError and DamagedNetwork."""
     from pipeline.faces.matching import EYE_DISTANCE_MM
     from pipeline.faces.networks import load_networks
     from pipeline.faces.sighting import reduce_picture
@@ -65,7 +65,8 @@ def find_capture_faces(
 def describe(
     subject: "SubjectFaces", rig: Rig, recorded: Rig, suggest: "Callable[[MatchedFaces], PixelsOfPoints]"
 ) -> FacesDocument:
-    """Returns what was found by ``rig`` in the pixels of ``recorded``; the subject's face comes first."""
+    """Returns the faces that were found with the reduced cameras ``rig``, in the pixels of the files' cameras
+    ``recorded``. In each picture the subject's face comes first."""
     matched = subject.matched
     faces: dict[str, list[FoundFace]] = {}
     for name, seen in subject.found.items():

@@ -55,9 +55,10 @@ Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as fea
 def ingest_archive(
     context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> CaptureContent:
-    """Unpacks ``archive``, checks the capture in it, and leaves ``folder`` with exactly its files.
+    """Unpacks the archive of a capture, checks the capture, and leaves exactly its files in ``folder``. Photographs
+    without cameras are calibrated first.
 
-    Returns what the capture's record says of the content. Raises InputError naming every fault.
+    Returns the content, as the capture's record holds it. Raises InputError naming every fault.
     """
     target = Path(folder)
     unpacked = target.with_name(target.name + ".unpacked")
@@ -152,8 +153,8 @@ def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportW
 def ingest_folder(
     context: WorkerContext, report: Progress, *, folder: str, image_pixels: int, measured: bool = False
 ) -> CaptureContent:
-    """Returns the same for a folder of our own making: a shot of the rig, ``measured`` where it was judged as it was
-    taken."""
+    """Checks a capture folder that the service made itself, and returns its content. ``measured``: the pictures were
+    measured when the shot was taken, so that only the subject is looked for."""
     return check_capture(Path(folder), image_pixels, report, measured=measured, networks=_face_networks(context))
 
 
@@ -166,7 +167,8 @@ def _face_networks(context: WorkerContext) -> FaceNetworks | None:
 
 
 def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
-    """Checks a shot of the calibration board: leaves ``folder`` with its images alone, one a camera, of any size."""
+    """Checks a shot of the calibration board and leaves only its images in ``folder``, one a camera, of any size.
+    Returns their description. Raises InputError."""
     root = Path(folder)
     for entry in root.iterdir():
         if entry.name != "images":
@@ -196,8 +198,8 @@ def check_capture(
     strays_pass: bool = False,
     networks: FaceNetworks | None = None,
 ) -> CaptureContent:
-    """Returns what a capture folder holds; pictures of no camera are faults unless ``strays_pass``. With ``networks``
-    the face is looked for, too. Raises InputError naming every fault."""
+    """Checks a capture folder and returns its content. Pictures of no camera are faults unless ``strays_pass``; with
+    ``networks`` the subject's face is looked for. Raises InputError naming every fault."""
     rig_file = find_rig_file(root)
     if rig_file is None:
         raise InputError("capture", [NO_RIG])
@@ -281,7 +283,8 @@ def _shows_its_plate(shot: Capture, name: str) -> bool:
 
 
 def check_features(context: WorkerContext, report: Progress, *, folder: str, points: Points) -> bytes:
-    """Judges feature points for the capture in ``folder``; returns the file of them. Raises InputError."""
+    """Checks feature points (px by point and camera) against the capture in ``folder``. Returns the bytes of the
+    features.json that holds them. Raises InputError."""
     rig_file = find_rig_file(Path(folder))
     if rig_file is None:
         raise InputError("capture", [NO_RIG])

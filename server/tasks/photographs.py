@@ -48,7 +48,7 @@ CAMERAS, FIGURES, PAGE = "cameras.json", "calibration.json", "calibration.html"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """Holds what ``reconstruct`` needs, and what was said while it was found."""
+    """Holds the capture and rig that ``reconstruct`` needs, and the warnings from finding the cameras."""
 
     capture: Capture
     rig: Rig
@@ -56,7 +56,7 @@ class Prepared:
 
 
 def photographs_alone(folder: Path) -> bool:
-    """Tells whether a capture folder has photographs and no cameras."""
+    """Tells whether a folder has photographs but no cameras."""
     root = capture_root(folder)
     if find_rig_file(root) is not None:
         return False
@@ -66,9 +66,10 @@ def photographs_alone(folder: Path) -> bool:
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Progress) -> Prepared:
-    """Reads a capture folder as it is, or, where it has no cameras, with those that its photographs give.
+    """Reads a capture folder. If it has no cameras, they are found from its photographs and kept in ``kept``.
 
-    Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add."""
+    Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add.
+    """
     if not photographs_alone(folder):
         return Prepared(*read_scaled_capture(folder), ())
     from calibration.scene.photographs import find_photographs
@@ -88,9 +89,10 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
 
 
 def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) -> tuple[Capture, Rig]:
-    """Reads a capture folder with its cameras; where scale.json lies beside them, in its millimetres.
+    """Reads a capture folder with its cameras. With a scale.json beside them the cameras are scaled to millimetres.
 
-    Raises InputError naming every fault, also of cameras that are in no plausible unit once they are scaled."""
+    Raises InputError naming every fault, also where the scaled cameras are in no plausible unit.
+    """
     capture, rig = read_capture(folder, pixels_most=pixels_most)
     root = capture_root(folder)
     rig_file = find_rig_file(root)
@@ -105,7 +107,8 @@ def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) 
 
 
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Progress) -> tuple[ReportWarning, ...]:
-    """Leaves cameras.json and its report in ``kept``, unless they are there and of the same photographs."""
+    """Calibrates the cameras of photographs and writes cameras.json and its report to ``kept``, unless those are there
+    from the same photographs. Returns the warnings."""
     made_of = _made_of(root, front)
     if (told_before := calibration_warnings(kept, made_of)) is not None:
         return told_before
@@ -134,8 +137,8 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
 
 
 def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -> tuple[ReportWarning, ...] | None:
-    """Returns what was said when the cameras beside it were found, as ``calibrate_photographs`` left it; None where
-    they were not found from photographs, or not from those of ``made_of``."""
+    """Returns the warnings that ``calibrate_photographs`` kept in ``kept``. Returns None where the cameras there are
+    not from photographs, or not from the files ``made_of`` (SHA-256 by name)."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
         same = made_of is None or document["made_of"] == made_of
@@ -145,8 +148,8 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
 
 
 def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
-    """Checks sizes as the headers say, before anything is decoded. Raises InputError naming every one that is too
-    large."""
+    """Checks the sizes of pictures from their headers, before anything is decoded. Raises InputError naming every
+    picture that is too large."""
     sizes = {path: picture_size(path) for path in files}
     huge = [f"{path.name} is {w} x {h} pixels" for path, (w, h) in sizes.items() if w * h > image_pixels]
     if huge:
@@ -156,8 +159,8 @@ def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
 def keep_masks(
     kept: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress
 ) -> dict[str, Silhouette]:
-    """Silhouettes; where the photographs alone told them, masks/ in ``kept`` shows them, and a second run takes what
-    it finds there."""
+    """Returns the silhouettes of a capture. If they were found from the photographs alone, they are also written to
+    masks/ in ``kept``, where a second run finds them."""
     from pipeline.segmentation.segment import segment
     from server.storage.silhouette_cache import SUFFIX, segment_once
 

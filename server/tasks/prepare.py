@@ -27,7 +27,7 @@ PROCESSES_MOST = 8  # each takes 250 MB and half a second to load what it compil
 
 
 class Prepared(NamedTuple):
-    """Holds numbers of loops."""
+    """Holds the numbers of compiled loops: those compiled now, those still missing, and all."""
 
     compiled: int  # now
     missing: int  # still: nothing can be kept
@@ -35,7 +35,8 @@ class Prepared(NamedTuple):
 
 
 def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bool:
-    """Compiles a line of the list, in a child. Returns False where it could not be kept, which the log has said."""
+    """Compiles the loop that a line of the list names, in a child process. Tells whether the code could be kept; if
+    not, the log says so."""
     from pipeline.compute.kernel_list import Kernel
 
     kernel = Kernel.from_line(line)
@@ -44,17 +45,17 @@ def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bo
 
 
 def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Prepared:
-    """Compiles what the list has and the cache folder lacks, and says so in a line.
+    """Compiles the listed loops that the cache folder lacks, in several processes, and logs one line about it.
 
-    Where nothing can be kept it says so in a line and compiles nothing: each process will have to, for itself.
+    Where nothing can be kept, it logs that and compiles nothing: each process will compile for itself.
 
     Args:
-        report: told "compiling 12 of 49 loops" and the share that is done, from several threads, one at a time. What
-            it raises ends the work; what was compiled until then is kept.
-        settings: of a job; the loops that it does not call are left out. Without them all of the list counts.
+        report: called with "compiling 12 of 49 loops" and the share that is done, from several threads, one at a time.
+            What it raises ends the work; what was compiled until then is kept.
+        settings: of a job: loops that it does not call are left out. None: all loops of the list.
 
     Returns:
-        How many loops there are, and what became of them.
+        How many loops were compiled, are missing, and are listed.
     """
     from pipeline.compute.kernel_list import by_module, listed_kernels
     from pipeline.settings import FINE_LEVELS

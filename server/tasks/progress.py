@@ -26,7 +26,7 @@ log = structlog.get_logger()
 
 
 class JobProgress:
-    """One job on its way: feed it reports, ask for progress and remaining seconds.
+    """Computes progress and remaining time of one job from the reports of its stages.
 
     Args:
         expected: seconds of each stage, in the order in which they come.
@@ -50,17 +50,18 @@ class JobProgress:
         self._fraction = min(1.0, max(0.0, fraction))
 
     def finish(self) -> dict[str, float]:
-        """Returns the seconds of every stage."""
+        """Ends the last stage and returns the seconds that every stage took."""
         self._close()
         self.stage = self._visit = ""
         return self.seconds
 
     def remaining_s(self) -> float:
-        """Estimates the seconds of this stage and all that come, at the pace of those that are done."""
+        """Estimates the seconds until the job ends, at the pace of the stages that are done."""
         return (self._rest_of_stage() + self._to_come()) * self._pace()
 
     def progress(self) -> float:
-        """Returns 0 to 1, never falling: each stage counts by its expected time."""
+        """Returns the share of the job that is done, 0 to 0.99 and never falling. Each stage counts by its expected
+        time."""
         done = sum(took for stage, took in self._expected.items() if stage in self.seconds and stage != self._visit)
         expected_s, spent = self._expected.get(self._visit, 0.0), self._spent_s() / self._pace()
         now = done + expected_s * spent / max(spent + self._rest_of_stage(), 1e-9)
@@ -102,8 +103,8 @@ class JobProgress:
 
 
 class ProgressMeter:
-    """Turns the reports of a job into events, with the remaining time: at most one in ``EVERY_S`` within a stage, and
-    one in ``EVERY_S`` where a stage reports nothing but is asked by ``tick``."""
+    """Writes the progress and remaining time of a job to its events, within a stage at most once in ``EVERY_S``.
+    ``tick`` does so where a stage reports nothing."""
 
     def __init__(self, log: "EventLog", job_id: str, progress: JobProgress) -> None:
         self._log, self._job_id, self._progress = log, job_id, progress

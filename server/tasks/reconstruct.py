@@ -13,8 +13,8 @@ DONE = "done"  # the pipeline's last word, when nothing is written yet
 
 
 class CaptureWork(Protocol):
-    """Declares what a worker runs for a job: ``reconstruct_capture``, or what the setting ``work`` names in its
-    place."""
+    """Declares the function that a worker runs for a job: ``reconstruct_capture``, or the one that the setting ``work``
+    names."""
 
     def __call__(
         self,
@@ -40,11 +40,11 @@ def reconstruct_capture(
     model: str | None,
     settings: Mapping[str, object],
 ) -> None:
-    """Reconstructs the capture folder ``capture`` into the result folder ``result``. ``cache`` is where
-    silhouettes of this capture are kept.
+    """Reconstructs the capture folder ``capture`` and writes the result folder ``result``. Silhouettes of the capture
+    are kept in ``cache``.
 
-    Raises InputError for an input that cannot be used, any EigenheadError that the pipeline raises, OSError for a full
-    disk, Cancelled out of ``report``.
+    Raises InputError for an input that cannot be used, any EigenheadError of the pipeline, OSError for a full disk, and
+    Cancelled if ``report`` does.
     """
     report("read", 0.0)  # a fresh child loads for seconds what this takes
     share_one_heap()

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 @contextmanager
 def folder_of(capture: Path) -> Iterator[Path]:
-    """A capture folder, or what is in an archive of one for as long as it is needed. Raises InputError."""
+    """Yields the folder of a capture. An archive is unpacked to a temporary folder for the duration of the block.
+    Raises InputError."""
     if capture.is_dir():
         yield capture
         return
@@ -41,10 +42,12 @@ def reconstruct_folder(
     chosen: "Settings",
     preparation: Progress,
 ) -> None:
-    """Reconstructs a capture folder into ``out``. ``kept`` is where cameras and masks that had to be found stay,
-    whatever comes after; ``preparation`` is told of what comes before the first stage: cameras, loops.
+    """Reconstructs the capture in ``folder`` and writes the result to ``out``. Cameras and masks that had to be found
+    are kept in ``kept``, even if the reconstruction fails.
 
-    Raises what the pipeline raises, and OSError for a full disk."""
+    ``preparation`` is called with the progress before the first stage: finding cameras, compiling loops. Raises what
+    the pipeline raises, and OSError for a full disk.
+    """
     from pipeline.compute.trace import span
     from server.tasks.photographs import keep_masks, read_or_calibrate
     from server.tasks.prepare import prepare_kernels
@@ -89,8 +92,8 @@ def reconstruct_beside(
     model: str | None,
     settings: Mapping[str, object],
 ) -> None:
-    """In a child of the process ``parent``: reconstructs a capture folder or archive into the new folder ``result``;
-    all that is temporary lies in the folder ``scratch``."""
+    """Reconstructs a capture folder or archive into the new folder ``result``, in a child of the process ``parent``.
+    All temporary files lie in the folder ``scratch``."""
     end_with_parent(parent)
     share_one_heap()
     from pipeline.settings import settings_from_document

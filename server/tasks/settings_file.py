@@ -10,7 +10,7 @@ from rig.messages.message import compose
 
 
 def read_settings_file(path: Path) -> dict[str, object]:
-    """Reads a table of settings. Raises InputError."""
+    """Reads settings from a TOML or JSON file. Raises InputError."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
         braced = path.suffix == ".json" or (path.suffix != ".toml" and text.lstrip().startswith("{"))
@@ -23,17 +23,18 @@ def read_settings_file(path: Path) -> dict[str, object]:
 
 
 def reason_of(error: OSError | ValueError | RecursionError) -> str:
-    """Returns why a file cannot be read, without its path, which is said beside it."""
+    """Returns why a file cannot be read, without the file's path."""
     return getattr(error, "strerror", None) or str(error)
 
 
 def settings_document(path: Path | None, **options: str | Mapping[str, object] | None) -> dict[str, object]:
-    """Settings from a TOML or JSON file, then from options; tables are merged. Raises InputError."""
+    """Returns the settings of a TOML or JSON file, if any, overridden by options; tables are
+    merged. Raises InputError."""
     return merged_settings({} if path is None else read_settings_file(path), options)
 
 
 def merged_settings(document: Mapping[str, object], over: Mapping[str, object]) -> dict[str, object]:
-    """Returns ``document`` with what ``over`` says; tables of both are merged, and None says nothing."""
+    """Returns ``document`` overridden by ``over``. Tables in both are merged; None in ``over`` overrides nothing."""
     merged = dict(document)
     for name, value in over.items():
         old = merged.get(name)

@@ -19,7 +19,7 @@ class SimulatedSync(TypedDict):
 
 
 class SimulatedCertificate(TypedDict):
-    """Of a shot of the simulated studio."""
+    """Holds the certificate of a shot of the simulated studio."""
 
     kind: str
     subject: str
@@ -28,9 +28,10 @@ class SimulatedCertificate(TypedDict):
 
 
 def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: int | None) -> SimulatedCertificate:
-    """Writes a capture in ``folder/files`` and its truth in ``folder/truth``. Returns the shot's certificate.
+    """Takes a shot of the simulated studio: writes the capture to ``folder/files`` and its truth to ``folder/truth``.
+    Returns the certificate.
 
-    Without a seed the subject is another one each time. The operator's clicks are left out: they are made later.
+    Without a seed each shot shows another subject. Feature points are left out: operators pick them later.
     """
     from pipeline.head_model.model import load_model
     from rig.formats.capture_folder import write_capture
@@ -51,14 +52,14 @@ def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: in
 
 
 def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
-    """Returns the certificate of a simulated shot: every picture is of one moment."""
+    """Returns the certificate of a simulated shot, all of whose pictures are of one moment."""
     cameras: dict[str, SimulatedSync] = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
     faults = [f.kind if f.camera is None else f"{f.kind} in {f.camera}" for f in taken.faults]
     return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}
 
 
 def look(context: WorkerContext, report: Progress, *, cameras: list[str]) -> dict[str, np.ndarray]:
-    """Returns what cameras of the studio show (RGB): a subject that sits there, drawn once and kept."""
+    """Returns what the named cameras of the simulated studio show (RGB). The subject is drawn once and kept."""
     from pipeline.head_model.model import load_model
     from rig.render.renderer import Renderer
     from rig.studio.scene.layout import default_layout

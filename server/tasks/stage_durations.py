@@ -36,12 +36,13 @@ LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
 
 
 def kind_of(settings: Settings) -> str:
-    """Returns what decides which stages a job has and how long they are: "contour photo both", say."""
+    """Returns the settings that decide which stages a job has and how long they take, as text such as "contour photo
+    both"."""
     return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}"
 
 
 def first_guess(settings: Settings) -> dict[str, float]:
-    """Returns the seconds of the stages that a job with these settings has, before one was seen."""
+    """Returns the seconds expected of each stage of a job with these settings, before any was measured."""
     photographs = settings.method == "contour" and settings.detail in PHOTO_LEVELS
     fine, bust = photographs and settings.detail in FINE_LEVELS, settings.outputs.surface != "head"
     parts = settings.detail in PHOTO_LEVELS or bust
@@ -61,8 +62,8 @@ def first_guess(settings: Settings) -> dict[str, float]:
 
 
 def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
-    """Returns the seconds that a second of the first guess takes on this machine, by the kinds of jobs that it has
-    done; 1 where there is none."""
+    """Returns by which factor this machine is slower than the first guess, from the measured stages of each kind of
+    job. Returns 1 where nothing was measured."""
     took = guessed = 0.0
     for kind, stages in learnt.items():
         simplex = kind.startswith("simplex")
@@ -73,16 +74,16 @@ def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
 
 
 class StageDurations:
-    """Keeps the seconds that each stage is expected to take. ``file`` need not exist; where it cannot be written, only
-    this process learns."""
+    """Learns how many seconds each stage of a job takes, and keeps them in ``file``. Where the file cannot be written,
+    only this process learns."""
 
     def __init__(self, file: Path | None = None) -> None:
         self._file = file or cache_folder() / "durations.json"
         self._learnt: dict[str, dict[str, float]] = {}
 
     def of(self, settings: Settings) -> dict[str, float]:
-        """Returns the seconds by stage, in their order. The first job of a kind goes by the guess, at the pace of the
-        other kinds that this machine has done."""
+        """Returns the expected seconds of each stage, in the stages' order. For a kind of job that this machine never
+        ran, they are the first guess scaled by the pace of other kinds."""
         learnt, guess = self._read(), first_guess(settings)
         known = learnt.get(kind_of(settings))
         if known is None:
@@ -91,7 +92,7 @@ class StageDurations:
         return {stage: known.get(stage, seconds) for stage, seconds in guess.items()}
 
     def learn(self, settings: Settings, seconds: Mapping[str, float]) -> None:
-        """Takes in how long the stages of a job took."""
+        """Adds the measured seconds of a job's stages to what is expected."""
         learnt, before = self._read(), self.of(settings)
         weight = LEARNING if kind_of(settings) in learnt else 1.0
         mixed = {stage: (1 - weight) * before[stage] + weight * seconds[stage] for stage in before if stage in seconds}

@@ -25,14 +25,16 @@ NEUTRAL: Mapping[str, float] = MappingProxyType({})
 
 
 def drawn_subject(model: HeadModel, rng: np.random.Generator, weights: Mapping[str, float] = NEUTRAL) -> Subject:
-    """Draws a head from the model's population, all modes."""
+    """Draws a subject at random from the population of a head model, all modes, with the expression that ``weights``
+    describe."""
     return model_subject(model, rng.standard_normal(len(model.modes)), f"drawn from {model.name}", weights)
 
 
 def model_subject(
     model: HeadModel, coefficients: np.ndarray, name: str, weights: Mapping[str, float] = NEUTRAL
 ) -> Subject:
-    """Makes a head of the model, with the expression that ``weights`` name."""
+    """Makes a subject from a head model: its shape from ``coefficients`` (standard deviations), its expression from
+    ``weights``."""
     full = model.levels["full"]
     vertices = model.posed_vertices(coefficients, weights)
     landmarks = {name: vertices[index] for name, index in model.landmarks.items()}
@@ -40,10 +42,11 @@ def model_subject(
 
 
 def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression: Sequence[str] = ()) -> Subject:
-    """``random``, ``mean``, or a mesh file in the head frame (mm) with its landmarks beside it, where it has some.
-    ``expression``: NAME=WEIGHT of the model's.
+    """Returns the subject that a text names: ``random``, ``mean``, or a mesh file in the head frame (mm), whose
+    landmarks are read from the file beside it, if any. ``expression``: texts such as NAME=WEIGHT.
 
-    Raises InputError."""
+    Raises InputError.
+    """
     weights = weights_from_text(expression, model.expressions.names)
     if text == "random":
         return drawn_subject(model, rng, weights)
@@ -60,7 +63,8 @@ def simulate_folder(
     out: Path, *, subject: str, seed: int, preset: Preset, faults: list[str], renderer: Renderer,
     expression: Sequence[str] = (),
 ) -> Path:  # fmt: skip
-    """Writes a capture folder at ``out`` (``eigenhead simulate``). Returns where the truth is."""
+    """Simulates a capture and writes it to the folder ``out`` (``eigenhead simulate``). Returns the
+    folder of the truth."""
     rng = np.random.default_rng(seed)
     chosen = subject_of(subject, load_model(), rng, expression)
     planted = tuple(fault_from_text(text) for text in faults)

@@ -26,5 +26,5 @@ def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
 
 
 def take_over(executors: Sequence[str]) -> list[str]:
-    """Puts the pending workflows of these executors back into their queues; returns the ids of the workflows."""
+    """Puts the pending workflows of the named executors back into their queues. Returns the workflows' ids."""
     return [handle.get_workflow_id() for handle in DBOS._recover_pending_workflows([*executors])]

@@ -7,8 +7,8 @@ from server.storage.database import now_sql, workers
 
 
 def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> list[str]:
-    """Lists the ids of workers that stopped, whose process is gone from this machine, or that are silent for
-    ``silent_s``."""
+    """Lists the ids of dead workers: those that stopped, whose process on this machine is gone, or that sent no
+    heartbeat for ``silent_s``."""
     machine = process_identity()[0]
     with engine.connect() as connection:
         silent = (workers.c.seen < now_sql(connection) - silent_s).label("silent")

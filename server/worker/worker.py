@@ -60,7 +60,7 @@ log = structlog.get_logger()
 
 
 class Worker:
-    """Runs one worker of one process (the job engine is a singleton)."""
+    """Runs the one worker of this process (the job engine is a singleton)."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
@@ -93,7 +93,8 @@ class Worker:
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
     def run_until_stopped(self) -> None:
-        """Blocks until ``stop`` or a signal; a running job is left for the next worker."""
+        """Runs jobs until ``stop`` is called or a signal comes. A job that is running then is left
+        to the next worker."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: self._stop.set())
         while not self._stop.wait(0.5):
@@ -158,7 +159,7 @@ class Worker:
         del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
 
     def ingest(self, job_id: str, request: JobRequest) -> None:
-        """Fails early and clearly on what would make the fit fail late."""
+        """Raises early, and with a clear reason, what would make the fit fail late."""
         self.events.append(job_id, {"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None})
         self.store.folder("jobs", job_id).mkdir(parents=True, exist_ok=True)  # where its log goes
         log.info("job started", capture=request["capture_id"])
@@ -169,7 +170,7 @@ class Worker:
             raise JobFailed(error.kind, error.detail) from error
 
     def fit(self, job_id: str, request: JobRequest) -> str:
-        """Runs the work in a child and returns the name of the attempt's folder."""
+        """Runs the reconstruction of a job in a child process. Returns the name of the attempt's folder."""
         name = f"attempt-{secrets.token_hex(6)}"
         folder = self.store.folder("jobs", job_id) / name
         settings = request.get("settings") or {}
@@ -202,7 +203,7 @@ class Worker:
         return name
 
     def calibrate(self, identity: str) -> CalibrationOutcome:
-        """Computes one calibration, written under a temporary name and renamed."""
+        """Computes one calibration. Its folder is written under a temporary name and renamed at the end."""
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
@@ -235,8 +236,8 @@ class Worker:
         return result
 
     def publish(self, job_id: str, attempt: str) -> dict[str, FileEntry]:
-        """Gives the result its name; returns size and sha256 of every file. Another worker may have done so already,
-        with the same bytes."""
+        """Gives the result of an attempt its final name. Returns size and SHA-256 of every file; if another worker has
+        published it, of that worker's files, which have the same bytes."""
         folder = self.store.folder("jobs", job_id)
         target = folder / "result"
         if not target.is_dir():
@@ -252,8 +253,8 @@ class Worker:
         return files
 
     def publish_outcome(self, job_id: str, state: str, job_webhook: JobWebhook | None = None) -> None:
-        """Publishes how the job ended: as the last event of its stream, with the warnings that an operator must see to,
-        and to the webhooks, the job's own included."""
+        """Announces how a job ended: as the last event of its stream, with the warnings that an operator must act on,
+        and to the webhooks of the service and of the job."""
         warnings = warnings_of(self.store.folder("jobs", job_id) / "result" / "report.json")
         for warning in warnings:
             log.warning(warning["message"], code=warning["code"])
@@ -320,7 +321,7 @@ class Worker:
 
 
 def warnings_of(report: Path) -> list[MessageDocument]:
-    """Returns the warnings of a result's report.json."""
+    """Returns the warnings in the report.json of a result."""
     try:
         return json.loads(report.read_bytes())["warnings"]
     except (OSError, ValueError, KeyError, TypeError):  # no result, or another kind of work
@@ -348,7 +349,7 @@ class _StateWatch:
 
 
 def described(folder: Path) -> dict[str, FileEntry]:
-    """Returns the size and sha256 of every file below ``folder``, by relative name."""
+    """Returns size and SHA-256 of every file below ``folder``, by the file's relative name."""
     files: dict[str, FileEntry] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as stream:
@@ -358,7 +359,8 @@ def described(folder: Path) -> dict[str, FileEntry]:
 
 
 def run_worker(settings: ServiceSettings, *, until_eof: bool = False) -> None:
-    """Runs the worker process. With ``until_eof`` it stops when its standard input ends: when its parent does."""
+    """Runs the worker process. With ``until_eof`` it stops at the end of its standard input, that is when its parent
+    ends."""
     worker = Worker(settings)
     worker.start()
     if until_eof:

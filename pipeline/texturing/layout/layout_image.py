@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float32
 
 
 def spread_texels(image: Float32[np.ndarray, "s s k"], known: Bool[np.ndarray, "s s"]) -> Float32[np.ndarray, "s s k"]:
-    """Returns the image with every unknown texel that of the nearest known one."""
+    """Returns the image with every unknown texel replaced by the nearest known one."""
     _, labels = cv2.distanceTransformWithLabels(
         (~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )

@@ -13,15 +13,15 @@ from pipeline.texturing.neighbourhood import Neighbourhood
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelLayout:
-    """Holds of the model's full level: texture coordinates, and which vertices lie beside each other."""
+    """Holds the texture coordinates of a model's full level and which of its vertices are neighbours."""
 
     layout: Layout
     around: Neighbourhood
 
 
 def model_layout(model: HeadModel) -> ModelLayout:
-    """Returns the layout made from the mean head, so that texels of any two subjects correspond. Raises NoLayout for a
-    model whose surface is not one piece with one open border."""
+    """Returns the texture layout of a model, made from its mean head, so that texels of any two subjects correspond.
+    Raises NoLayout for a surface that is not one piece with one open border."""
     faces = model.levels["full"].faces
     mean = model.vertices(np.zeros(0))
 

@@ -28,7 +28,8 @@ SIZE_PX = 1024  # 4.5 texels from a vertex of the full level to the next; the bu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalMapped:
-    """Holds a reduced mesh, mm; its vertices are ``rows`` of the full one."""
+    """Holds a reduced mesh (mm) with texture coordinates, normals, tangents and its normal map. Its vertices are those
+    numbered ``rows`` of the full mesh."""
 
     mesh: Mesh
     rows: Int[np.ndarray, " n"]
@@ -45,7 +46,8 @@ def normal_mapped(
     reduced: ReducedLayout,
     size: int = SIZE_PX,
 ) -> NormalMapped:
-    """Returns the head's full mesh (mm, unit normals) as a reduced one with its normal map."""
+    """Reduces the head's full mesh (mm, unit normals) and returns the reduced mesh with a normal map that keeps the
+    full mesh's detail."""
     rows = layout.source[reduced.rows]
     places, reduced_normals, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
     tangents = vertex_tangents(places, reduced_normals, uv, reduced.faces)
@@ -72,7 +74,8 @@ def vertex_tangents(
     uv: Float[np.ndarray, "n 2"],
     faces: Int[np.ndarray, "f 3"],
 ) -> Float[np.ndarray, "n 4"]:
-    """Returns MikkTSpace's tangents, of a layout whose faces all turn the same way; v points downwards."""
+    """Computes MikkTSpace's tangents at the vertices; the fourth number is the sign of the bitangent. All triangles
+    must turn the same way in the layout, whose v points downwards."""
     corners, flat = vertices[faces], uv[faces]
     edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     (s, t), (p, q) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
@@ -125,5 +128,5 @@ def _in_frame(
 
 
 def png(image: UInt8[np.ndarray, "s s 3"]) -> bytes:
-    """Returns the map as a file: no loss, which would be seen in highlights."""
+    """Returns the normal map as the bytes of a PNG file. Lossy compression would be seen in highlights."""
     return cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()

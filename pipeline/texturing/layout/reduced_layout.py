@@ -21,14 +21,15 @@ FACE_WEIGHT = 8.0  # of an error in the face region
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedLayout:
-    """Holds a layout on fewer triangles. ``rows``: the layout's vertices that are left; ``faces`` among them."""
+    """Holds a texture layout reduced to fewer triangles. ``rows``: which vertices of the full layout remain; ``faces``:
+    triangles as indices into ``rows``."""
 
     rows: Int[np.ndarray, " n"]
     faces: Int[np.ndarray, "f 3"]
 
 
 def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
-    """Returns that of the model's full level."""
+    """Returns the reduced texture layout of a model's full level, made from its mean head once and kept."""
     mean, region = model.vertices(np.zeros(0)), model.levels["full"].face_region
 
     def make() -> dict[str, np.ndarray]:
@@ -43,8 +44,8 @@ def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
 def reduce(
     layout: Layout, vertices: Float[np.ndarray, "v 3"], importance: Float[np.ndarray, " v"], count: int = FACES
 ) -> ReducedLayout:
-    """Returns the layout of a mesh with these vertices (mm) on ``count`` of its faces or a few more; ``importance``
-    multiplies the error of a vertex."""
+    """Reduces the texture layout of a mesh to ``count`` triangles or a few more, its border unchanged. ``importance``
+    multiplies the error of a vertex: where it is high the layout stays denser."""
     source = layout.source
     ((rows, faces),) = decimate(
         vertices[source],

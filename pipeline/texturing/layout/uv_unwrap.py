@@ -35,8 +35,8 @@ class NoLayout(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Holds the mesh with its cut open. ``source`` is the vertex that each of the layout's vertices was; ``uv`` lies in
-    the unit square, v downwards as in glTF."""
+    """Holds a mesh cut open and laid flat. ``source``: the mesh's vertex that each vertex of the layout comes from;
+    ``uv``: where it lies in the unit square, v downwards as in glTF."""
 
     uv: Float[np.ndarray, "n 2"]
     faces: Int[np.ndarray, "f 3"]
@@ -45,14 +45,15 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas:
-    """Holds a layout and its image."""
+    """Holds a texture layout and the image (sRGB) that belongs to it."""
 
     layout: Layout
     image: UInt8[np.ndarray, "s s 3"]
 
 
 def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Layout:
-    """Lays out a head (head frame, one open border at the neck). Raises NoLayout for any other topology."""
+    """Cuts a head open from the nape to the crown and lays it flat in the unit square. Raises NoLayout unless the mesh
+    is one piece with one open border, at the neck."""
     border = _border(faces)
     back = int(border[np.argmin(vertices[border, 2] + np.abs(vertices[border, 0]))])
     crown = int(np.argmax(vertices[:, 1]))

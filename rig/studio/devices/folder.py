@@ -19,13 +19,13 @@ from rig.studio.sensor.realism import REALISM, made_real
 def simulate_to_folder(
     out: Path, simulated: SimulatedCapture, *, seed: int | None = None, features: bool = True
 ) -> Path:
-    """Writes the capture folder ``out`` and ``<out>.truth``; returns the latter.
+    """Writes a simulated capture as the folder ``out`` and its truth as the folder ``<out>.truth``. Returns the truth's
+    folder.
 
     The truth holds head.ply (world frame, mm, colours as lit), face_mask.npy and colour_mask.npy (a boolean a vertex),
-    silhouettes/ (subject with hair and clothes, coverage of at least a half), head_silhouettes/ (bare head),
-    coverage/ (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz
-    (points that two or more cameras see, of head, hair and clothes), cameras.json (where the cameras were) and
-    meta.json.
+    silhouettes/ (subject with hair and clothes, coverage of at least a half), head_silhouettes/ (bare head), coverage/
+    (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz (points of head,
+    hair and clothes that two or more cameras see), cameras.json (where the cameras were) and meta.json.
     """
     capture = simulated.capture
     if not features:
@@ -37,7 +37,7 @@ def simulate_to_folder(
 
 
 def write_truth(folder: Path, simulated: SimulatedCapture, *, seed: int | None = None) -> None:
-    """The truth folder alone."""
+    """Writes the truth of a simulated capture, without the capture, into ``folder``."""
     scene = simulated.scene
     count = len(scene.head.vertices)
     face = np.ones(count, bool) if scene.face_region is None else np.asarray(scene.face_region)

@@ -53,7 +53,7 @@ _JPEG = [
 
 @dataclass(frozen=True, slots=True)
 class DeviceFault:
-    """Holds a fault of ``KINDS``. ``camera`` None: the whole rig."""
+    """Holds a fault of ``KINDS``: its camera (None: the whole rig) and its amount (None: the usual one)."""
 
     kind: str
     camera: str | None = None
@@ -61,12 +61,13 @@ class DeviceFault:
 
     @property
     def strength(self) -> float:
-        """Returns the amount, or the kind's usual one."""
+        """Returns the amount of the fault, or the usual amount of its kind where none was set."""
         return self.amount if self.amount is not None else DEFAULT_AMOUNT.get(self.kind, 0.0)
 
 
 def device_fault_from_text(text: str) -> DeviceFault:
-    """``kind[:camera][=amount]``. Raises InputError; ``StudioDevices.inject`` judges whether a studio can do it."""
+    """Reads a fault from ``kind[:camera][=amount]``. Raises InputError for text of another form or an unknown kind;
+    ``StudioDevices.inject`` checks the camera."""
     kind, camera, amount = fault_parts(text)
     if kind not in KINDS:
         raise InputError("fault", [compose("none-of", value=f"{kind!r}", known=KINDS)])
@@ -84,10 +85,11 @@ class _Look:
 
 
 class StudioDevices:
-    """Eleven (or any number of) streams and a box; ``folder`` receives rig.toml and the link to the box's port.
+    """Runs the cameras of the simulated studio as streams, and its trigger box, while a block runs. ``folder`` receives
+    rig.toml and the link to the box's port.
 
-    ``takes`` is how many pictures of the empty studio, each with noise of its own, the live view shows in turn; more
-    clean plates than that would repeat themselves. A context manager; ``close`` leaves no thread, port or link.
+    ``takes`` is the number of pictures of the empty studio, each with noise of its own, that the live view shows in
+    turn; more clean plates than that would repeat themselves. ``close`` leaves no thread, port or link.
     """
 
     def __init__(
@@ -131,24 +133,24 @@ class StudioDevices:
         self.close()
 
     def close(self) -> None:
-        """Ends the streams and the box. Safe to call twice."""
+        """Ends the streams and the trigger box. Safe to call twice."""
         if self.box is not None:
             self.box.close()
         self.streams.close()
 
     @property
     def port_link(self) -> Path:
-        """Returns where rig.toml finds the trigger box."""
+        """Returns the path under which rig.toml finds the trigger box."""
         return self.folder.resolve() / "trigger-box"
 
     def seat(self, present: bool) -> None:
-        """The subject takes the seat, or leaves it. Returns when every camera sees it."""
+        """Seats the subject, or empties the seat. Returns when every camera shows it."""
         with self._busy:
             self.present = present
             self._refresh()
 
     def inject(self, fault: DeviceFault) -> None:
-        """Something goes wrong from now on. Raises InputError for what this studio cannot do."""
+        """Adds a fault that holds from now on. Raises InputError for an unknown kind or camera."""
         faults = []
         if fault.kind not in KINDS:
             strange = compose("none-of", value=f"{fault.kind!r}", known=KINDS)
@@ -164,13 +166,13 @@ class StudioDevices:
             self._apply()
 
     def clear(self) -> None:
-        """Everything is well again."""
+        """Ends all faults."""
         with self._busy:
             self.faults = ()
             self._apply()
 
     def write_rig(self) -> Path:
-        """rig.toml of this studio; its path."""
+        """Writes rig.toml for this studio and returns its path."""
         text = [
             'format = "eigenhead-rig/1"',
             f"name = {json.dumps(STUDIO)}",
@@ -307,7 +309,8 @@ class StudioDevices:
 def serve_scene(
     folder: Path, scene: Scene, *, fps: float = 4.0, host: str = "127.0.0.1", port: int = 0
 ) -> StudioDevices:
-    """Returns the devices of a drawn scene, the chair still empty; ``folder`` receives rig.toml and cameras.json."""
+    """Starts the devices of a drawn scene, its seat empty, and returns them. ``folder`` receives rig.toml and
+    cameras.json."""
     folder.mkdir(parents=True, exist_ok=True)
     write_rig(scene.rig, folder / "cameras.json")
     empty, seated = SceneImages(scene, seated=False, seed=1), SceneImages(scene, seated=True, seed=2)

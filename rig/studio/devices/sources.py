@@ -21,16 +21,17 @@ from rig.studio.sensor.sensor import drift, expose
 
 @runtime_checkable
 class ImageSource(Protocol):
-    """What a camera sees at a moment (s since the studio began), sensor noise and all."""
+    """Returns what a camera sees at a moment (``time_s``: seconds since the studio began), sensor noise included."""
 
     def __call__(self, camera: str, time_s: float) -> ImageRgb: ...
 
 
 class SceneImages:
-    """A still scene, with the subject seated or without; every picture has noise of its own. Thread-safe.
+    """Takes pictures of a still scene, with the subject seated or without. Every picture has noise of its own.
+    Thread-safe.
 
-    The light of a seated subject has drifted by the scene's preset from that of the empty studio, as between clean
-    plate and shot.
+    With the subject seated, the light differs from that of the empty studio by the drift that the scene's preset has
+    between clean plate and shot.
     """
 
     def __init__(self, scene: Scene, *, seated: bool, seed: int = 0) -> None:
@@ -61,7 +62,8 @@ _building = threading.Lock()
 
 
 def scene_of_file(mesh_file: Path) -> Scene:
-    """Returns the default studio with the head of a mesh file in it (head frame, mm); the last one is kept.
+    """Returns the default studio with the head of a mesh file in it (head frame, mm). The last scene is kept for the
+    next call.
 
     Raises InputError for a file that is no mesh.
     """

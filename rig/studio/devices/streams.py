@@ -28,7 +28,7 @@ Control = Callable[[str, str, Mapping[str, str]], tuple[int, str]]
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """JPEG files of one scene as a camera sees it: for the live view, and for releases."""
+    """Holds JPEG files of one scene as a camera sees it: some for the live view, others for releases."""
 
     live: tuple[bytes, ...]
     released: tuple[bytes, ...]
@@ -51,7 +51,8 @@ class _Camera:
 
 
 class StreamServer:
-    """Serves ``/<camera>.mjpeg`` for every name. A context manager; ``close`` leaves no thread and no port."""
+    """Serves the address ``/<camera>.mjpeg`` of every camera while a block runs. ``close`` leaves
+    no thread and no port."""
 
     def __init__(
         self, names: Sequence[str], control: Control, *, fps: float = 5.0, host: str = "127.0.0.1", port: int = 0
@@ -80,11 +81,11 @@ class StreamServer:
 
     @property
     def address(self) -> str:
-        """Returns where everything is served."""
+        """Returns the server's address, as the beginning of a URL."""
         return f"http://{self._host}:{self.port}"
 
     def url(self, name: str) -> str:
-        """Address of a camera's stream."""
+        """Returns the URL of a camera's stream."""
         return f"{self.address}/{name}.mjpeg"
 
     def close(self) -> None:
@@ -99,11 +100,11 @@ class StreamServer:
         self._loop.close()
 
     def show(self, name: str, film: Film) -> None:
-        """What a camera sees from now on."""
+        """Sets what a camera sees from now on."""
         self._do(lambda: setattr(self._cameras[name], "film", film))
 
     def arm(self, armed: bool) -> None:
-        """Holds the live views back, or lets them go on."""
+        """Holds all live views back, or lets them go on."""
 
         def hold() -> None:
             for camera in self._cameras.values():
@@ -112,7 +113,8 @@ class StreamServer:
         self._do(hold)
 
     def release(self, at_s: Mapping[str, float]) -> None:
-        """Raises the trigger inputs of cameras, each at its time (time.monotonic); the others' live views go on."""
+        """Raises the trigger inputs of the cameras in ``at_s``, each at its time (time.monotonic, s). The live views of
+        the other cameras go on."""
 
         def plan() -> None:
             for name, camera in self._cameras.items():
@@ -124,19 +126,19 @@ class StreamServer:
         self._do(plan)
 
     def freeze(self, name: str, frozen: bool = True) -> None:
-        """The camera sends the picture that it sent last over and over."""
+        """Makes a camera send its last picture over and over, or ends that."""
         self._do(lambda: setattr(self._cameras[name], "frozen", frozen))
 
     def hang(self, name: str, hung: bool = True) -> None:
-        """The camera keeps its connections and sends nothing."""
+        """Makes a camera keep its connections and send nothing, or ends that."""
         self._do(lambda: setattr(self._cameras[name], "hung", hung))
 
     def drop_next(self, name: str, drop: bool = True) -> None:
-        """The next triggered frame of a camera gets lost."""
+        """Makes a camera lose its next triggered frame, or ends that."""
         self._do(lambda: setattr(self._cameras[name], "drop_next", drop))
 
     def connect(self, views: Mapping[str, str]) -> None:
-        """Whose picture each address shows: the cables of the rig."""
+        """Sets which camera's pictures each address shows, as the cables of a rig do."""
         self._do(lambda: self._views.update(views))
 
     def _do(self, work: Callable[[], Any]) -> None:

@@ -31,7 +31,7 @@ LIGHTS = 4
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """Holds the outputs of one FIRE: channel to delay (s) behind ``time_s`` (time.monotonic)."""
+    """Holds the outputs that one FIRE raises: for each channel how long (s) after ``time_s`` (time.monotonic)."""
 
     time_s: float
     delays_s: dict[int, float]
@@ -39,7 +39,8 @@ class Release:
 
 @dataclass(slots=True)
 class BoxLogic:
-    """State of one box. ``handle`` maps a request to its reply; the hooks see what the outputs do."""
+    """Holds the state of one trigger box. ``handle`` returns the reply to a request; the ``on_`` hooks are called when
+    outputs change."""
 
     on_release: Callable[[Release], None]
     on_lights: Callable[[int], None]
@@ -55,8 +56,8 @@ class BoxLogic:
     _last_reply: str = ""
 
     def handle(self, sequence: int, body: str, now_s: float) -> str:
-        """Returns the reply to a request. The same request under the same sequence number is answered without acting
-        again."""
+        """Returns the reply to a request. A request that comes again under the same sequence number is answered without
+        acting again."""
         if self._last == (sequence, body):
             return self._last_reply
         self.expire(now_s)
@@ -70,7 +71,7 @@ class BoxLogic:
         return reply
 
     def expire(self, now_s: float) -> None:
-        """Disarms a box whose window has passed."""
+        """Disarms the box if its window has passed."""
         if self.armed_until_s is not None and now_s > self.armed_until_s:
             self._disarm()
 
@@ -147,7 +148,8 @@ _COMMANDS: dict[str, Callable[[BoxLogic, list[str], float], str]] = {
 
 
 class SimulatedTriggerBox:
-    """A box on a pty. ``port`` is a link to it that the caller names; it goes when the box closes or is unplugged."""
+    """Runs a simulated trigger box on a pseudo-terminal. ``port`` is the path of a link to it, removed when the box is
+    closed or unplugged."""
 
     def __init__(self, port: Path, logic: BoxLogic) -> None:
         self.port = port
@@ -170,11 +172,11 @@ class SimulatedTriggerBox:
         self.close()
 
     def unplug(self) -> None:
-        """Pulls the cable: the client's next read or write fails, and the port is gone."""
+        """Pulls the box's cable: the client's next read or write fails, and the port is gone."""
         self.close()
 
     def close(self) -> None:
-        """Ends the thread and removes the port. Safe to call twice."""
+        """Ends the box's thread and removes its port. Safe to call twice."""
         if self._stopped:
             return
         self._stopped = True

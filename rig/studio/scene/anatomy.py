@@ -16,7 +16,8 @@ PAINTED = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anatomy:
-    """Head frame, mm. ``unit`` is the size of the head against the one that the lay-outs were drawn on."""
+    """Holds the few places on a head that hair, paint and clothes are laid out from (head frame, mm). ``unit`` is the
+    head's size relative to the one that the layouts were drawn on."""
 
     ears: Float[np.ndarray, " 3"]  # middle between the ears' openings
     half_breadth: float
@@ -26,8 +27,8 @@ class Anatomy:
 
 
 def anatomy(vertices: Float[np.ndarray, "v 3"], landmarks: Landmarks) -> Anatomy:
-    """Lays the anatomy out from landmarks, or from the mesh's extent where they are unknown (a head of 225 mm from chin
-    to crown)."""
+    """Finds the anatomy of a head from its landmarks. Where they are unknown, it is taken from the extent of the mesh,
+    as for a head of 225 mm from chin to crown."""
     if {"tragion_right", "tragion_left", "gnathion", "glabella"} <= set(landmarks):
         right, left = landmarks["tragion_right"], landmarks["tragion_left"]
         chin = float(landmarks["gnathion"][1])

@@ -17,7 +17,8 @@ def backdrop(
     unevenness: float,
     colour: tuple[float, float, float] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Returns linear radiance (float32). ``colour`` replaces the drawn one."""
+    """Draws the backdrop of one camera's picture (linear radiance, float32). ``colour`` replaces the colour that
+    ``rng`` would draw."""
     height, width = intrinsics.height, intrinsics.width
     base = np.array(COLOURS[rng.integers(len(COLOURS))] if colour is None else colour, np.float32)
     image = np.broadcast_to(base, (height, width, 3)).astype(np.float32)
@@ -43,7 +44,7 @@ def _panel(image: Float[np.ndarray, "h w 3"], rng: np.random.Generator, tint: np
 
 
 def chair(width: int, height: int, rng: np.random.Generator) -> Float[np.ndarray, "h w 4"]:
-    """Returns a chair's back at the image's side: linear RGB times alpha, and alpha."""
+    """Draws the back of a chair at one side of the picture: linear RGB times alpha, and alpha."""
     image = np.zeros((height, width, 4), np.float32)
     colour = (*(rng.uniform(0.02, 0.08, 3)).tolist(), 1.0)
     left = int(width * (rng.uniform(0.03, 0.08) if rng.random() < 0.5 else rng.uniform(0.76, 0.8)))

@@ -14,7 +14,7 @@ SUNK_MM = 2.0  # below the skin where no beard grows
 
 
 def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Grows beard and moustache (head frame, mm); thickness, curls and strands as in ``style``.
+    """Grows beard and moustache on a head (head frame, mm). ``style`` sets thickness, curls and strands.
 
     Raises InputError for a head without landmarks.
     """
@@ -35,7 +35,8 @@ def grow_beard(head: Mesh, body: Anatomy, style: HairStyle, rng: np.random.Gener
 
 
 def beard_share(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
-    """Returns how much beard grows at each vertex, 0 to 1: jaw, chin and upper lip, up to the ears, not the lips."""
+    """Returns how densely beard grows at each vertex, 0 to 1: on jaw, chin and upper lip, up to the ears, not on the
+    lips."""
     marks, (x, y, z) = body.landmarks, vertices.T
     mouth, ears = marks["stomion"], body.ears
     across = (x - mouth[0]) / body.half_breadth

@@ -20,7 +20,7 @@ SUPERSAMPLED = 2
 
 
 def chart_picture(patches: Float[np.ndarray, "24 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Returns the chart itself, linear reflectances: four rows of six."""
+    """Draws the colour chart by itself: four rows of six patches, linear reflectances."""
     step = PATCH_PX + GAP_PX
     picture = np.full((4 * step + GAP_PX, 6 * step + GAP_PX, 3), FRAME, np.float32)
     for i, colour in enumerate(patches):
@@ -38,7 +38,8 @@ def chart_plate(
     turned_to: str,
     lamps: Sequence[Lamp] = LAMPS,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns what ``camera`` sees of the empty studio with the chart in it, which faces the camera ``turned_to``."""
+    """Takes a clean plate with ``camera`` of the empty studio with the colour chart in the subject's place. The chart
+    faces the camera ``turned_to``."""
     seen, view = scene.true_rig[camera], scene.views[camera]
     middle = scene.world_from_head.translation
     normal = scene.true_rig[turned_to].centre_world - middle

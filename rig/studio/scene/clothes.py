@@ -27,7 +27,8 @@ BUST_MM = 95.0  # a mesh that reaches this far below the collar brings its own s
 def shirt(
     head: Mesh, body: Anatomy, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "f 3"]] | None:
-    """Returns vertices and outward faces in the head frame; None for a bust."""
+    """Makes a shirt for a head whose mesh ends at the neck: vertices (head frame, mm) and outward faces. Returns None
+    for a bust, which has shoulders."""
     vertices = head.vertices
     collar_y = body.chin_y - 27.0 * body.unit
     if vertices[:, 1].min() < collar_y - BUST_MM or vertices[:, 1].min() > collar_y:

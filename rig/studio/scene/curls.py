@@ -16,7 +16,8 @@ def curled(
     amount: Float[np.ndarray, " v"],
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
-    """Returns the surface with curls on it, and its shade: where a random field is near zero a ridge winds along.
+    """Returns the vertices of a surface of hair raised to curls (mm), and a shade for each. A ridge winds along where a
+    random field is near zero.
 
     Args:
         vertices: Of the smooth surface (mm), a few to each curl.

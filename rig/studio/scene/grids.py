@@ -5,7 +5,8 @@ from jaxtyping import Float, Int
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarray, "f 3"]:
-    """Returns triangles of a grid of vertices, counted row by row; ``closed``: the last column meets the first."""
+    """Returns the triangles of a grid of vertices that are counted row by row. ``closed``: the last column is joined to
+    the first."""
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - (not closed)), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = a + columns, b + columns
@@ -13,7 +14,8 @@ def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarra
 
 
 def finer_grid(field: Float[np.ndarray, "r c *_"], times: int) -> Float[np.ndarray, "_ _ *_"]:
-    """Returns a grid that is closed from its last column to its first, interpolated linearly in both directions."""
+    """Returns a field on a grid ``times`` as fine, interpolated linearly in both directions. The grid is closed from
+    its last column to the first."""
     if times == 1:
         return field
     rows, columns = field.shape[:2]

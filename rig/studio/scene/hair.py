@@ -30,7 +30,8 @@ HAIRLINE_OVER_EARS = np.array([(-200, -55), (-40, -52), (-10, -38), (22, -34), (
 
 @dataclass(frozen=True, slots=True)
 class HairStyle:
-    """Lengths in mm. ``fringe_mm`` brings the hairline down over the forehead; the last three are 0 for none."""
+    """Describes a hair style. ``fringe_mm`` brings the hairline down over the forehead; curls, hanging hair and bun are
+    0 for none."""
 
     thickness_mm: float = 14.0
     over_ears: bool = False
@@ -47,8 +48,11 @@ class HairStyle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hair:
-    """Holds one surface of hair, head frame. ``shade`` is its tone against the style's; ``roots`` names the shell
-    vertex that each strand vertex is lit like; nobody sees the inside of a ``one_sided`` shell."""
+    """Holds one surface of hair, the shell, and the strands on it (head frame, mm).
+
+    ``shade``: tone of each vertex relative to the style's; ``roots``: the vertex of the shell that each vertex of a
+    strand is lit like; ``one_sided``: nobody sees the inside of the shell.
+    """
 
     shell: Float[np.ndarray, "v 3"]
     shell_faces: Int[np.ndarray, "f 3"]
@@ -62,7 +66,7 @@ class Hair:
 
 
 def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Grows hair for a head in the head frame."""
+    """Grows the hair of a head over its scalp. Vertices are in the head frame (mm)."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     elevation, azimuth = np.meshgrid(
         np.radians(np.linspace(90.0, LOWEST_DEG, ROWS)), np.arange(COLUMNS) * 2 * np.pi / COLUMNS, indexing="ij"
@@ -96,7 +100,8 @@ def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rn
 
 
 def outer_radius(points: Float[np.ndarray, "v 3"], *, open_ears: bool) -> Float[np.ndarray, "r c"]:
-    """Returns the head's outermost radius along each direction of the grid, smoothed."""
+    """Returns the outermost radius (mm) of points about the origin in each direction of the grid, smoothed. With
+    ``open_ears`` what is as narrow as an ear is left out."""
     length = np.linalg.norm(points, axis=1)
     elevation = np.degrees(np.arcsin(points[:, 1] / length))
     row = (90.0 - elevation) / (90.0 - LOWEST_DEG) * (ROWS - 1)
@@ -136,7 +141,9 @@ def grow_strands(
     style: HairStyle,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "g 3"], Float[np.ndarray, "s 3"], Int[np.ndarray, " s"]]:
-    """Ribbons that leave the shell, mostly where ``along`` (some 3 mm long) points. They grow by ``weight``."""
+    """Grows strands of hair as ribbons that leave the shell mostly in the directions ``along`` (some 3 mm long).
+    ``weight`` sets how densely they grow at each vertex. Returns their vertices, triangles, texture coordinates and
+    roots, as ``Hair`` holds them."""
     count = style.strands
     weight = weight.copy()
     weight[np.setdiff1d(np.arange(len(shell)), faces)] = 0.0

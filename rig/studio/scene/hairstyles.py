@@ -48,7 +48,8 @@ without panes: the pipeline asks studios for that."""
 
 
 def restyled(look: Look, names: Sequence[str]) -> Look:
-    """Returns the look with the named changes, one after the other: ``curly,beard``. Raises InputError."""
+    """Returns the look with the named changes of ``HAIRSTYLES`` made one after the other. Raises InputError for an
+    unknown name."""
     if unknown := [name for name in names if name not in HAIRSTYLES]:
         raise InputError("hair", [compose("none-of", value=name, known=[*HAIRSTYLES]) for name in unknown])
     for name in names:

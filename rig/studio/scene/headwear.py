@@ -23,7 +23,7 @@ SIDES = 10  # of a tube
 
 
 def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, body: Anatomy) -> Surface:
-    """Returns a cap over a head and its hair, if any (head frame, mm)."""
+    """Makes a cap that fits over a head and its hair, if any (head frame, mm)."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     radius = outer_radius(head - centre, open_ears=True)
     if hair is not None:
@@ -68,7 +68,7 @@ def _visor(rim: Float[np.ndarray, "c 3"], azimuth: Float[np.ndarray, " c"], body
 
 
 def glasses(head: Float[np.ndarray, "v 3"], body: Anatomy) -> AnySurface:
-    """Returns two rims, a bridge and two temples, laid out from landmarks (head frame, mm).
+    """Makes glasses from a head's landmarks: two rims, a bridge and two temples (head frame, mm).
 
     Raises InputError for a head without landmarks.
     """
@@ -134,7 +134,7 @@ def _tube(
 
 
 def joined(surfaces: list[AnySurface]) -> AnySurface:
-    """Returns several surfaces as one."""
+    """Returns several surfaces as one: their vertices and renumbered triangles."""
     starts = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces])
     faces = [faces + start for (_, faces), start in zip(surfaces, starts[:-1], strict=True)]
     return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)

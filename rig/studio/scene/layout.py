@@ -40,24 +40,27 @@ ARRANGEMENTS_DEG = {
 
 
 def default_layout() -> Rig:
-    """Returns eleven cameras on the front hemisphere, 1.2 m away; cam00 looks at the face from the front."""
+    """Returns the default rig: eleven cameras in front of and beside the head, 1.2 m away. cam00 looks at the face from
+    the front."""
     return rig_from_directions(DEFAULT_DIRECTIONS_DEG)
 
 
 def arrangement(name: str) -> Rig:
-    """Returns one of the paper's four arrangements of section 5.3: "a" even, "b" informative, "c" vertical, "d" to the
+    """Returns one of the four rigs of section 5.3 of the paper: "a" even, "b" informative, "c" vertical, "d" to the
     side."""
     return rig_from_directions(ARRANGEMENTS_DEG[name])
 
 
 def row_directions(count: int, spacing_mm: float, distance_mm: float) -> tuple[tuple[float, float], ...]:
-    """Computes directions of a level row of cameras before the face, from the subject's right to its left."""
+    """Computes the directions (azimuth, elevation in degrees) of a level row of cameras before the face, from the
+    subject's right to its left."""
     offsets = spacing_mm * (np.arange(count) - (count - 1) / 2)
     return tuple((float(np.degrees(np.arctan2(offset, distance_mm))), 0.0) for offset in offsets)
 
 
 def circle_directions(count: int, elevations_deg: Sequence[float] = (0.0,)) -> tuple[tuple[float, float], ...]:
-    """Computes directions of a full circle, cam00 at the front; the heights take turns."""
+    """Computes the directions (azimuth, elevation in degrees) of cameras on a full circle, cam00 at the front.
+    Neighbouring cameras take the elevations in turn."""
     azimuths = (np.arange(count) * 360.0 / count + 180.0) % 360.0 - 180.0
     return tuple((float(azimuth), elevations_deg[i % len(elevations_deg)]) for i, azimuth in enumerate(azimuths))
 
@@ -69,7 +72,8 @@ def rig_from_directions(
     distance_mm: float = DISTANCE_MM,
     rolls_deg: Sequence[float] = (0.0,),
 ) -> Rig:
-    """Cameras at (azimuth, elevation) in degrees, each with a lens and a mounting a little of its own.
+    """Returns a rig with a camera in each direction (azimuth and elevation in degrees). Lenses and mountings differ a
+    little from camera to camera.
 
     Args:
         directions_deg: one for each camera.

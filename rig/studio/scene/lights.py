@@ -23,7 +23,8 @@ BIAS_MM = 3.0  # a surface does not shade itself for the coarseness of the map, 
 
 @dataclass(frozen=True, slots=True)
 class Lamp:
-    """Holds a soft box. ``towards``: from the subject, world axes of a rig with y up and z to the front. Linear RGB."""
+    """Holds a soft box. ``towards``: direction from the subject to the lamp (world frame, y up, z to the front);
+    ``colour``: linear RGB."""
 
     towards: tuple[float, float, float]
     colour: tuple[float, float, float]
@@ -44,7 +45,8 @@ def lamp_directions(lamps: Sequence[Lamp] = LAMPS) -> Float[np.ndarray, "l 3"]:
 
 
 def dome(lamps: Sequence[Lamp] = LAMPS) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
-    """Returns directions, spread evenly over the sphere above -45 degrees, and the linear RGB that each sends."""
+    """Returns directions spread evenly over the sphere above -45 degrees, and the linear RGB of the light that comes
+    from each."""
     index = np.arange(DIRECTIONS) + 0.5
     y = 1.0 - index / DIRECTIONS * 1.7
     angle = index * np.pi * (3.0 - np.sqrt(5.0))
@@ -63,8 +65,8 @@ def irradiance(
     casters: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]],
     lamps: Sequence[Lamp] = LAMPS,
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Returns linear RGB at each receiver's (vertices, unit normals), shaded by the ``casters``' triangles; world
-    frame."""
+    """Computes the linear RGB of the light at the vertices of each receiver (vertices and unit normals, world frame),
+    shaded by the triangles of ``casters``."""
     directions, sent = dome(lamps)
     vertices, faces = casters
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2

@@ -23,7 +23,7 @@ BUN_ELEVATION_DEG = 58.0  # over the back of the head
 def hang(
     shell: Hair, below: Float[np.ndarray, "n 3"], body: Anatomy, style: HairStyle, rng: np.random.Generator
 ) -> Hair:
-    """Returns the sheet that carries the shell on downwards, by ``style.hanging_mm`` below the ears' openings.
+    """Makes the sheet of hair that hangs down from the shell to ``style.hanging_mm`` below the openings of the ears.
 
     Args:
         shell: The hair over the scalp.
@@ -96,7 +96,7 @@ def _envelope(points: Float[np.ndarray, "n 3"], unit: float, length_mm: float) -
 
 
 def knot(shell: Hair, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Returns a bun of twisted hair on the crown, ``style.bun_mm`` in radius."""
+    """Makes a bun of twisted hair on the crown, ``style.bun_mm`` in radius."""
     elevation = np.radians(BUN_ELEVATION_DEG)
     outward = np.array([0.0, np.sin(elevation), -np.cos(elevation)])
     arms = shell.shell - body.ears

@@ -14,8 +14,8 @@ def scattered(
     irradiance: Float[np.ndarray, "v 3"],
     scattering_mm: tuple[float, float, float],
 ) -> Float[np.ndarray, "v 3"]:
-    """Computes irradiance after one implicit step of heat flow on the surface, by channel; the light's sum over the
-    surface stays. A channel with 0 mm stays as it is.
+    """Spreads light within the skin, by one implicit step of heat flow on the surface for each channel. The sum of the
+    light over the surface stays the same; a channel with 0 mm is unchanged.
 
     Args:
         vertices: mm.

@@ -38,7 +38,8 @@ THREADS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Holds what one camera looks at: the subject's linear light times coverage, and coverage; the backdrop's light."""
+    """Holds what one camera looks at. ``subject``: linear light times coverage, and coverage; ``backdrop``: the light
+    behind the subject."""
 
     subject: Float[np.ndarray, "h w 4"]
     backdrop: Float[np.ndarray, "h w 3"]
@@ -51,7 +52,8 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Holds a lit studio with a subject in it. ``rig`` is what calibration says, ``true_rig`` where the cameras are."""
+    """Holds a lit studio with a subject in it. ``rig``: the cameras as calibrated; ``true_rig``:
+    where the cameras are."""
 
     rig: Rig
     true_rig: Rig
@@ -71,7 +73,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedCapture:
-    """Holds the pictures, the rig as calibrated, and the scene, which holds the truth."""
+    """Holds a simulated capture, the rig as calibrated, and the scene with the truth."""
 
     capture: Capture
     rig: Rig
@@ -80,7 +82,7 @@ class SimulatedCapture:
 
     @property
     def masks(self) -> dict[str, Bool[np.ndarray, "h w"]]:
-        """Returns the true silhouettes, hair and clothes included: coverage of at least a half."""
+        """Returns the true silhouettes by camera, hair and clothes included: where coverage is at least a half."""
         return {name: view.mask for name, view in self.scene.views.items()}
 
 
@@ -95,7 +97,7 @@ def simulate(
     world_from_head: Similarity | None = None,
     faults: Sequence[Fault] = (),
 ) -> SimulatedCapture:
-    """Returns one capture of ``subject`` by ``rig``. Look and pose are drawn where none is given."""
+    """Takes one capture of ``subject`` with ``rig``. Look and pose are drawn at random where they are None."""
     scene_rng, shot_rng = rng.spawn(2)
     faults = tuple(_settled(fault, rig, shot_rng) for fault in faults)
     scene = build_scene(
@@ -116,8 +118,8 @@ def build_scene(
     faults: Sequence[Fault] = (),
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Scene:
-    """Dresses, lights and draws the subject, and paints the backdrops. The same ``rng`` makes the same skin, hair and
-    set for another pose or other ``lamps``."""
+    """Dresses, lights and renders the subject, and draws the backdrops. The same ``rng`` gives the same skin, hair and
+    backdrops for another pose or other ``lamps``."""
     look_rng, pose_rng, dress_rng, set_rng = rng.spawn(4)
     look = _worn(look or random_look(look_rng), preset, faults)
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
@@ -154,7 +156,7 @@ def build_scene(
 
 
 def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[np.ndarray, "h w 3"]:
-    """Returns the light on one camera's sensor (float32), with the subject or without."""
+    """Returns the light on one camera's sensor (linear, float32), with or without the subject in the picture."""
     light = view.backdrop
     if subject:
         light = view.subject[:, :, :3] + (1 - view.subject[:, :, 3:]) * light
@@ -162,8 +164,8 @@ def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[
 
 
 def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) -> Capture:
-    """Photographs clean plates, then the shot. ``faults`` name their cameras (``simulate`` draws those that do
-    not)."""
+    """Takes the clean plates of a scene, then the shot. ``faults`` must name their cameras (``simulate`` draws a camera
+    for those that do not)."""
     names = scene.rig.names
     click_rng, *rngs = rng.spawn(1 + len(names))
 
@@ -188,8 +190,8 @@ def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) 
 
 
 def click(scene: Scene, rng: np.random.Generator) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
-    """Returns feature points as an operator picks them: in up to four views that see them best, with the preset's
-    noise."""
+    """Returns feature points (px) by landmark and camera as an operator would pick them: in the four views that see a
+    landmark best, with the preset's noise."""
     clicked: dict[str, dict[str, np.ndarray]] = {}
     for landmark, views in scene.landmarks_seen.items():
         for name in list(views)[:CLICKED_VIEWS]:

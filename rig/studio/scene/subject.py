@@ -55,7 +55,7 @@ NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """Holds a head in the head frame (mm). Landmarks may be missing, which leaves the skin without brows and lips."""
+    """Holds a head (head frame, mm). Without landmarks its skin has neither brows nor lips."""
 
     mesh: Mesh
     landmarks: Landmarks = field(default_factory=dict)
@@ -66,7 +66,7 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Colours are linear RGB albedos."""
+    """Holds how a subject looks. Colours are linear RGB albedos."""
 
     skin: Colour
     cloth: Colour
@@ -84,7 +84,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """Holds a part before it is placed and lit, head frame. ``shows``: head, hair or clothes."""
+    """Holds a part of the subject before it is placed and lit (head frame, mm). ``shows``: head, hair or clothes."""
 
     shows: str
     vertices: Float[np.ndarray, "v 3"]
@@ -98,9 +98,12 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dressed:
-    """Holds the lit subject in the world frame: the bare head, and what it wears (hair first, which hides most of the
-    rest). ``solid`` are vertices and faces of all but the strands of hair, for occlusion; ``surfaces`` are the same by
-    what they are: head, hair, clothes."""
+    """Holds the lit subject in the world frame (mm): the bare head and what it wears, hair first because that hides
+    most of the rest.
+
+    ``solid``: vertices and triangles of everything but strands of hair, to compute what hides what; ``surfaces``: the
+    same by name: head, hair, clothes.
+    """
 
     head: Part
     worn: tuple[Part, ...]
@@ -110,7 +113,7 @@ class Dressed:
 
 
 def random_look(rng: np.random.Generator) -> Look:
-    """Draws one of the committed tones each, and one of a few hair styles."""
+    """Draws a skin tone, a hair tone and a cloth tone from the lists of this module, and a hair style."""
     tone = HAIR_TONES[rng.integers(len(HAIR_TONES))]
     over_ears = bool(rng.random() < 0.4)
     hair = HairStyle(
@@ -129,7 +132,7 @@ def random_look(rng: np.random.Generator) -> Look:
 def random_pose(
     centre_world: Float[np.ndarray, " 3"], spread_deg: float, spread_mm: float, rng: np.random.Generator
 ) -> Similarity:
-    """world_from_head of a subject who sits where the cameras look, a little turned and off."""
+    """Draws the pose (world_from_head) of a subject who sits where the cameras look, a little turned and displaced."""
     rotation = rotation_from_vector(np.radians(rng.normal(0, spread_deg, 3)))
     return Similarity(1.0, rotation, centre_world + rng.normal(0, spread_mm, 3))
 
@@ -144,7 +147,7 @@ def dress(
     rng: np.random.Generator,
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Dressed:
-    """Returns hair, clothes, paint and light for a head, in the world frame."""
+    """Gives a head hair, clothes, paint and light. Returns it in the world frame (mm)."""
     hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng = rng.spawn(5)
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
     worn = shirt(head, body, cloth_rng) if clothes else None

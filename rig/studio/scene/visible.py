@@ -24,7 +24,7 @@ HIDDEN_MM = 0.5  # a nearer surface hides a point beyond this: the depth map's o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisiblePoints:
-    """Points of the true surface that two or more cameras see, world frame, mm; ``part`` indexes ``PARTS``."""
+    """Holds points of the true surface that two or more cameras see (world frame, mm). ``part`` indexes ``PARTS``."""
 
     points: Float32[np.ndarray, "n 3"]
     normals: Float32[np.ndarray, "n 3"]  # unit, outwards
@@ -32,7 +32,7 @@ class VisiblePoints:
     views: UInt8[np.ndarray, " n"]  # cameras that see the point
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Returns the arrays of ``visible.npz``; ``area`` is the surface (mm2) that a point stands for."""
+        """Returns the arrays of ``visible.npz``. ``area`` is the area of surface (mm2) that each point stands for."""
         counted = {"points": self.points, "normals": self.normals, "part": self.part, "views": self.views}
         return counted | {"area": np.asarray(AREA_MM2, np.float32)}
 
@@ -40,7 +40,8 @@ class VisiblePoints:
 def visible_points(
     rig: Rig, surfaces: Mapping[str, Mesh], *, renderer: Renderer, rng: np.random.Generator
 ) -> VisiblePoints:
-    """Returns points of surfaces (by part, world frame), evenly over their area, that ``VIEWS_LEAST`` cameras see."""
+    """Draws points evenly over the surfaces (by part, world frame, mm) and returns those that at least ``VIEWS_LEAST``
+    cameras see."""
     drawn = [sample_surface(mesh, AREA_MM2, rng) for mesh in surfaces.values()]
     points, normals = (np.concatenate(arrays) for arrays in zip(*drawn, strict=True))
     codes = np.array([PARTS.index(name) for name in surfaces], np.uint8)
@@ -62,9 +63,10 @@ def part_masks(
     *,
     renderer: Renderer,
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
-    """Returns what every pixel shows, counted as in bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the ``masks``.
+    """Returns what every pixel shows, by camera, in the codes of bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the
+    ``masks``.
 
-    What no surface covers within a mask are strands: hair.
+    Pixels within a mask that no surface covers show strands of hair.
     """
     depth = {name: renderer.depth(rig, mesh.vertices, mesh.faces) for name, mesh in surfaces.items()}
     codes = np.array([1 + PARTS.index(name) for name in surfaces], np.uint8)
@@ -80,7 +82,7 @@ def part_masks(
 def sample_surface(
     mesh: Mesh, area_mm2: float, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Returns one point for each ``area_mm2`` at random places of the surface, and the unit normals of their
+    """Draws one point for each ``area_mm2`` of the surface, at random. Returns the points and the unit normals of their
     triangles."""
     normals = face_normals(mesh.vertices, mesh.faces)
     double = np.linalg.norm(normals, axis=1)
@@ -100,9 +102,10 @@ def sees(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
 ) -> np.ndarray:
-    """Returns which points a camera sees, of a surface that has ``depth`` (camera z, mm, inf where nothing) in it.
+    """Returns which points of a surface a camera sees. ``depth`` is the surface's depth map in the camera (z, mm; inf
+    where there is nothing).
 
-    The map is read at the nearest pixel's centre, where the point's own tangent plane is a little nearer or farther.
+    The map is read at the centre of the nearest pixel and compared with the point's tangent plane there.
     """
     k, pose = camera.intrinsics, camera.camera_from_world
     at = np.rint(np.nan_to_num(camera.project(points), nan=-9.0))

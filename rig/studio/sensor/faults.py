@@ -23,7 +23,8 @@ DEFAULT_AMOUNT = {"dark": 0.02, "lights-off": 0.02, "bumped": 0.6, "exposure": 0
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """``camera`` None: the whole rig where that makes sense, else a camera that the studio draws."""
+    """Holds a fault of ``KINDS``. ``camera`` None: the whole rig or, where only one camera can have the fault, one that
+    the studio draws."""
 
     kind: str
     camera: str | None = None
@@ -39,12 +40,14 @@ class Fault:
 
 
 def fault_from_text(text: str) -> Fault:
-    """``kind[:camera][=amount]``, as the command line takes it: ``exposure=0.2``, ``dark:cam03``. Raises InputError."""
+    """Reads a fault from ``kind[:camera][=amount]`` as on the command line: ``exposure=0.2``, ``dark:cam03``. Raises
+    InputError."""
     return Fault(*fault_parts(text))
 
 
 def fault_parts(text: str) -> tuple[str, str | None, float | None]:
-    """Returns the kind, camera and amount of ``kind[:camera][=amount]``. Raises InputError."""
+    """Splits ``kind[:camera][=amount]`` into kind, camera and amount. Raises InputError for an
+    amount that is no number."""
     head, _, amount = text.partition("=")
     kind, _, camera = head.partition(":")
     try:

@@ -6,14 +6,14 @@ from jaxtyping import Float, UInt8
 
 
 def volume(rng: np.random.Generator, cells: int) -> UInt8[np.ndarray, "n n n 4"]:
-    """Returns independent bytes for a repeated 3D texture."""
+    """Draws independent random bytes for a 3D texture that repeats, ``cells`` a side."""
     return rng.integers(0, 256, (cells, cells, cells, 4), np.uint8)
 
 
 def smooth(
     rng: np.random.Generator, height: int, width: int, cells_high: int, cells_wide: int, channels: int = 1
 ) -> Float[np.ndarray, "h w c"]:
-    """Normal values on a coarse grid, interpolated by cubics (float32)."""
+    """Draws a smooth random field (float32): normal values on a coarse grid of cells, interpolated by cubics."""
     grid = rng.standard_normal((cells_high + 3, cells_wide + 3, channels)).astype(np.float32)
     large = cv2.resize(grid, (width * (cells_wide + 3) // cells_wide, height * (cells_high + 3) // cells_high),
                        interpolation=cv2.INTER_CUBIC)  # fmt: skip
@@ -25,7 +25,8 @@ def smooth(
 def around(
     rng: np.random.Generator, rows: int, columns: int, cells_high: int, cells_wide: int
 ) -> Float[np.ndarray, "h w"]:
-    """Draws noise like ``smooth``, one channel, but closed on itself from the last column to the first (float64)."""
+    """Draws a smooth random field (float64) like ``smooth``, but of one channel and closed from its last column to the
+    first."""
     grid = rng.standard_normal((cells_high + 2, cells_wide)).astype(np.float32)
     grid = np.concatenate([grid[:, -3:], grid, grid[:, :3]], axis=1)
     step = columns / cells_wide
@@ -37,7 +38,8 @@ def around(
 def waves(
     rng: np.random.Generator, points: Float[np.ndarray, "n 3"], shortest_mm: float, longest_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns a random field in space, standard deviation 1: a sum of waves of random directions and lengths."""
+    """Draws a random field in space with standard deviation 1, and returns its values at ``points`` (mm). It is a sum
+    of waves of random direction and of lengths between the two."""
     count = 32
     directions = rng.normal(0, 1, (count, 3))
     lengths = rng.uniform(shortest_mm, longest_mm, (count, 1))

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Shares are of full scale or of the light; lengths in the image are pixels."""
+    """Holds how imperfect the simulated studio is. Shares are of full scale or of the light; lengths in the picture are
+    pixels."""
 
     noise: float = (
         0.015  # sensor noise at mid grey, standard deviation; grows with the light's square root (shot noise)

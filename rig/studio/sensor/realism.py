@@ -29,7 +29,7 @@ cameras write it."""
 
 
 def made_real(preset: Preset, names: Sequence[str]) -> Preset:
-    """Returns the preset with the named changes. Raises InputError."""
+    """Returns the preset with the named changes of ``REALISM``. Raises InputError for an unknown name."""
     if unknown := [name for name in names if name not in REALISM]:
         raise InputError("realism", [compose("none-of", value=name, known=[*REALISM]) for name in unknown])
     for name in names:
@@ -38,5 +38,5 @@ def made_real(preset: Preset, names: Sequence[str]) -> Preset:
 
 
 def realism_names(text: str | None) -> tuple[str, ...]:
-    """Returns the names in ``NAME[,NAME]``; all for ``all``, none for None."""
+    """Returns the names in ``NAME[,NAME]``: all of ``REALISM`` for ``all``, none for None."""
     return tuple(REALISM) if text == "all" else tuple(text.split(",")) if text else ()

@@ -15,7 +15,7 @@ READ_SHARE = 0.1  # of mid grey's noise variance: what is there without light
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Holds one camera's own imperfections, the same in every picture it takes."""
+    """Holds the imperfections of one camera, which are the same in every picture."""
 
     gains: tuple[float, float, float]  # exposure times white balance, per channel
     vignetting: float
@@ -36,8 +36,8 @@ _CURVE = _curve()
 
 
 def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarray, "h w 3"]:
-    """Returns the light on the sensor: blurred by the lens, darker in the corners, times the camera's gains
-    (float32)."""
+    """Returns the light on the sensor (linear, float32): blurred by the lens, darker in the corners, times the camera's
+    gains."""
     light = cv2.GaussianBlur(linear, (0, 0), sensor.defocus_px) if sensor.defocus_px > 0 else linear
     height, width = light.shape[:2]
     y, x = np.ogrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
@@ -46,8 +46,8 @@ def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarra
 
 
 def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
-    """Returns what a rolling shutter makes of a subject that moves by ``shift_px`` from the first row's readout to the
-    last's: each row shows it where it was then, the middle row where it is."""
+    """Returns the subject as a rolling shutter shows it while it moves by ``shift_px`` from the readout of the first
+    row to that of the last. The middle row shows it where it is."""
     height, width = subject.shape[:2]
     across, down = shift_px / (height - 1)
     source = np.array([[1.0, -across, shift_px[0] / 2], [0.0, 1.0 - down, shift_px[1] / 2]])
@@ -56,7 +56,7 @@ def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"
 
 
 def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns one picture of the light on the sensor, with fresh noise."""
+    """Takes one picture (sRGB codes) of the linear light on the sensor, with fresh noise."""
     if sensor.noise > 0:
         # The curve's slope at mid grey is 1.07, so that the noise there is ``noise`` of full scale in the picture.
         variance = (sensor.noise / 1.07) ** 2 * (READ_SHARE + (1 - READ_SHARE) / MID_GREY * np.maximum(light, 0))
@@ -71,8 +71,8 @@ def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Gen
 
 
 def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Returns what a Bayer sensor (red at the first pixel) tells: one channel a pixel, the others interpolated along
-    edges (OpenCV's), float32."""
+    """Returns the light (float32) as a Bayer sensor records it, with red at the first pixel: one channel a pixel, the
+    others interpolated along edges by OpenCV."""
     codes = np.rint(65535.0 * np.clip(light, 0.0, 1.0)).astype(np.uint16)
     bayer = codes[:, :, 1].copy()
     bayer[::2, ::2], bayer[1::2, 1::2] = codes[::2, ::2, 0], codes[1::2, 1::2, 2]
@@ -81,7 +81,7 @@ def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 
 
 
 def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns a picture after JPEG, colour at half of the size."""
+    """Returns a picture compressed as JPEG and decoded again, its colour at half the resolution."""
     flags = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
     data = cv2.imencode(".jpg", np.ascontiguousarray(picture[:, :, ::-1]), flags)[1]
     back = cv2.imdecode(data, cv2.IMREAD_COLOR)
@@ -90,8 +90,8 @@ def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.nd
 
 
 def drift(shape: tuple[int, int], amount: float, rng: np.random.Generator) -> Float[np.ndarray, "h w 1"]:
-    """Returns the gain of the light between clean plate and shot: one factor and a slope over the image, each of this
-    size."""
+    """Draws the gain of the light between clean plate and shot, for a picture of this shape: a common factor and a
+    slope over the picture, both of standard deviation about ``amount``."""
     level, across, down = amount * rng.standard_normal(3)
     y, x = np.ogrid[-1.0 : 1.0 : shape[0] * 1j, -1.0 : 1.0 : shape[1] * 1j]
     return (1.0 + level + 0.5 * (across * x + down * y)).astype(np.float32)[:, :, None]

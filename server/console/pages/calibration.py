@@ -25,7 +25,7 @@ NO_BOARD = compose("studio-without-board")
 
 
 class Shots:
-    """The board shots that are being collected: one collection a service, which all pages show."""
+    """Collects shots of the board for a calibration. There is one collection in a service, which all pages show."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -37,7 +37,7 @@ class Shots:
             self.board, self.taken = board, [*self.taken, (capture, found)]
 
     def check(self, board: Mapping[str, object]) -> None:
-        """Raises Conflict where the shots so far are of another board."""
+        """Raises Conflict where the shots collected so far show another board."""
         with self._lock:
             if self.taken and board != self.board:
                 detail = compose("shots-of-other-board", count=len(self.taken))
@@ -57,7 +57,7 @@ shots = Shots()
 
 
 class RigLine(TypedDict):
-    """``is_measured``: whether a calibration of the rig's own is in use."""
+    """Holds what the page shows of the rig. ``is_measured``: a calibration that this service made is in use."""
 
     kind: str
     calibration: str | None
@@ -82,7 +82,7 @@ class CalibrateForm(TypedDict):
 
 
 class UseForm(Chosen):
-    """``poor``: the operator has read what it lacks."""
+    """Holds the request to use a calibration. ``poor``: the operator has read what it lacks."""
 
     poor: NotRequired[bool]
 
@@ -93,7 +93,7 @@ class CalibrationPage(Page, component="calibration.js"):
 
 
 def known_calibrations(service: Service, age_s: float) -> list[Calibration]:
-    """Newest first; shared by the pages, and at most ``age_s`` old."""
+    """Returns all calibrations, newest first, shared by the pages and at most ``age_s`` seconds old."""
     return shared.get("calibrations", age_s, service.calibrations.find)
 
 
@@ -116,7 +116,7 @@ def calibration_state(service: Service) -> CalibrationState:
 
 
 def calibration_line(found: Calibration) -> Mapping[str, object]:
-    """A calibration, whose ``missing`` and ``warnings`` are messages."""
+    """Returns a calibration as plain values, ``missing`` and ``warnings`` as messages."""
     messages = {"missing": documents_of(found.missing), "warnings": documents_of(found.warnings)}
     return {
         **asdict(replace(found, missing=(), warnings=(), error=None)),
@@ -126,7 +126,7 @@ def calibration_line(found: Calibration) -> Mapping[str, object]:
 
 
 def board_of(event: BoardForm) -> Mapping[str, object]:
-    """The board's document from the form. Raises InputError."""
+    """Returns the board that a form describes, as a document. Raises InputError."""
     form = event.get("board") or {}
     needed = ("kind", "columns", "rows", "square_mm")
     other = ("measured_width_mm", "inverted") + (("marker_ratio", "dictionary") * (form.get("kind") == "charuco"))

@@ -30,7 +30,7 @@ SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are fou
 
 
 class JobOfCapture(TypedDict):
-    """``progress`` (0 to 1) of one that runs."""
+    """Holds a job of a capture. ``progress`` (0 to 1) is None unless the job runs."""
 
     id: str
     state: str
@@ -38,14 +38,15 @@ class JobOfCapture(TypedDict):
 
 
 class SyncLine(TypedDict):
-    """What the rig's certificate says, for people."""
+    """Holds a sentence on how far the pictures of a shot are of one moment."""
 
     message: MessageDocument
     good: bool
 
 
 class CaptureLine(TypedDict):
-    """A capture in the list; ``size`` is that of its first camera's pictures, ``jobs`` all of it, newest first."""
+    """Holds a capture as the list shows it. ``size``: of the first camera's pictures (px); ``jobs``: all its jobs,
+    newest first."""
 
     id: str
     created: str
@@ -69,7 +70,7 @@ class CaptureLine(TypedDict):
 
 
 class SessionLine(TypedDict):
-    """``captures``: how many."""
+    """Holds a session as the list shows it. ``captures``: their number."""
 
     id: str
     created: str
@@ -79,7 +80,7 @@ class SessionLine(TypedDict):
 
 
 class CapturesState(TypedDict):
-    """One page of captures; ``chosen`` is the one that is looked at, which may lie on another page."""
+    """Holds one page of captures. ``chosen``: the capture that is looked at, which may lie on another page."""
 
     captures: list[CaptureLine]
     chosen: CaptureLine | None
@@ -93,7 +94,7 @@ class CapturesState(TypedDict):
 
 
 class EditForm(Chosen):
-    """``tags``: with commas between."""
+    """Holds changes to a capture. ``tags``: separated by commas."""
 
     label: NotRequired[str]
     expression: NotRequired[str]
@@ -111,7 +112,7 @@ class SessionEditForm(Chosen, SessionForm):
 
 
 class BulkForm(WorkForm):
-    """An action on all ``ids``; ``id`` is the session of move, empty for none; ``tags``: with commas between."""
+    """Holds an action on all ``ids``. ``id``: the session to move to, empty for none; ``tags``: separated by commas."""
 
     ids: list[str]
     action: str
@@ -120,7 +121,8 @@ class BulkForm(WorkForm):
 
 class CapturesPage(Page, component="captures.js"):
     def look(self) -> CapturesState:
-        """What is looked at stays, whatever comes in meanwhile: nobody erases another capture than the one they see."""
+        """Returns the state of the page. The capture that is looked at stays whatever arrives meanwhile, so that nobody
+        erases another one than they see."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: CapturesState = shared.get(
             ("captures", *requested.values()), 0.3, lambda: captures_state(self.service, requested)
@@ -131,7 +133,7 @@ class CapturesPage(Page, component="captures.js"):
 
 
 def captures_state(service: Service, requested: Mapping[str, str | None]) -> CapturesState:
-    """A page of the captures that are sought, with the jobs of each."""
+    """Returns one page of the captures that match what is requested, each with its jobs."""
     order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
@@ -155,7 +157,7 @@ def captures_state(service: Service, requested: Mapping[str, str | None]) -> Cap
 
 
 def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCapture]]:
-    """Every job of some captures, newest first, with the progress of those that run."""
+    """Returns the jobs of each capture, newest first, with the progress of those that run."""
     found = service.jobs.of_captures(captures)
     running = [job for jobs in found.values() for job, state in jobs if state == "running"]
     progress = {job.id: job.progress for job in service.jobs.of(running)}
@@ -192,7 +194,7 @@ def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine
 
 
 def sync_line(shot: Mapping[str, object]) -> SyncLine:
-    """How far the pictures of a shot belong to one moment."""
+    """Returns a sentence on how far the pictures of a shot are of one moment."""
     lines = sync_of(shot)
     late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
     if late:
@@ -207,13 +209,14 @@ def sync_line(shot: Mapping[str, object]) -> SyncLine:
 
 
 def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
-    """Status and skew of each camera in a capture's certificate, of a real rig or of the simulated studio."""
+    """Returns status and skew of each camera from the certificate of a shot, of a real rig or of
+    the simulated studio."""
     certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
     return certificate.get("cameras", {})
 
 
 def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLine]:
-    """The newest ones, newest first, and the chosen one where it is older."""
+    """Returns the newest sessions, newest first, and the ``chosen`` one where it is older."""
 
     def make() -> list[Session]:
         return [*service.sessions.page(limit=SESSIONS_SHOWN).items]
@@ -249,7 +252,7 @@ def reconstruct_session(page: Page, event: WorkForm) -> Message:
 
 
 def sample(page: Page, event: object) -> Message:
-    """A capture of the simulated studio, for who has no pictures yet."""
+    """Takes a capture of the simulated studio, for those who have no pictures yet."""
     record = page.service.captures.sample()
     page.choice["capture"] = record.id
     forget_captures()
@@ -298,7 +301,8 @@ def discard(page: Page, event: Chosen) -> None:
 
 
 def bulk(page: Page, event: BulkForm) -> Message | None:
-    """One action on the captures that are ticked; what is refused to some is told with its reasons."""
+    """Does one action to all captures that are ticked. Raises InvalidInput with the reasons where it is refused for
+    some."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")
@@ -332,7 +336,7 @@ def bulk(page: Page, event: BulkForm) -> Message | None:
 
 
 def said_of(action: str, count: int) -> Message:
-    """What was done to so many captures."""
+    """Returns the message of what was done to ``count`` captures."""
     said = {
         "reconstruct": compose("captures-queued", count=count),
         "move": compose("captures-moved", count=count),

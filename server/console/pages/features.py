@@ -46,9 +46,11 @@ class Size(TypedDict):
 
 
 class Picking(Helps):
-    """One capture's points, and what helps to pick them. The first seven ``names`` are those of section 4.2;
-    ``suggested``: places that nobody took yet; ``is_contradictory``: whether contradictions are to be looked at before
-    they are saved."""
+    """Holds the points of one capture and what helps to pick them.
+
+    ``names``: the first seven are those of section 4.2; ``suggested``: suggestions that nobody accepted yet;
+    ``is_contradictory``: contradictions must be confirmed before the points are saved.
+    """
 
     id: str
     cameras: list[Size]
@@ -67,7 +69,7 @@ class FeaturesShown(TypedDict):
 
 
 class Place(TypedDict):
-    """``at``: pixels; None takes the point back."""
+    """Holds where a point is put in one view. ``at``: pixels; None removes the point there."""
 
     point: str
     camera: str
@@ -79,7 +81,7 @@ class Sure(TypedDict):
 
 
 class SuggestedPlaces(TypedDict):
-    """Which suggestions: of one point in one view, of one in all views, or all."""
+    """Selects suggestions: of one point in one view, of one point in all views, or all."""
 
     point: NotRequired[str]
     camera: NotRequired[str]
@@ -87,10 +89,10 @@ class SuggestedPlaces(TypedDict):
 
 @dataclass(slots=True)
 class Picked:
-    """Holds the points of a capture as they stand on the page, and as they were saved.
+    """Holds the points of a capture as they are on the page, and as they were saved.
 
-    ``suggested``: places where a found face has points that are not set there; they are no points before somebody
-    takes them. ``unconfirmed``: the points as they stood when they were to be saved and contradicted each other.
+    ``suggested``: pixels of points that are not set there, from a face that was found; they count only once somebody
+    accepts them. ``unconfirmed``: the points that were to be saved although they contradict each other.
     """
 
     capture: str
@@ -123,7 +125,7 @@ drafts = Drafts()
 
 
 class FeaturesPage(Page, component="features.js"):
-    """The points are the page's own until they are saved."""
+    """Shows the page on which points are picked. They belong to this page until they are saved."""
 
     picked: Picked | None = None
 
@@ -166,14 +168,14 @@ class FeaturesPage(Page, component="features.js"):
         }
 
     def of_capture(self) -> Picked:
-        """What is being picked. Raises Conflict before the page has shown a capture."""
+        """Returns the points that are being picked. Raises Conflict before the page has shown a capture."""
         if self.picked is None:
             raise Conflict("no-capture", compose("no-capture-shown"))
         return self.picked
 
 
 def captures_to_pick(service: Service) -> list[CaptureChoice]:
-    """The newest ones that show a head."""
+    """Returns the newest captures that show a head."""
     found = service.captures.page(CaptureQuery(board=False), CHOICES)
     return [choice_of(record) for record in found.items if record.id not in removals]
 
@@ -189,8 +191,8 @@ def rig_of(service: Service, capture_id: str) -> Rig:
 
 
 class Landmarks:
-    """The landmarks of the default model's mean head (head frame, mm). Loading a model takes a second or more:
-    it is asked for once, in a thread, and the page works without until it is there."""
+    """Holds the landmarks of the default model's mean head (head frame, mm). They are loaded once, in a thread, since
+    that takes a second or more; until then there are none."""
 
     def __init__(self) -> None:
         self._asked = threading.Lock()
@@ -214,7 +216,7 @@ landmarks = Landmarks()
 
 
 def place(page: FeaturesPage, event: Place) -> None:
-    """Sets one point in one view, or takes it back where ``at`` is null."""
+    """Sets one point in one view, or removes it there where ``at`` is None."""
     picked = page.of_capture()
     points = {name: dict(views) for name, views in picked.points.items()}
     views = points.setdefault(event["point"], {})
@@ -228,8 +230,8 @@ def place(page: FeaturesPage, event: Place) -> None:
 
 
 def suggest(page: FeaturesPage, event: object) -> Message:
-    """Suggests all seven points in every view in which the face is seen. Nothing of it is stored, or used, before
-    somebody takes it."""
+    """Suggests all seven points in every view that shows the face. Suggestions are neither stored nor used before
+    somebody accepts them."""
     picked = page.of_capture()
     found = found_faces(page.service, picked.capture)["suggested"]
     if not found:
@@ -239,7 +241,7 @@ def suggest(page: FeaturesPage, event: object) -> Message:
 
 
 def accept(page: FeaturesPage, event: SuggestedPlaces) -> None:
-    """Makes suggestions points, which are saved as any."""
+    """Turns suggestions into points, which are saved like all others."""
     picked = page.of_capture()
     picked.points = take_suggestions(picked.points, picked.suggested, event.get("point"), event.get("camera"))
     picked.suggested = open_suggestions(picked.suggested, picked.points)
@@ -252,7 +254,8 @@ def reject(page: FeaturesPage, event: SuggestedPlaces) -> None:
 
 
 def save(page: FeaturesPage, event: Sure) -> Message | None:
-    """Stores the points. Where views contradict each other the page asks first, once, and ``sure`` is the answer."""
+    """Stores the points. Where views contradict each other, nothing is stored until the event comes
+    again with ``sure``."""
     picked = page.of_capture()
     points = picked.points
     if not event.get("sure") and contradictions(page):

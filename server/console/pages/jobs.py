@@ -35,14 +35,14 @@ LOG_LINES = 200
 
 
 class LogLine(TypedDict):
-    """When a stage or state began, in seconds after the first event."""
+    """Holds when a stage or state began, in seconds after the first event of the job."""
 
     at_s: float
     text: str
 
 
 class CameraLine(TypedDict):
-    """What report.json says of a camera; None where it says nothing."""
+    """Holds what report.json says of a camera; None where it says nothing."""
 
     name: str
     view: bool | None
@@ -55,7 +55,8 @@ class CameraLine(TypedDict):
 
 
 class JobDetail(TypedDict):
-    """Of a job its log, and of a finished one residuals by camera, warnings and whether it has pictures."""
+    """Holds the log of a job and, of a finished one, the cameras' residuals, the warnings and whether there are
+    pictures."""
 
     id: str
     log: list[LogLine]
@@ -68,14 +69,14 @@ class JobDetail(TypedDict):
 
 
 class ShownJob(JobLine):
-    """A job in the list, with the label and time of its capture."""
+    """Holds a job as the list shows it, with the label and time of its capture."""
 
     capture: str
     captured: str | None
 
 
 class JobsState(TypedDict):
-    """Jobs of one page, on the first one those that run and wait before them; ``waiting``: how many more wait."""
+    """Holds one page of jobs; the first page begins with those that run and wait. ``waiting``: how many more wait."""
 
     jobs: list[ShownJob]
     counts: dict[str, int]
@@ -86,14 +87,14 @@ class JobsState(TypedDict):
 
 
 class JobsShown(JobsState):
-    """``job``: the one that is looked at, which may lie on another page."""
+    """Holds what the page shows. ``job``: the job that is looked at, which may lie on another page."""
 
     job: ShownJob | None
     detail: JobDetail | None
 
 
 class SettingsForm(TypedDict, total=False):
-    """``more`` is further settings as JSON."""
+    """Holds the settings of a form. ``more``: further settings as JSON."""
 
     method: str
     detail: str
@@ -112,7 +113,7 @@ class RestartForm(Chosen, SettingsForm):
 
 @dataclass(frozen=True, slots=True)
 class ListedJob:
-    """A job with the label, time and session of its capture."""
+    """Holds a job with the label, time and session of its capture."""
 
     job: Job
     capture: str
@@ -136,7 +137,8 @@ class JobsPage(Page, component="jobs.js"):
 
 
 def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsState:
-    """First what runs, then the queue in its order, then what ended, newest first."""
+    """Returns one page of jobs: first those that run, then the queue in its order, then those that
+    ended, newest first."""
     sought, after = requested["find"] or "", requested["after"]
     order = cast(JobOrder, requested["sort"] if requested["sort"] in get_args(JobOrder) else "-created")
     state = requested["state"] if requested["state"] in STATUSES else None
@@ -157,14 +159,14 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsSta
 
 
 def active_jobs(service: Service, sought: str, *, running: bool = True) -> tuple[list[Job], int]:
-    """What runs and what is taken next, and how many more wait."""
+    """Returns the jobs that run and those that are taken next, and how many more wait."""
     found = service.jobs.page(JobQuery(sought, ACTIVE if running else STATUSES["queued"]), SOUGHT_MOST)
     jobs = sorted(found.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
     return jobs[:SHOWN], found.total - min(SHOWN, len(jobs))
 
 
 def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
-    """Jobs with what is known of their captures."""
+    """Returns the jobs with label, time and session of their captures."""
     found = []
     for job in jobs:
         capture = next(iter(service.captures.of([job.capture_id or ""])), None)
@@ -220,7 +222,7 @@ def camera_line(name: str, camera: CameraReport) -> CameraLine:
 
 
 def log_lines(events: list[JobEvent]) -> list[LogLine]:
-    """One line a stage or state: when it began, in seconds after the first event."""
+    """Returns when each stage or state of a job began, in seconds after the first event."""
     lines: list[LogLine] = []
     for event in events:
         text = event.document.get("stage") or event.document.get("state") or ""
@@ -238,7 +240,7 @@ def restart(page: Page, event: RestartForm) -> Message:
 
 
 def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
-    """Settings from the form: method, detail and front, and further ones as JSON. Raises InputError."""
+    """Returns the settings of a form: method, detail, front, and further ones from JSON. Raises InputError."""
     try:
         settings = json.loads(event.get("more") or "{}")
     except ValueError as error:
@@ -259,7 +261,8 @@ def delete(page: Page, event: Chosen) -> None:
 
 
 def bulk(page: Page, event: BulkForm) -> Message:
-    """One action on the jobs that are ticked; what is refused to some is told with its reasons."""
+    """Does one action to all jobs that are ticked. Raises InvalidInput with the reasons where it is
+    refused for some."""
     service, action = page.service, event["action"]
     if action == "remove":
         ended = [job.id for job in service.jobs.of(event["ids"]) if job.state in FINISHED]

@@ -28,8 +28,8 @@ SUBJECTS_HEADS = 100
 
 
 class ResultLine(TypedDict):
-    """A job with a result; ``capture`` and ``captured`` are its capture's label and time, ``subject`` whose session the
-    capture belongs to."""
+    """Holds a job with a result. ``capture`` and ``captured``: label and time of its capture; ``subject``: name of the
+    subject."""
 
     id: str
     capture: str
@@ -44,7 +44,8 @@ class ResultLine(TypedDict):
 
 
 class Head(ResultLine):
-    """What stands beside the head: measurements, warnings, files and their bytes, whether the truth is known."""
+    """Holds what is shown beside the head: measurements, warnings, the size of each file (bytes), and whether the truth
+    is known."""
 
     measurements: dict[str, Measured]
     quality: dict[str, float | None]
@@ -60,8 +61,8 @@ class Head(ResultLine):
 
 
 class ResultShown(TypedDict):
-    """``results``: the newest heads that are sought, those of the shown one's subject, and the shown one; ``total``
-    counts all that are sought."""
+    """Holds what the page shows. ``results``: the newest heads that match the search, those of the shown head's
+    subject, and the shown head; ``total``: number of heads that match."""
 
     results: list[ResultLine]
     total: int
@@ -101,13 +102,13 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
 
 
 def newest_heads(service: Service, sought: str) -> tuple[list[ResultLine], int]:
-    """The newest finished jobs that are sought, and how many there are."""
+    """Returns the newest finished jobs that match a search, and the number of all that do."""
     page = service.jobs.page(JobQuery(sought, STATUSES["succeeded"]), SHOWN)
     return result_lines(service, [job for job in page.items if job.id not in removals]), page.total
 
 
 def heads_of_subject(service: Service, head: ResultLine) -> list[ResultLine]:
-    """Heads of the same capture, and of all sessions that bear the same name."""
+    """Returns the heads of the same capture and of all sessions with the same name."""
     captures = {head["capture_id"] or ""} | set(service.sessions.captures_of_subject(head["session"]))
     jobs = service.jobs.of_captures(captures)
     done = sorted((job for some in jobs.values() for job, state in some if state == "succeeded"), reverse=True)
@@ -163,7 +164,8 @@ def head_of(service: Service, job: ResultLine) -> Head:
 
 
 def clear_residuals(report: Report) -> list[float]:
-    """Contour residuals (px) of the cameras that see most of the rim: elsewhere they tell of hair and clothes."""
+    """Returns the contour residuals (px) of the cameras that see most of the rim. Those of other cameras are caused by
+    hair and clothes."""
     cameras = [camera for camera in report.get("cameras", {}).values() if camera.get("used")]
     clear = [camera for camera in cameras if (camera.get("excluded_share") or 0.0) < MOSTLY]
     residuals = [camera.get("contour_rms_px") for camera in clear]

@@ -37,7 +37,7 @@ from server.tasks.simulate import SimulatedSync
 
 
 class Tile(TypedDict):
-    """A camera: what its driver says, its line in the last shot's certificate, and whether it has moved."""
+    """Holds one camera: the state of its driver, its line in the last shot's certificate, and whether it has moved."""
 
     name: str
     driver: str
@@ -47,7 +47,7 @@ class Tile(TypedDict):
 
 
 class InUse(TypedDict):
-    """The calibration that every capture gets."""
+    """Holds the calibration that every capture gets."""
 
     label: str
     created: str
@@ -67,7 +67,7 @@ class PlatesLine(TypedDict):
 
 
 class PlatesShown(TypedDict):
-    """The clean plates in use, those before them, and newer ones that were refused."""
+    """Holds the clean plates in use, those before them, and newer ones that were refused."""
 
     taken: str
     before: PlatesLine | None
@@ -88,7 +88,7 @@ class RigShown(TypedDict):
 
 
 class JobStrip(TypedDict):
-    """What the page tells of a job that was started on it."""
+    """Holds what the page shows of a job that was started on it."""
 
     id: str
     state: str
@@ -99,8 +99,8 @@ class JobStrip(TypedDict):
 
 
 class RigPageShown(RigShown):
-    """``shot``: the capture that was taken on this page and waits for the operator's decision; ``job``: the one that
-    was started here last."""
+    """Holds what the page shows. ``shot``: the capture that was taken here and awaits the operator's decision; ``job``:
+    the job that was started here last."""
 
     shot: CaptureLine | None
     job: JobStrip | None
@@ -130,7 +130,7 @@ def job_strip(service: Service, identity: str | None) -> JobStrip | None:
 
 
 def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
-    """The capture to judge; None where there is none, or it was removed meanwhile."""
+    """Returns the capture that awaits the operator's decision. Returns None where there is none, or it was removed."""
     if identity is None or identity in removals:
         return None
     with suppress(NotFound):
@@ -139,7 +139,8 @@ def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
 
 
 def rig_state(service: Service) -> RigShown:
-    """What the tiles say beside the live pictures: the driver's state, the last shot's sync, the calibration."""
+    """Returns what the page shows beside the live pictures: drivers, the last shot's certificate, calibration and clean
+    plates."""
     rig = service.rig.describe()
     last = service.captures.newest()
     sync = {} if last is None or last.shot is None else sync_of(last.shot)
@@ -169,7 +170,8 @@ def rig_state(service: Service) -> RigShown:
 
 
 def plates_shown(kept: list[PlatesVersion]) -> PlatesShown | None:
-    """None where there are none, or the rig takes them with every shot."""
+    """Returns what the page shows of the clean plates. Returns None where there are none, or the rig takes them with
+    every shot."""
     in_use = next((version for version in kept if version.in_use), None)
     if in_use is None:
         return None
@@ -185,7 +187,8 @@ def _plates_line(version: PlatesVersion | None) -> PlatesLine | None:
 
 
 def calibration_in_use(service: Service) -> InUse | None:
-    """Label, time and residual of the calibration that every capture gets; None for the rig's own."""
+    """Returns label, time and residual of the calibration that every capture gets. Returns None where no calibration
+    made by this service is in use."""
     if service.calibrations.in_use() is None:
         return None
     known: list[Calibration] = shared.get("calibrations", 2.0, service.calibrations.find)
@@ -200,7 +203,7 @@ def calibration_in_use(service: Service) -> InUse | None:
 
 
 def moved_cameras(service: Service) -> set[str]:
-    """Cameras that the last result calls moved."""
+    """Returns the cameras that have moved according to the newest result."""
     done = service.jobs.find(state="succeeded", limit=1)
     if not done:
         return set()
@@ -212,7 +215,7 @@ def moved_cameras(service: Service) -> set[str]:
 
 
 def read_report(service: Service, job_id: str) -> Report | None:
-    """report.json of a finished job; None where it has none. Results do not change, so that it is read once."""
+    """Reads report.json of a finished job, once, since results do not change. Returns None where there is none."""
     path = service.store.folder("jobs", job_id) / "result" / "report.json"
 
     def read() -> Report | None:
@@ -236,7 +239,7 @@ def keep(page: Page, event: object) -> None:
 
 
 def retake(page: Page, event: Chosen) -> None:
-    """Lets go of a shot that is not worth keeping; the page then counts down to the next one."""
+    """Discards a shot that is not worth keeping. The page then counts down to the next one."""
     discard(page, event)
     page.choice["shot"] = None
 

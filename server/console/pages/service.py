@@ -44,7 +44,7 @@ class KeyLine(TypedDict):
 
 
 class SettingLine(TypedDict):
-    """A setting of retention: its variable, what it is set to in words, and what it means."""
+    """Holds one setting of retention: its variable, its value in words, and its meaning."""
 
     name: str
     variable: str
@@ -53,8 +53,8 @@ class SettingLine(TypedDict):
 
 
 class ServiceShown(TypedDict):
-    """``keys`` are None for a caller who may not see them; ``open``: whether there are none, so that whoever sits at
-    this machine may do everything."""
+    """Holds what the page shows. ``keys``: None for a caller who may not see them; ``open``: there are no API keys, so
+    that whoever sits at this machine may do everything."""
 
     keys: list[KeyLine] | None
     open: bool
@@ -132,7 +132,8 @@ def _days(days: float | None) -> Message:
 
 
 def add_key(page: ServicePage, event: KeyForm) -> Message:
-    """The first key closes an open service, and so must be able to make others; this page goes on with it."""
+    """Makes an API key. The first one closes an open service and must therefore have the scope admin; the page goes on
+    with it."""
     name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
     faults = []
     if not name or len(name) > NAME_MOST:

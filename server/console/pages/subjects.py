@@ -18,7 +18,7 @@ ASKED = ("find", "tag", "sort", "after")
 
 
 class SubjectsState(TypedDict):
-    """One page of people; ``tags``: all that captures bear, to choose from."""
+    """Holds one page of subjects. ``tags``: the tags of all captures, to choose from."""
 
     subjects: list[Mapping[str, object]]
     tags: list[str]
