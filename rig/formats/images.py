@@ -158,7 +158,7 @@ def cut_out_alpha(path: Path) -> Plane | None:
     if pixels is None or pixels.ndim != 3 or pixels.shape[2] != 4:
         return None
     alpha = np.ascontiguousarray(pixels[..., 3])
-    opaque = alpha > np.iinfo(alpha.dtype).max // 2 if alpha.dtype.kind == "u" else alpha > 0.5
+    opaque = alpha > {"uint8": 127, "uint16": 32767}.get(alpha.dtype.name, 0.5)
     if 1.0 - opaque.mean() < CUT_AWAY_LEAST or subject_convention(opaque) != "white":
         return None
     return alpha
