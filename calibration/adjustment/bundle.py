@@ -38,7 +38,7 @@ STEPS_MOST = 60
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """Which parameters move. The first camera's pose never does: it fixes the world."""
+    """Holds which kinds of parameters move. The pose of the first camera never does, since it fixes the world."""
 
     intrinsics: bool = True
     poses: bool = True
@@ -48,7 +48,7 @@ class Free:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution:
-    """Where the adjustment ended."""
+    """Holds the state in which the adjustment ended, and its normal matrix."""
 
     state: BundleState
     normal: Float[np.ndarray, "p p"]  # of the free parameters, at the solution, residuals in sigmas
@@ -61,7 +61,7 @@ class BundleSolution:
 
     def covariance(self) -> Float[np.ndarray, "q q"]:
         """Returns the covariance of all parameters: cameras (intrinsics, pose) first, then boards, then offsets; zero
-        for what was fixed."""
+        for parameters that were fixed."""
         full = np.zeros((len(self.free), len(self.free)))
         # Scaled to a unit diagonal first: parameters span from 1e-4 (distortion) to 1e3 (mm).
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self.normal), 1e-12))
@@ -78,11 +78,12 @@ class BundleSolution:
 def corner_sigma(
     state: BundleState, seen: Observations, lens_noise: Float[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " c"], float]:
-    """Noise (px) of each camera's corners within the rig, and the part of it that all share.
+    """Estimates the noise (px) of each camera's corners within the rig, and the part of it that all cameras share.
 
     A camera's own noise is known from its lens. What the joint fit leaves beyond it comes from moments that differ or a
-    board that bends: one variance for all cameras, for if each camera had its own, the fit could call one of them bad
-    and follow the others exactly."""
+    board that bends. It is one variance for all cameras: with one for each, the fit could call a camera bad and follow
+    the others exactly.
+    """
     squares = (residuals(state, seen) ** 2).sum(axis=1)
     typical = float(np.median(squares)) / 1.1774**2
     shared = max(0.0, typical - float(np.median(lens_noise[seen.camera[seen.view_of]] ** 2)))
@@ -100,7 +101,7 @@ def solve(
     steps: int = STEPS_MOST,
     tick: Callable[[], None] = lambda: None,
 ) -> BundleSolution:
-    """Minimises the cost from ``state``.
+    """Minimises the cost of the bundle adjustment, starting from ``state``.
 
     Args:
         sigma: noise of a corner's coordinate by camera, px.
@@ -116,7 +117,7 @@ def solve(
 
 
 def bundle_problem(state: BundleState, corners: CornerTerm, prior: LensPrior, free: Free) -> Problem[BundleState]:
-    """Returns the complete problem: corners, lenses, square pixels, and which parameters move."""
+    """Builds the complete problem: corners, lens priors, square pixels, and which parameters move."""
     mask = free_mask(state, free)
     return Problem((corners, prior, AspectTerm()), len(mask), moved_state, mask)
 

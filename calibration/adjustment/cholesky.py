@@ -12,7 +12,7 @@ from calibration.adjustment.cholesky_kernels import factor_lower, solve_lower
 
 
 class NotPositiveDefinite(np.linalg.LinAlgError):
-    """The matrix has no Cholesky factor; the caller raises its damping."""
+    """Reports a matrix without a Cholesky factor; the solver then raises its damping."""
 
 
 def factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -24,10 +24,10 @@ def factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def solve(lower: Float[np.ndarray, "n n"], right: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
-    """``x`` with ``L L^T x = right``."""
+    """Returns x with ``L L^T x = right``, where ``lower`` is L."""
     return solve_lower(lower, np.ascontiguousarray(right, dtype=float).copy())
 
 
 def solve_system(matrix: Float[np.ndarray, "n n"], right: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """``x`` with ``matrix x = right``. Raises NotPositiveDefinite."""
+    """Returns x with ``matrix x = right``. Raises NotPositiveDefinite."""
     return solve(factor(matrix), right[:, None])[:, 0]

@@ -28,7 +28,8 @@ from rig.geometry import cross_matrix
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CornerTerm:
-    """``sigma_px``: noise of a coordinate, by camera."""
+    """Computes the cost of all corners as a function of the state. ``sigma_px``: noise of a corner's coordinate, for
+    each camera."""
 
     seen: Observations
     sigma_px: Float[np.ndarray, " c"]
@@ -41,7 +42,7 @@ class CornerTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedCornerTerm:
-    """All corners at one state."""
+    """Holds the residuals of all corners at one state."""
 
     term: CornerTerm
     state: BundleState
@@ -64,7 +65,8 @@ class LinearisedCornerTerm:
             equations.gradient[at] += product[:-1, -1]
 
     def by_view(self) -> Float[np.ndarray, "n 2 22"]:
-        """Returns derivatives by the parameters of the corner's own view: camera (15), board (6), time offset (1)."""
+        """Returns the derivatives of each corner by the parameters of the view that it belongs to: camera (15), board
+        (6), time offset (1)."""
         state, seen = self.state, self.term.seen
         world, inside, camera = corner_positions(state, seen)
         behind = inside[:, 2] < DEPTH_LEAST_MM
@@ -80,7 +82,7 @@ class LinearisedCornerTerm:
         return rows
 
     def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
-        """Returns derivatives by all parameters, mostly zeros: for tests and other solvers."""
+        """Returns the derivatives of each corner by all parameters, mostly zeros: for tests and other solvers."""
         seen, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
         for view, at in enumerate(places(seen, len(self.state.intrinsics), size)):
@@ -90,7 +92,8 @@ class LinearisedCornerTerm:
 
 
 def places(seen: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
-    """Returns where each view's parameters stand among all: its camera's, its board's, its camera's time offset."""
+    """Returns, for each view, the indices of its parameters: those of its camera, its board, and its camera's time
+    offset."""
     of_camera = seen.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
     board = cameras * PER_CAMERA + seen.shot[:, None] * PER_SHOT + np.arange(PER_SHOT)
     return np.concatenate([of_camera, board, size - cameras + seen.camera[:, None]], axis=1)

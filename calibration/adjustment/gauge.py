@@ -29,13 +29,14 @@ def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 
 
 
 def moved(camera: Camera, step: Float[np.ndarray, " 6"]) -> Camera:
-    """``camera`` under the left perturbation (rotation rad, translation mm): x' = R(w) x + v in the camera frame."""
+    """Returns the camera moved by a left perturbation of its pose (rotation rad, translation mm): x' = R(w) x + v in
+    the camera frame."""
     motion = RigidTransform(rotation_from_vector(step[:3]), step[3:])
     return replace(camera, camera_from_world=motion @ camera.camera_from_world)
 
 
 def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
-    """Returns the derivative of the pixels by a left perturbation of camera_from_world."""
+    """Returns the derivative of the points' pixels by a left perturbation of camera_from_world."""
     _, by_world = camera.project_with_jacobian(points_world)
     by_camera = by_world @ camera.camera_from_world.rotation.T
     points = camera.camera_from_world.apply(points_world)
@@ -43,8 +44,8 @@ def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Flo
 
 
 def image_metric(rig: Rig, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c 6 6"]:
-    """Computes per camera the mean squared image motion (px^2) of ``points_world`` as a quadratic form of the
-    perturbation."""
+    """Computes, for each camera, the mean squared image motion (px^2) of ``points_world`` as a quadratic form of the
+    pose perturbation."""
     metrics = []
     for camera in rig:
         jacobian = pose_jacobian(camera, points_world)
@@ -54,8 +55,8 @@ def image_metric(rig: Rig, points_world: Float[np.ndarray, "n 3"]) -> Float[np.n
 
 
 def world_motions(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p g"]:
-    """Returns the left perturbations of all cameras that a motion of the world (rotation, translation, and scale)
-    amounts to."""
+    """Returns the left perturbations of all cameras (rows) that correspond to a rotation, a translation and, with
+    ``scale``, a scaling of the world (columns)."""
     columns = []
     for camera in rig:
         rotation, translation = camera.camera_from_world.rotation, camera.camera_from_world.translation
@@ -70,7 +71,7 @@ def world_motions(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p g"]:
 
 
 def gauge_projection(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p p"]:
-    """``S`` of the module's docstring."""
+    """Returns the projection S of the module's docstring."""
     weights = _block_diagonal(image_metric(rig, subject_points(rig)))
     motions = world_motions(rig, scale=scale)
     normal = motions.T @ weights @ motions
@@ -85,9 +86,11 @@ def _block_diagonal(blocks: Float[np.ndarray, "c 6 6"]) -> Float[np.ndarray, "p 
 
 
 def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
-    """``rig`` with its world moved (and scaled) so that its cameras see the subject's region as ``reference`` does.
+    """Returns ``rig`` with its world moved (and scaled, if asked) so that its cameras see the subject's region as those
+    of ``reference`` do.
 
-    The motion is found by Gauss-Newton on image distances, from the motion that brings the cameras' frames together."""
+    The motion is found by Gauss-Newton on image distances, from the motion that brings the cameras' frames together.
+    """
     aligned = _brought_together(rig, reference)
     points = subject_points(reference)
     target = np.concatenate([reference[camera.name].project(points) for camera in rig]).ravel()
@@ -105,7 +108,8 @@ def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
 
 
 def _shifted(rig: Rig, step: np.ndarray) -> Rig:
-    """The rig with ``camera_from_world @ motion`` and, with a seventh entry, translations scaled."""
+    """Returns the rig with ``camera_from_world @ motion`` as poses and, if the step has a seventh entry, translations
+    scaled."""
     motion = RigidTransform(rotation_from_vector(step[:3]), step[3:6])
     cameras = []
     for camera in rig:
@@ -117,7 +121,8 @@ def _shifted(rig: Rig, step: np.ndarray) -> Rig:
 
 
 def _brought_together(rig: Rig, reference: Rig) -> Rig:
-    """Mean over the cameras of camera_from_world(rig)^-1 @ camera_from_world(reference), applied to the world."""
+    """Returns the rig with its world moved by the mean motion that takes its cameras' frames to those of
+    ``reference``."""
     moves = [camera.camera_from_world.inverse() @ reference[camera.name].camera_from_world for camera in rig]
     rotation = nearest_rotation(np.sum([move.rotation for move in moves], axis=0))
     here = np.mean([camera.centre_world for camera in rig], axis=0)
@@ -137,7 +142,7 @@ def image_distance(rig: Rig, reference: Rig, *, scale: bool = False) -> Float[np
 
 
 def intrinsics_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 9"]:
-    """Returns the derivative of the pixels by fx fy cx cy k1 k2 p1 p2 k3."""
+    """Returns the derivative of the points' pixels by fx fy cx cy k1 k2 p1 p2 k3."""
     return lens_jacobians(camera.camera_from_world.apply(points_world), camera.intrinsics.values())[1]
 
 

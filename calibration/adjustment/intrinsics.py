@@ -37,7 +37,8 @@ CORNER_SIGMA_LEAST = 0.02  # px: no detector is better, and a perfect fit must n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lens:
-    """Holds one camera's lens by itself. ``covariance`` is that of fx fy cx cy (px) k1 k2 p1 p2 k3."""
+    """Holds one camera's lens, estimated from that camera alone. ``covariance`` is that of fx fy cx cy (px) k1 k2 p1 p2
+    k3."""
 
     camera: str
     intrinsics: Intrinsics
@@ -54,7 +55,7 @@ class Lens:
 
     @property
     def weakness(self) -> Message | None:
-        """Tells why these views do not determine the lens well; None if they do."""
+        """Returns why the views do not determine the lens well; None if they do."""
         if self.views < VIEWS_LEAST:
             return compose("lens-views-too-few", camera=self.camera, views=self.views, needed=VIEWS_LEAST)
         share = self.sigma[0] / self.intrinsics.fx
@@ -64,7 +65,7 @@ class Lens:
 
 
 def estimate_lenses(detections: Detections) -> dict[str, Lens]:
-    """Returns a ``Lens`` per camera that sees the board at all."""
+    """Estimates the lens of every camera that sees the board, from that camera's views alone."""
     found = {camera: [v for v in detections.views if v.camera == camera] for camera in detections.sizes}
     return {
         camera: estimate_lens(views, detections.sizes[camera], detections.board)
@@ -74,7 +75,7 @@ def estimate_lenses(detections: Detections) -> dict[str, Lens]:
 
 
 def estimate_lens(views: Sequence[View], size: tuple[int, int], board: Board) -> Lens:
-    """Returns intrinsics and board poses of one camera (one or more views)."""
+    """Estimates the lens of one camera, and the board's poses, from one or more views."""
     shots = [view.shot for view in views]
     seen = observations(views, [views[0].camera], shots, board)
     state = _start(views, size, board)
@@ -118,7 +119,8 @@ def noise_of(misses: Float[np.ndarray, "n 2"]) -> float:
 
 
 def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> BundleState:
-    """Focal length by a scan, principal point in the middle, no distortion; boards by IPPE."""
+    """Returns a first state: the focal length that fits best of several, the principal point in the middle, no
+    distortion, and board poses by IPPE."""
     width, height = size
     best: tuple[float, Intrinsics, list[RigidTransform]] | None = None
     for share in SCAN:
@@ -135,7 +137,7 @@ def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> Bundle
 
 
 def single_state(intrinsics: Intrinsics, camera_from_boards: Sequence[RigidTransform]) -> BundleState:
-    """Returns the state of one camera at the world's origin."""
+    """Returns the state of a single camera at the world's origin, with the given board poses."""
     return BundleState(
         intrinsics.values()[None],
         np.eye(3)[None],
@@ -148,7 +150,8 @@ def single_state(intrinsics: Intrinsics, camera_from_boards: Sequence[RigidTrans
 
 
 def board_poses_of(found: Found, intrinsics: Intrinsics, board: Board) -> list[tuple[RigidTransform, float]]:
-    """camera_from_board with the RMS in pixels, best first: the two poses between which a plane's image wavers."""
+    """Returns the possible camera_from_board, each with its RMS error (px), best first. The image of a plane fits up to
+    two poses."""
     points = board.corners()[found.ids]
     count, turns, shifts, errors = cv2.solvePnPGeneric(
         points, found.corners, intrinsics.matrix(), intrinsics.distortion.opencv(), flags=cv2.SOLVEPNP_IPPE

@@ -20,13 +20,13 @@ LENS_PRIOR = {"k1": 0.5, "k2": 0.5, "p1": 0.01, "p2": 0.01, "k3": 0.5}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensPrior:
-    """Gaussian knowledge of the intrinsics: mean and information (inverse covariance) per camera."""
+    """Holds Gaussian priors of the intrinsics: mean and information (inverse covariance) for each camera."""
 
     mean: Float[np.ndarray, "c 9"]
     information: Float[np.ndarray, "c 9 9"]
 
     def combine(self, mean: Float[np.ndarray, "c 9"], information: Float[np.ndarray, "c 9 9"]) -> "LensPrior":
-        """Combines two independent pieces of knowledge."""
+        """Returns the product of this prior with an independent second one."""
         total = self.information + information
         pull = np.einsum("cij,cj->ci", self.information, self.mean) + np.einsum("cij,cj->ci", information, mean)
         return LensPrior(np.linalg.solve(total, pull[:, :, None])[:, :, 0], total)
@@ -37,7 +37,7 @@ class LensPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedLensPrior:
-    """``LensPrior`` at a distance from its mean."""
+    """Holds the prior at the distance ``away`` from its mean."""
 
     prior: LensPrior
     away: Float[np.ndarray, "c 9"]
@@ -54,7 +54,7 @@ class LinearisedLensPrior:
 
 
 class AspectTerm:
-    """Pixels are square: ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` by camera."""
+    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` of each camera: pixels are nearly square."""
 
     def at(self, state: BundleState) -> "LinearisedAspectPrior":
         return LinearisedAspectPrior(*state.intrinsics[:, :2].T)
@@ -76,7 +76,7 @@ class LinearisedAspectPrior:
         return float((self.residual**2).sum())
 
     def slopes(self) -> Float[np.ndarray, "c 2"]:
-        """Returns the derivatives by fx and fy of the camera."""
+        """Returns the derivatives of each camera's residual by its fx and fy."""
         return np.stack([4.0 * self.fy, -4.0 * self.fx], axis=1) / ((self.fx + self.fy)[:, None] ** 2 * ASPECT_PRIOR)
 
     def add_to(self, equations: NormalEquations) -> None:
@@ -87,7 +87,7 @@ class LinearisedAspectPrior:
 
 
 def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
-    """Returns what is known of any lens before a board is seen."""
+    """Returns wide priors that hold for any lens, from the image sizes alone."""
     mean, sigma = [], []
     for width, height in sizes:
         long = max(width, height)
@@ -99,5 +99,5 @@ def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
 
 
 def fixed_prior(intrinsics: Float[np.ndarray, "c 9"]) -> LensPrior:
-    """Returns a prior that holds lenses still: ``Free(intrinsics=False)``."""
+    """Returns a prior without information, for lenses that are held fixed by ``Free(intrinsics=False)``."""
     return LensPrior(intrinsics, np.zeros((len(intrinsics), 9, 9)))

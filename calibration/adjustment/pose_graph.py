@@ -32,7 +32,7 @@ SAME_DEG = 15.0  # candidates closer than this are one hypothesis
 
 
 class PoseGraphError(EigenheadError):
-    """The views do not determine how the cameras stand to each other. ``reasons`` names the cameras."""
+    """Reports that the views do not determine how the cameras stand to each other. ``reasons`` names the cameras."""
 
     def __init__(self, reasons: Iterable[Message]) -> None:
         self.reasons = tuple(reasons)
@@ -41,7 +41,8 @@ class PoseGraphError(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Possible camera_from_board of one view: each pose with each turn of the board. ``turns`` index Board.turns()."""
+    """Holds the possible camera_from_board of one view: each pose with each turn of the board. ``turns`` index
+    Board.turns()."""
 
     poses: tuple[RigidTransform, ...]
     turns: tuple[int, ...]
@@ -49,8 +50,8 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """Two cameras with shots in common: the best a_from_b, in how many of them it holds, and whether another holds
-    equally well."""
+    """Holds the relative pose of two cameras with shots in common: the best a_from_b, in how many shots it holds
+    (``support``), and whether another pose holds equally well."""
 
     a: str
     b: str
@@ -66,7 +67,8 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
-    """Cameras in the frame of ``names[0]``, boards placed, turns applied to ``views``; ``strays`` fit nowhere."""
+    """Holds all cameras in the frame of ``names[0]`` and the placed boards; the boards' turns are applied to ``views``,
+    and ``strays`` are views that fit nowhere."""
 
     names: tuple[str, ...]
     shots: tuple[str, ...]
@@ -89,7 +91,8 @@ class Graph:
 
 
 def build_graph(detections: Detections, lenses: dict[str, Lens]) -> Graph:
-    """Raises PoseGraphError where the rig does not hang together."""
+    """Places all cameras and boards in one frame. Raises PoseGraphError if the shared views do not connect the
+    cameras."""
     board = detections.board
     names = tuple(name for name in detections.sizes if name in lenses)
     options = {(v.camera, v.shot): _candidates(v, lenses[v.camera], board) for v in detections.views}

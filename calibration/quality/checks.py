@@ -26,7 +26,8 @@ LOOSE_PX = 2.0  # a camera whose pose is looser than this, seen at the subject, 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """``passed`` is None where there was nothing to check against; ``advice`` says what to do on failure."""
+    """Holds the result of one check. ``passed`` is None if there was nothing to check against; ``advice`` says what to
+    do on failure."""
 
     name: str
     passed: bool | None
@@ -59,7 +60,8 @@ def check_held_out(
     free: Free,
     tick: Callable[[], None] = lambda: None,
 ) -> Check:
-    """Checks that cameras estimated without every fifth shot see those shots' boards as well as the others'."""
+    """Checks that cameras estimated without every fifth shot fit the boards of those shots as well as they fit the
+    others."""
     several = np.flatnonzero(np.bincount(seen.shot, minlength=len(state.board_rotations)) >= 2)
     held = several[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     if len(held) < 2 or len(several) - len(held) < 4:
@@ -78,8 +80,8 @@ def check_held_out(
 
 
 def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
-    """Checks the square size against a second distance on the print, and the print's height against its width as the
-    cameras see it."""
+    """Checks the square size against the measured size of the print, and the print's height over its width as measured
+    by the cameras."""
     pairs = [
         ("width", board.measured_width_mm, board.columns),
         ("height", board.measured_height_mm, board.rows),
@@ -100,7 +102,7 @@ def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
 
 
 def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
-    """Checks that every camera's pose is known to a fraction of a pixel at the subject."""
+    """Checks that the uncertainty of every camera's pose, seen at the subject, is below ``LOOSE_PX`` pixels."""
     loose = [name for name, value in zip(rig.names, pose_sigma_px, strict=True) if not value < LOOSE_PX]
     worst = int(np.argmax(pose_sigma_px))
     detail = compose("poses-determined", px=pose_sigma_px.max(), camera=rig.names[worst])
@@ -109,7 +111,7 @@ def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:
 
 
 def check_against_previous(rig: Rig, previous: Rig | None) -> list[Check]:
-    """Compares names, handedness, scale and lenses with the last calibration, as far as cameras are shared."""
+    """Compares layout, scale and lenses with the previous calibration, for the cameras that both have."""
     names = [name for name in rig.names if previous is not None and name in previous]
     if previous is None or len(names) < 3:
         return [
@@ -152,7 +154,8 @@ def _check_layout(now: Rig, then: Rig) -> Check:
 
 
 def _assignment(now: Rig, then: Rig) -> tuple[list[int], float, float]:
-    """Which earlier camera each camera stands for by its pose, the mean distance (mm) then, and the one by names."""
+    """Returns, for each camera, the earlier camera that lies where it does, the mean distance (mm) of this assignment,
+    and that of the assignment by names."""
     here, there = (np.stack([camera.centre_world for camera in rig]) for rig in (now, then))
     best: tuple[list[int], float] | None = None
     for camera, other in ((c, o) for c in now for o in then):
@@ -169,7 +172,7 @@ def _assignment(now: Rig, then: Rig) -> tuple[list[int], float, float]:
 
 
 def _misfit_mm(here: Float[np.ndarray, "c 3"], there: Float[np.ndarray, "c 3"], mirrored: bool) -> float:
-    """RMS distance (mm) after the best motion, with a reflection if ``mirrored``."""
+    """Returns the RMS distance (mm) after the best rigid motion; with ``mirrored`` after a reflection too."""
     points = here * (-1.0, 1.0, 1.0) if mirrored else here
     return float(np.sqrt(((rigid_fit(points, there).apply(points) - there) ** 2).sum(axis=1).mean()))
 
@@ -195,8 +198,8 @@ def _check_lenses(now: Rig, then: Rig) -> Check:
 def measure_aspect(
     state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
 ) -> tuple[float, float]:
-    """Returns the height of the board's squares over their width as the cameras see it, and its standard deviation:
-    three solutions with the board stretched, and the parabola through their costs."""
+    """Measures the height of the board's squares over their width, and its standard deviation, from the parabola
+    through the costs of three solutions with the board stretched."""
     step = 0.003
     costs = []
     for stretch in (-step, 0.0, step):
@@ -210,5 +213,5 @@ def measure_aspect(
 
 
 def failed(checks: Sequence[Check]) -> list[Check]:
-    """Returns the checks that do not hold; what could not be judged is not among them."""
+    """Returns the checks that failed, without those that could not be judged."""
     return [check for check in checks if check.passed is False]

@@ -24,14 +24,14 @@ MATCH_RATIO = 3.0  # an explanation must bring a view this much closer than it w
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """Holds what was left out, of which camera (None: all of the shot), and why."""
+    """Holds a view that was left out (camera None: the whole shot), and the reason."""
 
     shot: str
     camera: str | None
     reason: Message
 
     def message(self) -> Message:
-        """Returns all of it in one sentence."""
+        """Returns shot, camera and reason as one message."""
         if self.camera is None:
             return compose("dropped-shot", shot=self.shot, reason=self.reason)
         return compose("dropped-view", shot=self.shot, camera=self.camera, reason=self.reason)
@@ -41,7 +41,8 @@ class Dropped:
 
 
 def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
-    """Leaves out views whose edges are wider than corners can be trusted across."""
+    """Returns the detections without views whose edges are too blurred to locate corners, and these views with the
+    reason."""
     kept, dropped = [], []
     for view in detections.views:
         side = square_side_px(view, detections.board)
@@ -55,7 +56,7 @@ def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
 
 
 def square_side_px(view: View, board: Board) -> float:
-    """Returns the typical side of a square in the picture."""
+    """Returns the median side (px) of the board's squares in a view; 0 if no two neighbouring corners are seen."""
     columns = board.grid[0]
     place = dict(zip(view.found.ids.tolist(), view.found.corners, strict=True))
     sides = [
@@ -68,7 +69,8 @@ def square_side_px(view: View, board: Board) -> float:
 
 
 def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detections, list[Dropped]]:
-    """Leaves out views that no pose of a flat board explains with their own camera's lens."""
+    """Returns the detections without views that no pose of a flat board fits with the camera's lens, and these views
+    with the reason."""
     kept, dropped = [], []
     for view in detections.views:
         lens = lenses[view.camera]
@@ -83,15 +85,15 @@ def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detec
 
 
 def view_rms(state: BundleState, seen: Observations) -> Float[np.ndarray, " v"]:
-    """Returns the root mean square reprojection error of each view, px."""
+    """Returns the RMS reprojection error (px) of each view."""
     squares = (residuals(state, seen) ** 2).sum(axis=1)
     counts = np.bincount(seen.view_of, minlength=len(seen.camera))
     return np.sqrt(np.bincount(seen.view_of, squares, minlength=len(seen.camera)) / np.maximum(counts, 1))
 
 
 def bad_views(state: BundleState, seen: Observations) -> np.ndarray:
-    """Marks the views that the joint solution does not explain. A robust solution lets one camera of a shot keep the
-    board and the rest of the shot fail; what is wrong with such a shot is for ``explain_shot`` to say."""
+    """Tells which views the joint solution does not fit. A robust solution may fit one camera of a shot and let the
+    others fail; ``explain_shot`` finds out what is wrong with such a shot."""
     rms = view_rms(state, seen)
     return rms > max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
 
@@ -107,7 +109,7 @@ def explain_shot(
     boards: dict[str, RigidTransform],
     noise_px: float,
 ) -> list[Dropped]:
-    """Decides what to leave out of a shot in which ``bad`` views contradict the rig, and why."""
+    """Decides which views of a shot to leave out, and why, given the ``bad`` views that contradict the rig."""
     cameras = {
         name: Camera(name, intrinsics_of(state.intrinsics[i], detections.sizes[name]), state.camera_pose(i))
         for i, name in enumerate(names)
@@ -127,7 +129,8 @@ def explain_shot(
 def _why(
     view: View, cameras: dict[str, Camera], detections: Detections, boards: dict[str, RigidTransform], noise_px: float
 ) -> Message:
-    """Whether the picture fits under another camera's name, or in another shot."""
+    """Returns the reason why a view contradicts the rig: its picture belongs to another camera or another shot, or
+    neither is found."""
     limit = max(10 * noise_px, 3.0)
     for name, camera in cameras.items():
         alike = name != view.camera and detections.sizes[name] == detections.sizes[view.camera]
@@ -140,7 +143,7 @@ def _why(
 
 
 def miss(view: View, camera: Camera, world_from_board: RigidTransform, board: Board) -> float:
-    """RMS distance in pixels between the corners and where they should be, in the best turn of the board."""
+    """Returns the RMS distance (px) between a view's corners and their projections, for the best turn of the board."""
     values = []
     for turn in board.turns():
         points = world_from_board.apply(board.corners()[turn[view.found.ids]])
@@ -152,8 +155,8 @@ def miss(view: View, camera: Camera, world_from_board: RigidTransform, board: Bo
 def board_scale(
     views: Sequence[View], cameras: dict[str, Camera], board: Board, start: RigidTransform
 ) -> tuple[float, float] | None:
-    """Returns the size of a shot's board, as a multiple of the described one, that its cameras agree on, and the RMS
-    (px) they then have; None where fewer than two see it."""
+    """Estimates the size of a shot's board relative to the described one, and the RMS error (px) at that size. Returns
+    None if too few cameras or corners determine it."""
     if len({view.camera for view in views}) < 2:
         return None
     triples = [(cameras[v.camera], board.corners()[v.found.ids], v.found.corners) for v in views]
@@ -173,7 +176,8 @@ def board_scale(
 def _triangulated(
     triples: Sequence[tuple[Camera, np.ndarray, np.ndarray]], ids: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, Float[np.ndarray, "n 3"]] | None:
-    """Corners that two or more cameras see, as the points nearest to their rays."""
+    """Triangulates the corners that two or more cameras see. Returns their numbers and positions, or None if there are
+    too few."""
     counts = np.bincount(np.concatenate(ids))
     wanted = np.flatnonzero(counts >= 2)
     if len(wanted) < 4:

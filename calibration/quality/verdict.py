@@ -20,7 +20,8 @@ COVERED_GOOD = 0.25  # share of the picture's twelfths that hold a corner: lense
 
 @dataclass(frozen=True, slots=True)
 class CameraEvidence:
-    """``focal_share``: standard deviation of the focal length over it; ``covered``: share of the picture's twelfths."""
+    """Holds how well one camera is calibrated. ``focal_share``: standard deviation of the focal length divided by it;
+    ``covered``: share of the picture's twelfths with corners."""
 
     views: int
     focal_share: float
@@ -30,14 +31,15 @@ class CameraEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``missing``: what would make it better, most urgent first; empty where it is good."""
+    """Holds the verdict on a calibration. ``missing``: what would improve it, most urgent first; empty if it is
+    good."""
 
     word: Word
     missing: tuple[Message, ...]
 
 
 def judge(cameras: Mapping[str, CameraEvidence], checks: Sequence[Check]) -> Verdict:
-    """Judges a calibration by its weakest camera."""
+    """Judges a calibration by its weakest camera, and by whether held-out shots could be checked."""
     severe, mild = [], []
 
     def of(test: str, least: float, most: float) -> list[str]:

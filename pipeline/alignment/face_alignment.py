@@ -28,8 +28,8 @@ FORGIVEN_SIGMAS = 2.5  # a residual of that many deviations has twice its varian
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceAlignment:
-    """Holds the pose and how well it fits. ``rms_sigmas``: of what is left between the mean head's places and the found
-    ones, by what is expected."""
+    """Holds the pose of the mean head on a face and the landmarks it was fitted to. ``rms_sigmas``: RMS distance
+    between the landmarks and the mean head, in expected standard deviations."""
 
     world_from_head: Similarity
     landmarks: LandmarkObservations
@@ -37,7 +37,7 @@ class FaceAlignment:
 
 
 def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> FaceAlignment:
-    """Aligns the mean head of ``model``, which has the modes of the fit, to the face."""
+    """Aligns the mean head to the landmarks of a face. ``model`` must have the modes of the later fit."""
     which = spread_points(places)
     mean, basis = blended_basis(model, places.rows[which], places.weights[which])
     modes = basis.reshape(len(basis), -1).T.astype(float)
@@ -64,7 +64,8 @@ def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> 
 
 
 def spread_points(places: LandmarkMap) -> Int[np.ndarray, " n"]:
-    """Returns ``POINTS`` of the points that do not slide, each as far from those before it as can be."""
+    """Returns the indices of at most ``POINTS`` landmarks that do not slide, spread as evenly as possible over the
+    face."""
     rest = np.flatnonzero(~places.slides)
     deviation = np.sqrt((places.deviation_mm**2).sum(axis=1))
     position = point_table().shape_mm
@@ -77,6 +78,6 @@ def spread_points(places: LandmarkMap) -> Int[np.ndarray, " n"]:
 
 
 def frontmost_camera(facing_world: Float[np.ndarray, " 3"], middle_world: Float[np.ndarray, " 3"], rig: Rig) -> str:
-    """Returns the camera towards which a face looks most."""
+    """Returns the name of the camera that a face looks towards most directly."""
     towards = {camera.name: camera.centre_world - middle_world for camera in rig}
     return max(towards, key=lambda name: float(towards[name] @ facing_world / np.linalg.norm(towards[name])))

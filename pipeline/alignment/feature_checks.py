@@ -14,7 +14,7 @@ NAMES_TOLD = 8
 
 
 def feature_faults(features: Features, rig: Rig) -> list[Message]:
-    """Tells why these points determine no alignment; nothing where they do, or where there are none."""
+    """Returns the reasons why feature points determine no alignment; an empty list if they do, or if there are none."""
     if not features:
         return []
     faults = unknown_landmarks(features)
@@ -36,6 +36,6 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
 
 
 def unknown_landmarks(features: Features) -> list[Message]:
-    """Returns names that no model has."""
+    """Returns a message for each landmark name that no model has, at most ``NAMES_TOLD`` of them."""
     unknown = sorted(set(features) - set(NAMES))[:NAMES_TOLD]
     return [compose("feature-unknown", name=f"{name!r:.80}", known=SEVEN_POINTS) for name in unknown]

@@ -24,14 +24,16 @@ CONTRADICTION = 1e-4  # probability of a misfit this large by chance; one point 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedFeatures:
-    """Holds the world points by landmark name, and a sentence for everything that was left out."""
+    """Holds triangulated feature points (world frame) by landmark name, and a remark for each point or view that was
+    left out."""
 
     points: Mapping[str, TriangulatedPoint]
     remarks: tuple[Message, ...] = ()
 
 
 def locate_features(features: Features, rig: Rig, *, noise_px: float) -> LocatedFeatures:
-    """Triangulates every landmark seen in two views or more. Raises nothing: a point that fails is a remark."""
+    """Triangulates every landmark seen in two views or more. A point that cannot be triangulated is left out with a
+    remark; nothing is raised."""
     points, remarks = {}, []
     for name, pixels in features.items():
         known = {camera: pixel for camera, pixel in pixels.items() if camera in rig}
@@ -53,8 +55,8 @@ def locate_features(features: Features, rig: Rig, *, noise_px: float) -> Located
 
 
 def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Message | None:
-    """What is wrong with most points together: rows and columns exchanged, or another shot's. None where most points
-    agree in their views, or where too few points are there to judge."""
+    """Returns the fault that most points share: rows and columns exchanged, or points of other pictures. None if most
+    points agree between their views, or if there are too few to judge."""
     grossly = GROSS_NOISE * noise_px
     judged = {name: views for name, views in features.items() if len(views) >= MIN_JUDGED_VIEWS}
     wrong = len(judged) - len(locate_features(judged, rig, noise_px=grossly).points)
@@ -70,7 +72,8 @@ def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Mess
 def _consistent(
     pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig, noise_px: float
 ) -> tuple[TriangulatedPoint | None, str | None]:
-    """The point from all views; or from all but one, and that one's name; or nothing."""
+    """Triangulates a point from all views or, if these contradict each other, from all but one, and returns that view's
+    name as well. Returns (None, None) if that fails too."""
     rays = rays_of(pixels, rig)
     point = triangulate(pixels, rig, noise_px=noise_px, rays_world=rays)
     if _agrees(point, noise_px):

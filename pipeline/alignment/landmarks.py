@@ -37,7 +37,7 @@ OUTLIER_SIGMAS = 4.0  # of a point's own expected spread; 1 in 1,000 good points
 
 
 class WrongFeatures(EigenheadError):
-    """Feature points that are wrong as wholes; the sentence says how."""
+    """Reports feature points that are wrong as a whole, with the kind of fault."""
 
     def __init__(self, fault: Message) -> None:
         super().__init__(compose("of-features", fault=fault))
@@ -59,9 +59,10 @@ class TooFewFeatures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureAlignment:
-    """Holds ``world_from_head``, the paper's ``procrustes`` of the same points, and the evidence.
+    """Holds the pose ``world_from_head``, the paper's ``procrustes`` of the same points, and the points used.
 
-    ``residuals_mm``: distance of every point from the mean head's landmark, outliers too; ``used`` says which spoke.
+    ``residuals_mm``: distance of every point from the mean head's landmark, outliers too; ``used``: whether the point
+    counted.
     """
 
     world_from_head: Similarity
@@ -73,12 +74,13 @@ class FeatureAlignment:
 
 
 def align_to_features(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> Similarity:
-    """Returns world_from_head of ``feature_alignment``. Raises TooFewFeatures."""
+    """Returns only the pose world_from_head of ``feature_alignment``. Raises TooFewFeatures or WrongFeatures."""
     return feature_alignment(model, features, rig, settings).world_from_head
 
 
 def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> FeatureAlignment:
-    """Returns alignment to picked points: outliers found, eq. (3) minimised, then weighed. Raises TooFewFeatures."""
+    """Aligns the mean head to picked feature points: rejects outliers, minimises eq. (3), then weighs the points by
+    their covariance. Raises TooFewFeatures or WrongFeatures."""
     whole = features_as_wholes(features, rig, noise_px=settings.feature_noise_px)
     if whole is not None:
         raise WrongFeatures(whole)
@@ -126,7 +128,7 @@ def _sides_exchanged(
     kept: Bool[np.ndarray, " n"],
     settings: AlignmentSettings,
 ) -> bool:
-    """Whether most points belong together only once right and left are exchanged in all of them."""
+    """Tells whether most points agree with the mean head only after right and left are exchanged in all of them."""
     others = [mirrored(name) for name in names]
     if float(kept.mean()) >= MIN_AGREED_SIDES or others == names or not all(name in model.landmarks for name in others):
         return False
@@ -141,7 +143,7 @@ def landmark_statistics(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "p p"]]:
     """Returns the mean head's landmarks (head frame, mm) and their covariance over the population (mm^2, p = 3 n).
 
-    ``noise_mm`` is what a person's idea of a landmark and the model's differ by.
+    ``noise_mm`` is the standard deviation between where a person and the model place the same landmark.
     """
     vertices = np.array([model.landmarks[name] for name in names])
     modes = model.basis("full", len(model.modes), vertices).reshape(len(model.modes), -1).astype(float)
@@ -152,10 +154,11 @@ def landmark_statistics(
 def consensus(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], expected_mm: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"] | None:
-    """Returns which points belong together; None where no triple of them spans a triangle.
+    """Tells which points fit one rigid alignment; returns None if no three of them span a triangle.
 
-    Of the rigid alignments through every triple, the one with the least truncated sum of squared residuals wins; points
-    within OUTLIER_SIGMAS of the alignment of all that agree are kept. 26 points make 2,600 triples: 0.3 s.
+    The rigid alignment through every three points is tried, and the one with the least truncated sum of squared
+    residuals wins. Kept are points within ``OUTLIER_SIGMAS`` of an alignment of all that agree. 26 points make 2,600
+    triples: 0.3 s.
     """
     best, agreed = np.inf, None
     for triple in combinations(range(len(source)), MIN_POINTS):
@@ -183,7 +186,7 @@ def _rigid(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -
 
 
 def flatness(points: Float[np.ndarray, "n 3"]) -> float:
-    """Rms distance (mm) of points from the line that fits them best."""
+    """Returns the RMS distance (mm) of points from the line that fits them best."""
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(np.hypot(singular[1], singular[2]) / np.sqrt(len(points)))
 

@@ -62,8 +62,8 @@ class NoSubject(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class FoundPose:
-    """Holds a pose with its evidence. ``rival``: how much more the best pose that is turned otherwise costs, as a
-    share; None where there is none."""
+    """Holds the pose that the search found. ``rival``: how much more the best pose turned another way costs, as a share
+    of its cost; None if there is no such pose."""
 
     world_from_head: Similarity
     rival: float | None
@@ -79,10 +79,8 @@ def search_alignment(
     stated: bool = False,
     report: Progress,
 ) -> FoundPose:
-    """Finds the pose of the mean head from the silhouettes alone. ``stated``: somebody said which camera is the front.
-
-    Raises NoSubject.
-    """
+    """Finds the pose of the mean head from the silhouettes alone. ``stated``: the user named the ``front`` camera.
+    Raises NoSubject."""
     starts = list(start_poses(model, silhouettes, rig, front, stated=stated))
     problem = make_problem(model, starts[0], silhouettes, rig, settings.fitting, {}, levels=("p99", "p95"))
     found = []
@@ -107,8 +105,8 @@ def search_alignment(
 def moved_to_hull(
     pose: Similarity, camera: Camera, model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> Similarity:
-    """Returns a pose whose distance from a camera is not known, moved along its line of sight into the visual hull, and
-    scaled so that the camera sees the same. Raises NoSubject."""
+    """Returns the pose moved along the camera's line of sight into the visual hull, and scaled so that it looks the
+    same from the camera. Meant for a pose of unknown distance. Raises NoSubject."""
     origin = head_origin(model, silhouettes, rig, pose.rotation)
     along = pose.translation - camera.centre_world
     share = float((origin - camera.centre_world) @ along / (along @ along))
@@ -118,8 +116,8 @@ def moved_to_hull(
 def start_poses(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, front: str, *, stated: bool
 ) -> Iterator[Similarity]:
-    """Yields where the descents begin: upright as the body stands or turned by quarters, looking to the front or,
-    where no front can be guessed, all around."""
+    """Yields the poses from which the search starts: upright or, if that is unknown, turned by quarters, and facing the
+    front camera or, if no front is known, all directions around."""
     forward = rig[front].centre_world - rig.centre_world()
     up = body_up(silhouettes, rig)
     pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
@@ -142,8 +140,8 @@ def upright_axes(up_world: Float[np.ndarray, " 3"], forward_world: Float[np.ndar
 
 
 def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray, " 3"] | None:
-    """Returns the world's direction away from where the body leaves the pictures; None where it leaves none, or views
-    disagree."""
+    """Returns the direction (world) opposite to where the body leaves the pictures; None if it leaves none of them, or
+    the views disagree."""
     total, weight = np.zeros(3), 0.0
     for camera in rig:
         silhouette = silhouettes.get(camera.name)
@@ -161,19 +159,20 @@ def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray
 
 
 def fan_strength(rig: Rig) -> float:
-    """Returns 1 where all cameras stand on one side, 0 where they stand evenly around."""
+    """Returns how one-sided the cameras stand: 1 if all are on one side of the subject, 0 if evenly around."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     return float(np.linalg.norm((directions / np.linalg.norm(directions, axis=1, keepdims=True)).mean(axis=0)))
 
 
 def turn_between_deg(one: Similarity, other: Similarity) -> float:
-    """Returns the angle by which two poses are turned against each other."""
+    """Returns the angle (degrees) of the rotation between two poses."""
     cosine = (np.trace(one.rotation.T @ other.rotation) - 1.0) / 2.0
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def _differently_turned(states: Sequence[State]) -> list[State]:
-    """The best states of ``MANY_FINALISTS`` different poses, best first."""
+    """Returns at most ``MANY_FINALISTS`` states, best first, that all differ in rotation by more than
+    ``SAME_POSE_DEG``."""
     chosen: list[State] = []
     for state in states:
         if all(turn_between_deg(state.world_from_head, other.world_from_head) > SAME_POSE_DEG for other in chosen):
@@ -186,8 +185,8 @@ def _differently_turned(states: Sequence[State]) -> list[State]:
 def head_origin(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, axes: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, " 3"]:
-    """Returns where the origin of the mean head is, so that its crown and the middle of its head meet the visual
-    hull's."""
+    """Returns the position (world, mm) of the mean head's origin at which its crown and the middle of its head match
+    those of the visual hull. Raises NoSubject."""
     line = np.arange(-REACH_MM, REACH_MM + 1, SPACING_MM)
     grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)  # along the head's axes
     points = rig.centre_world() + grid @ axes.T
@@ -219,7 +218,7 @@ def head_origin(
 
 
 def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
-    """Returns the head turned about its own origin, first nodding and then about the upright axis."""
+    """Returns the pose after turns in the head's own frame: the yaw about its upright axis, and the pitch (nodding)."""
     turn = rotation_from_vector(np.radians([0.0, yaw_deg, 0.0])) @ rotation_from_vector(
         np.radians([pitch_deg, 0.0, 0.0])
     )

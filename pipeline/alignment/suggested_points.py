@@ -35,7 +35,8 @@ Pixels = Float[np.ndarray, " 2"]
 def suggest_points(
     face: MatchedFaces, rig: Rig, model: HeadModel, places: LandmarkMap, names: Iterable[str]
 ) -> dict[str, dict[str, Pixels]]:
-    """Returns pixels by landmark and camera; landmarks that the model lacks, or that no view shows, are left out."""
+    """Suggests pixels for named landmarks in each camera, from a face in the photographs. Landmarks that the model
+    lacks or that no view shows are left out."""
     marks = model.levels["full"].landmarks
     rows = {name: marks[name] for name in names if name in marks}
     positions, world_from_head = locate_landmarks(face, model, places, list(rows.values()))
@@ -53,7 +54,8 @@ def suggest_points(
 def locate_landmarks(
     face: MatchedFaces, model: HeadModel, places: LandmarkMap, rows: list[int]
 ) -> tuple[Float[np.ndarray, "n 3"], Similarity]:
-    """Returns where vertices of the mean head come to lie on a face (world), and world_from_head of the mean head."""
+    """Returns the positions (world) of the mean head's vertices ``rows`` after it is bent to a face, and the pose
+    world_from_head of the mean head."""
     firm = ~places.slides
     mean = model.vertices(np.zeros(0))
     sources = places.points(mean)[firm]
@@ -66,7 +68,7 @@ def locate_landmarks(
 def _are_seen(
     camera: Camera, head_world: Float[np.ndarray, "v 3"], model: HeadModel, rows: list[int]
 ) -> Bool[np.ndarray, " n"]:
-    """Whether the mean head, as it lies, hides none of its vertices ``rows`` from a camera."""
+    """Tells which of the vertices ``rows`` the camera sees, not hidden by the mean head itself."""
     longest = max(camera.intrinsics.width, camera.intrinsics.height)
     small = replace(camera, intrinsics=camera.intrinsics.scaled(min(1.0, RASTER_PX / longest)))
     surface, _ = depth_map(small, head_world, model.levels["full"].faces)
@@ -79,6 +81,6 @@ def _are_seen(
 
 
 def _are_inside(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Whether a camera's picture holds them; NaN is outside."""
+    """Tells which pixels lie inside the camera's picture; NaN lies outside."""
     size = (camera.intrinsics.width, camera.intrinsics.height)
     return np.asarray(((pixels > -0.5) & (pixels < np.array(size) - 0.5)).all(axis=1))

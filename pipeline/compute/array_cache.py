@@ -41,7 +41,7 @@ def cached_arrays(
     *,
     made_by: Iterable[Callable[..., Any]],
 ) -> dict[str, np.ndarray]:
-    """Returns what ``make()`` returns, or what it returned to an earlier process.
+    """Returns the arrays that ``make()`` computes, from a cache file if an earlier process stored them.
 
     Args:
         name: what the arrays are, for the file's name.
@@ -85,12 +85,12 @@ def _digest(inputs: Sequence[Any], made_by: Iterable[Callable[..., Any]]) -> str
 
 @cache
 def _source(module: str) -> bytes:
-    """The digest of a loaded module's file."""
+    """Returns the SHA-256 digest of a loaded module's source file."""
     return hashlib.sha256(Path(str(sys.modules[module].__file__)).read_bytes()).digest()
 
 
 def _packed(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Checksum, length of the header, header, arrays."""
+    """Returns the bytes of a cache file: checksum, length of the header, header, arrays."""
     entries, place = [], 0
     for key, array in arrays.items():
         entries.append((key, array.dtype.str, array.shape, place))
@@ -107,7 +107,7 @@ def _packed(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
-    """The arrays in a file, mapped; None where there is none, or a damaged one."""
+    """Returns the arrays of a cache file, mapped into memory; None if it is missing or damaged."""
     try:
         with path.open("rb") as stream:
             data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)

@@ -50,7 +50,8 @@ log = logging.getLogger("eigenhead")
 
 
 def _choose_processor() -> None:
-    """Before anything is compiled; NUMBA_CPU_NAME goes before, and another processor compiles for itself."""
+    """Sets the portable processor that loops are compiled for, before anything is compiled. Does nothing if
+    NUMBA_CPU_NAME is set or this processor lacks a feature."""
     options: Any = config
     try:
         host: dict[str, bool] = dict(llvmlite.binding.get_host_cpu_features())
@@ -87,7 +88,7 @@ def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Calla
 
 
 class KeptFunction:
-    """Holds what Numba asks for a function that it is to compile, and tells of one that it did."""
+    """Stores and finds the compiled forms of one function on disk, as the cache that Numba asks."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
@@ -98,7 +99,7 @@ class KeptFunction:
         return str(cache_folder() / "kernels")
 
     def file(self, signature: Any) -> Path:
-        """Returns where the function compiled for these argument types is or would be."""
+        """Returns the path of the file for the function compiled for these argument types, whether it exists or not."""
         if not self._digest:  # late: a function may call one that its module defines further down
             self._digest = function_digest(self._dispatcher)
         key = f"{self._digest} {signature!r} {machine()}"
@@ -107,7 +108,7 @@ class KeptFunction:
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(key.encode()).hexdigest()}"
 
     def is_kept(self, signature: Any) -> bool:
-        """Tells whether there is a file for these argument types."""
+        """Tells whether a file for these argument types exists."""
         file = self.file(signature)
         try:
             return (CARRIED / file.name).is_file() or file.is_file()
@@ -115,7 +116,7 @@ class KeptFunction:
             return False
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Returns the compiled function, or None where none is kept, or a damaged one."""
+        """Returns the compiled function from its file, or None if there is none or it is damaged."""
         target_context.refresh()
         file = self.file(signature)
         for path in (CARRIED / file.name, file):
@@ -128,7 +129,7 @@ class KeptFunction:
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Keeps a compiled function; where that is not possible it says so, once, and goes on."""
+        """Writes a compiled function to its file. If that fails, logs it once for each process and goes on."""
         if any(not lifted.can_cache for lifted in result.lifted) or result.library.has_dynamic_globals:
             return
         data = serialize.dumps(result._reduce())
@@ -138,7 +139,8 @@ class KeptFunction:
             say_not_kept(error)
 
     def flush(self) -> None:
-        """Does nothing: a file that the code no longer leads to is not found."""
+        """Does nothing; Numba requires it. Files of older code are never found, since their names contain a digest of
+        the code."""
 
 
 @cache
@@ -147,7 +149,7 @@ def _warned() -> set[str]:
 
 
 def say_not_kept(error: OSError) -> None:
-    """Writes one line a process where the cache folder cannot be written."""
+    """Logs, once for each process, that the cache folder cannot be written."""
     folder = str(cache_folder())
     if folder not in _warned():
         _warned().add(folder)
@@ -161,7 +163,8 @@ def say_not_kept(error: OSError) -> None:
 
 @cache
 def machine() -> str:
-    """Returns what a compiled function follows from besides its source: versions and the processor's features."""
+    """Returns what a compiled function depends on besides its source: versions, options and the processor's
+    features."""
     options: Any = config
     target: Any = cpu_target.target_context
     versions = (numba.__version__, llvmlite.__version__, sys.implementation.cache_tag)
@@ -169,7 +172,7 @@ def machine() -> str:
 
 
 def function_digest(dispatcher: Dispatcher) -> str:
-    """Returns the SHA-256 of all that the compiled function follows from in the sources."""
+    """Returns the SHA-256 digest of all sources that the compiled function depends on."""
     digest = hashlib.sha256()
     for part in _function_parts(dispatcher, set()):
         digest.update(part)
@@ -178,7 +181,8 @@ def function_digest(dispatcher: Dispatcher) -> str:
 
 
 def code_size(dispatcher: Dispatcher) -> int:
-    """Bytes of all that the compiled function follows from: twice as many take about twice as long."""
+    """Returns the size (bytes) of all code that the compiled function depends on; compiling takes about proportionally
+    long."""
     return sum(map(len, _function_parts(dispatcher, set())))
 
 
@@ -217,7 +221,8 @@ def _code_parts(code: CodeType) -> Iterator[bytes]:
 
 
 def _value_parts(value: Any, names: list[str], seen: set[int]) -> Iterator[bytes]:
-    """What a compiled function takes over from a global name: a value, or another function."""
+    """Yields what a compiled function takes over from a global name: the bytes of a value, or the parts of another
+    function."""
     if isinstance(value, Dispatcher):
         yield from _function_parts(value, seen)
     elif isinstance(value, ModuleType):

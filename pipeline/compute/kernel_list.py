@@ -44,7 +44,7 @@ class Kernel:
 
     @property
     def line(self) -> str:
-        """Returns it as the list has it."""
+        """Returns the kernel as a line of the list."""
         return " ".join((self.place, *self.arguments))
 
     @property
@@ -52,7 +52,7 @@ class Kernel:
         return self.place.partition(":")[0]
 
     def dispatcher(self) -> Dispatcher | None:
-        """Returns the function, or None where loops are not compiled (NUMBA_DISABLE_JIT)."""
+        """Returns the compiled function's dispatcher, or None if loops are not compiled (NUMBA_DISABLE_JIT)."""
         module, _, name = self.place.partition(":")
         function = getattr(importlib.import_module(f"{PACKAGE}.{module}"), name)
         return function if isinstance(function, Dispatcher) else None
@@ -61,32 +61,33 @@ class Kernel:
         return tuple(type_from_text(text) for text in self.arguments)
 
     def is_kept(self) -> bool:
-        """Tells whether the wheel brought it, or an earlier process left it in the cache folder."""
+        """Tells whether the compiled loop is in the wheel or in the cache folder; True if loops are not compiled."""
         dispatcher = self.dispatcher()
         kept = None if dispatcher is None else getattr(dispatcher, "_cache", None)
         return not isinstance(kept, KeptFunction) or kept.is_kept(self.signature())
 
     def size(self) -> int:
-        """Returns the size of the code that is compiled, the loops that it calls included, in bytes of the
-        interpreter's: what takes longest is begun first."""
+        """Returns the size (bytes of the interpreter's code) of the loop and all that it calls, so that the longest is
+        compiled first."""
         dispatcher = self.dispatcher()
         return 0 if dispatcher is None else code_size(dispatcher)
 
     def compile(self) -> None:
-        """Compiles it, or finds it, in this process; what was compiled is kept."""
+        """Compiles the loop for its argument types, or loads it from the cache."""
         dispatcher = self.dispatcher()
         if dispatcher is not None:
             dispatcher.compile(self.signature())
 
 
 def listed_kernels(*, dense: bool = True) -> list[Kernel]:
-    """Returns all of the list, or without those that only the dense stage calls."""
+    """Returns all kernels of the list; without ``dense``, not those that only the dense stage calls."""
     plain, _, added = LIST.read_text(encoding="utf-8").partition("\n\n")
     return [Kernel.from_line(line) for line in (*plain.splitlines(), *(added.splitlines() if dense else ()))]
 
 
 def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:
-    """Kernels of one module together: they call the same inner loops, which two processes would both compile."""
+    """Yields the kernels of each module together: they call the same inner loops, which two processes would both
+    compile."""
     groups: dict[str, list[Kernel]] = {}
     for kernel in kernels:
         groups.setdefault(kernel.module, []).append(kernel)
@@ -94,7 +95,7 @@ def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:
 
 
 def type_from_text(text: str) -> types.Type:
-    """Raises ValueError for what is no type of the list's notation."""
+    """Returns the Numba type for its notation in the list. Raises ValueError for anything else."""
     if array := _ARRAY.fullmatch(text):
         dtype, dimensions, layout, readonly = array.groups()
         return types.Array(_scalar(dtype), int(dimensions), layout, readonly=bool(readonly))
@@ -111,7 +112,7 @@ def type_from_text(text: str) -> types.Type:
 
 
 def _members(text: str) -> Iterator[str]:
-    """The parts between semicolons that no inner braces hold."""
+    """Yields the parts of the text between semicolons that are not inside braces."""
     depth = start = 0
     for at, sign in enumerate(text):
         depth += (sign == "{") - (sign == "}")
@@ -122,7 +123,7 @@ def _members(text: str) -> Iterator[str]:
 
 
 def text_from_type(kind: Any) -> str:
-    """Returns the list's notation. Raises ValueError where it has none."""
+    """Returns the list's notation of a Numba type. Raises ValueError if it has none."""
     if isinstance(kind, types.Array):
         text = f"{kind.dtype}[{kind.ndim}{kind.layout}]" + "r" * (not kind.mutable)
     elif isinstance(kind, types.NamedTuple | types.NamedUniTuple):

@@ -24,7 +24,7 @@ TRACED_THREADS = 16  # for how many threads a trace of one cuts its loops
 
 
 def thread_count() -> int:
-    """Tells how many threads share a loop: EIGENHEAD_THREADS, else the CPUs that this process may use. Raises
+    """Returns how many threads share a loop: EIGENHEAD_THREADS, or else the CPUs that this process may use. Raises
     WrongVariable."""
     requested = os.environ.get(THREADS, "").strip()
     if not requested:
@@ -35,16 +35,17 @@ def thread_count() -> int:
 
 
 def slice_count(threads: int) -> int:
-    """Returns into how many slices a loop falls, at most: a power of two, so that more threads cut the same slices
-    finer."""
+    """Returns the number of slices that a loop is cut into, at most: a power of two, so that more threads only
+    subdivide the same slices."""
     return max(SLICES, 1 << (2 * threads - 1).bit_length())
 
 
 def in_threads(count: int, work: Callable[[int, int], None]) -> None:
-    """Runs ``work(first, last)`` over slices of ``range(count)``; for compiled loops that let go of the interpreter.
+    """Runs ``work(first, last)`` over slices of ``range(count)`` in several threads; for compiled loops that release
+    the interpreter.
 
-    What comes out may not depend on how the range is cut. The caller takes slices like everyone else. A helper that has
-    not begun when they are gone (all busy, or left behind by a fork) is called off, so that nobody waits for it.
+    The result may not depend on how the range is cut. The calling thread takes slices too. A helper thread that has not
+    begun when no slices are left is cancelled, so that nobody waits for it.
     """
     threads, trace = thread_count(), active_trace()
     if trace is not None:
@@ -56,7 +57,7 @@ def in_threads(count: int, work: Callable[[int, int], None]) -> None:
 
 
 def map_in_threads(work: Callable[[int], Result], count: int) -> list[Result]:
-    """Returns ``work(k)`` of every k below ``count``, in order; shared out as by ``in_threads``, one at a time."""
+    """Returns ``work(k)`` for every k below ``count``, in order, computed in several threads."""
     found: dict[int, Result] = {}
 
     def take(first: int, last: int) -> None:
@@ -72,7 +73,7 @@ def map_in_threads(work: Callable[[int], Result], count: int) -> list[Result]:
 
 
 def cut(count: int, parts: int) -> list[tuple[int, int]]:
-    """Returns ``range(count)`` cut into so many slices, or into ones of one; one empty slice of an empty range."""
+    """Returns ``range(count)`` cut into at most ``parts`` slices, none empty unless the range is."""
     parts = max(1, min(parts, count))
     return list(pairwise(count * k // parts for k in range(parts + 1)))
 
@@ -103,8 +104,8 @@ def _share(slices: list[tuple[int, int]], work: Callable[[int, int], None], thre
 def _traced(
     trace: Trace, count: int, work: Callable[[int, int], None], name: str, threads: int, *, single: bool = False
 ) -> None:
-    """Runs a loop with spans of it and its slices; one thread cuts it as finely as many would, so that the trace tells
-    what they would have."""
+    """Runs a loop and records spans of it and of its slices. One thread cuts the loop as finely as several would, so
+    that the trace shows how it could be shared."""
     loop = trace.new_loop()
     parts = count if single else slice_count(threads if threads > 1 else TRACED_THREADS)
 
@@ -118,8 +119,8 @@ def _traced(
 
 @contextmanager
 def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
-    """Holds a pool of threads for the block, as many as share a loop unless it is said how many; its tasks are single
-    slices of a loop in the trace."""
+    """Yields a pool of ``threads`` threads, by default as many as share a loop; a trace records its tasks as slices of
+    one loop."""
     threads, trace = threads or thread_count(), active_trace()
     if trace is None:
         with ThreadPoolExecutor(threads) as pool:
@@ -138,7 +139,7 @@ class TracedPool(ThreadPoolExecutor):
         self._trace, self._loop = trace, loop
 
     def submit(self, function: Callable[..., Result], /, *arguments: Any, **options: Any) -> Future[Result]:
-        """Hands a task over, in its span."""
+        """Submits a task that is recorded in a span."""
 
         def timed() -> Result:
             with self._trace.span("slice", name_of(function), loop=self._loop):

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 class Trace:
-    """Collects spans of all threads of this process, from when it is made."""
+    """Collects the spans of all threads of this process, from its creation on."""
 
     def __init__(self) -> None:
         self._began = time.perf_counter_ns()
@@ -59,8 +59,8 @@ class Trace:
         self._events.append(event | times | {"args": arguments})
 
     def encoded(self, *, threads: int) -> bytes:
-        """Returns the trace as JSON for Chrome's viewer, an event a line: the threads' names and complete events by
-        start. ``threads`` is how many shared a loop."""
+        """Returns the trace as JSON for Chrome's viewer, one event per line: the threads' names, then the spans by
+        start. ``threads`` is how many threads shared a loop."""
         header = {
             "format": FORMAT,
             "displayTimeUnit": "ms",
@@ -81,13 +81,14 @@ _active: Trace | None = None
 
 
 def active_trace() -> Trace | None:
-    """Returns the trace that is recorded into, on any thread."""
+    """Returns the trace that currently records, on any thread; None if there is none."""
     return _active
 
 
 @contextmanager
 def recorded(trace: Trace | None) -> Iterator[None]:
-    """Records all spans of the block into ``trace``, as one job; None records nothing. One job a process at a time."""
+    """Records all spans of the block into ``trace``, as one job; None records nothing. Only one job at a time can be
+    recorded in a process."""
     global _active
     if trace is None:
         yield
@@ -101,12 +102,12 @@ def recorded(trace: Trace | None) -> Iterator[None]:
 
 
 def span(kind: Kind, name: str) -> AbstractContextManager[None]:
-    """Records the block, where a trace is active."""
+    """Returns a context that records its block as a span if a trace is active."""
     return nullcontext() if _active is None else _active.span(kind, name)
 
 
 def traced(function: Callable[P, T]) -> Callable[P, T]:
-    """Makes the decorated function a part of the stage that calls it, under its name."""
+    """Makes the decorated function record each call as a span, if a trace is active."""
 
     @functools.wraps(function)
     def timed(*arguments: P.args, **options: P.kwargs) -> T:
@@ -117,7 +118,8 @@ def traced(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def name_of(function: Callable[..., object]) -> str:
-    """Returns where a loop stands: its module below the pipeline, and the function that holds it."""
+    """Returns a function's name for a trace: its module within the pipeline, and its qualified name up to the outer
+    function."""
     inner = function
     while isinstance(inner, functools.partial):
         inner = inner.func

@@ -15,22 +15,23 @@ CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found
 
 
 def downweight_outside_contour(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
-    """Returns the rim where cranium, ears and neck only count as far as they stick out of the input."""
+    """Returns the rim with less weight outside the face: on cranium, ears and neck a sample counts only where the model
+    sticks out of the silhouette, and then with ``OUTSIDE_SHARE`` of its weight."""
     face = face_of(problem, evidence, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
     return replace(rim, length=np.where(face, rim.length, share * rim.length))
 
 
 def face_of(problem: ContourProblem, evidence: StageEvidence, level: str) -> Bool[np.ndarray, " v"]:
-    """Returns the face region, less what is known to lie under hair."""
+    """Tells which vertices of a level lie in the face region and not under hair."""
     region = problem.model.levels[level].face_region
     hair = {} if evidence.photographs is None else evidence.photographs.hair
     return region & ~hair[level] if level in hair else region
 
 
 def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Returns cells of every view where the input lies outside the model by more than the threshold, and around
-    them."""
+    """Marks, in every view, the cells of ``CELL_PX`` pixels where the silhouette reaches farther than ``threshold_px``
+    beyond the model, and the cells around them."""
     maps = []
     for k, (width, height) in enumerate(problem.views.size):
         cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), np.uint8)
@@ -42,7 +43,7 @@ def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tupl
 
 
 def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
-    """Returns the rim with no weight where the input is clutter."""
+    """Returns the rim with zero weight for the samples in cells marked as clutter."""
     if evidence.noise.clutter is None:
         return rim
     cell = (rim.pixel / CELL_PX).astype(int)

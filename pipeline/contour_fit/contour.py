@@ -44,7 +44,7 @@ NON_MONOTONE = 4  # costs that a step may climb back to
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourSolution:
-    """Holds a problem with its solution, from which others may go on."""
+    """Holds a problem of the contour solver and its solution, from which later stages continue."""
 
     problem: ContourProblem
     evidence: StageEvidence
@@ -65,7 +65,7 @@ def fit_contour(
     features: Mapping[str, Mapping[str, np.ndarray]] | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> Fit:
-    """Fits shape, pose and cameras to the silhouettes that are usable, from a start pose.
+    """Fits shape, pose and cameras to the usable silhouettes, from a start pose.
 
     All modes of ``model`` are used: the first ``settings.modes`` first, the rest once those have settled.
     """
@@ -84,7 +84,7 @@ def solve_contour(
     landmarks: LandmarkObservations | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> ContourSolution:
-    """Returns ``fit_contour`` without its covariance."""
+    """Solves the problem of ``fit_contour`` and returns the solution without computing its covariance."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
@@ -110,8 +110,8 @@ def solve_contour(
 
 
 def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
-    """Returns the pose and a few modes on a decimated mesh; the eigenheads, from the face's rim; the same from the
-    whole head's, kept if the head turns out to be bare; then what modes the model has beyond the eigenheads; then the
+    """Returns the stages of the fit in order: pose and a few modes on a decimated mesh; all eigenheads, from the face's
+    rim; the same from the whole head's rim, kept only if the head is bare; the further modes, if the model has any; the
     full mesh."""
     few, span = min(settings.modes_first, modes), min(settings.modes, modes)
     last = settings.robust_px
@@ -128,7 +128,8 @@ def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
 def run_stage(
     problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, report: Callable[[float], None]
 ) -> tuple[State, int, str]:
-    """Returns Levenberg-Marquardt through the robust scales of one stage: state, evaluations, why it stopped.
+    """Runs Levenberg-Marquardt through the robust scales of one stage. Returns the state, the number of evaluations and
+    the reason why it stopped.
 
     The set of rim samples changes with the state, which makes the cost slightly uneven: strict descent was seen to stop
     at ridges 0.3 mm from the minimum, so that a step may climb back a little.
@@ -148,21 +149,22 @@ def run_stage(
 
 
 def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
-    """Returns the evidence while residuals of that scale are let in: half of them counts as noise."""
+    """Returns the evidence with its noise unit raised to at least ``coarse_unit``, for steps whose robust scale is
+    still coarse."""
     noise = evidence.noise
     unit = max(noise.unit, coarse_unit(scale_px))
     return replace(evidence, noise=replace(noise, unit=unit))
 
 
 def coarse_unit(scale_px: float) -> float:
-    """Returns l sigma^2 (px^3) while residuals of that scale are let in: half of it counts as noise, so that the prior
-    holds the shape. Without it hair over both ears pulled the first 15 modes to 8 standard deviations, and a head 5
-    mm."""
+    """Returns the noise unit l sigma^2 (px^3) for a coarse robust scale, with half the scale as sigma, so that the
+    prior holds the shape. Without it hair over both ears pulled the first 15 modes to 8 standard deviations, and a head
+    5 mm."""
     return FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2
 
 
 def normal_equations(solved: ContourSolution) -> NormalEquations:
-    """Returns those of the last stage, at the solution."""
+    """Returns the normal equations of the last stage, evaluated at the solution."""
     scale = max(solved.stage.scales_px[-1], solved.evidence.noise.floor_px)
     whole, there = started_problem(solved.problem, solved.evidence, solved.stage, scale, solved.state)
     return whole.equations(there)

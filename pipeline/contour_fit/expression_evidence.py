@@ -24,7 +24,8 @@ VARIANCE_RANGE = (0.02, 4.0)
 
 
 def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> ContourSolution:
-    """Returns the solution moved to where the estimated variances put it; a neutral one as it is.
+    """Returns the solution re-estimated with a prior variance for each group of modes; a neutral face is returned
+    unchanged.
 
     Args:
         solved: with all modes; its model's ``posed`` says which are expressions.
@@ -58,7 +59,8 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
 
 
 def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
-    """Tells whether the weights among coefficients are those of a face that is not neutral."""
+    """Tells whether the expression weights among the coefficients sum to at least ``NEUTRAL``, so that the face is not
+    neutral."""
     return len(posed) > 0 and bool(coefficients[posed.start : posed.stop].sum() >= NEUTRAL)
 
 
@@ -68,7 +70,8 @@ def _variance(
     before: Float[np.ndarray, " m"],
     group: Int[np.ndarray, " k"],
 ) -> float:
-    """Prior variance of a group of modes: their squares over how many of them are determined."""
+    """Estimates the prior variance of a group of modes: the sum of their squared coefficients, divided by how many of
+    them the evidence determines."""
     if not len(group):
         return 1.0
     determined = float(np.clip(1.0 - covariance[group] / before[group], 0.0, 1.0).sum())

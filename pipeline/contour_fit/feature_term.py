@@ -19,7 +19,8 @@ FEATURE_SCALE = 4.0  # Geman-McClure scale of a feature point, in its standard d
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureTerm:
-    """Is a term over (coefficients, pose, cameras where they are solved for)."""
+    """Computes the cost of feature points as a function of coefficients, pose and, in stages that solve for them,
+    cameras."""
 
     problem: ContourProblem
     observed: Observed
@@ -38,7 +39,8 @@ class FeatureTerm:
         )
 
     def _deviation_px(self, slopes: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, " n"]:
-        """A click's noise, and the landmark's place on another head, in pixels."""
+        """Returns the standard deviation (px) of each feature point: a click's noise together with the landmark's
+        variation between heads."""
         settings = self.problem.settings
         pixels_per_mm = np.linalg.norm(slopes, axis=(1, 2)) / np.sqrt(2.0)
         return np.hypot(settings.feature_noise_px, settings.landmark_noise_mm * pixels_per_mm)
@@ -46,7 +48,7 @@ class FeatureTerm:
     def _rows(
         self, state: State, points: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2 3"]
     ) -> Float[np.ndarray, "n 2 p"]:
-        """d(pixel) / d(unknowns); the deviation is taken as constant."""
+        """Returns d(pixel) / d(unknowns) of each feature point; the change of its deviation is ignored."""
         observed, stage, views = self.observed, self.stage, moved_views(self.problem, state)
         pose, count = state.world_from_head, len(points)
         cameras = PER_CAMERA * len(views.names) if stage.cameras else 0

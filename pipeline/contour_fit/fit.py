@@ -11,7 +11,7 @@ from rig.geometry import Similarity
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Holds a head that fits the silhouettes.
+    """Holds a head fitted to the silhouettes.
 
     ``coefficients`` are in standard deviations, z ~ N(0, 1). ``covariance`` is over (coefficients, rotation (rad, left
     perturbation about the head's place in the world), translation (mm), log scale); None where a solver has none.

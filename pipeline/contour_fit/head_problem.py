@@ -20,8 +20,8 @@ def head_problem(
     scale_px: float,
     reference_px: float | None = None,
 ) -> Problem[State]:
-    """Terms over (coefficients, pose, cameras where the stage solves for them); ``reference_px`` as ``RimTerm`` has
-    it."""
+    """Builds the problem of one stage: all its terms over coefficients, pose and, in stages that solve for them,
+    cameras. ``reference_px`` is the outline length that ``RimTerm`` scales its cost to."""
     cameras = PER_CAMERA * len(problem.views.names) if stage.cameras else 0
     rim = RimTerm(problem, evidence, stage, scale_px, reference_px)
     terms: tuple[Term[State], ...] = (rim, *_other_terms(problem, evidence, stage))
@@ -36,7 +36,8 @@ def head_problem(
 
 
 def weight_bounds(state: State, posed: range, unknowns: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Returns steps that keep the weights of expressions between 0 and 1."""
+    """Returns the least and the largest step of every unknown that keep the expression weights between 0 and 1; other
+    unknowns are unbounded."""
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]
     weights = np.clip(weights, 0.0, 1.0)
@@ -47,7 +48,8 @@ def weight_bounds(state: State, posed: range, unknowns: int) -> tuple[Float[np.n
 def started_problem(
     problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, start: State
 ) -> tuple[Problem[State], Linearised]:
-    """Returns the problem whose outline length is that of ``start``, and itself there: the rim is found only once."""
+    """Returns the problem with its cost scaled to the outline length at ``start``, and its linearisation there. The rim
+    at ``start`` is found only once."""
     seen = RimTerm(problem, evidence, stage, scale_px).at(start)
     whole = head_problem(problem, evidence, stage, scale_px, float(seen.rim.length.sum()))
     rim, *others = whole.terms
@@ -67,7 +69,8 @@ def _other_terms(problem: ContourProblem, evidence: StageEvidence, stage: Stage)
 
 
 def apply_step(state: State, step: Float[np.ndarray, " p"], stage: Stage) -> State:
-    """Returns the state after a step in the unknowns of the stage."""
+    """Returns the state after adding a step, which holds the unknowns of the stage in order: coefficients, pose,
+    cameras."""
     m = stage.modes
     pose = state.world_from_head
     turned = rotation_from_vector(step[m : m + 3]) @ pose.rotation

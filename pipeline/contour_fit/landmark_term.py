@@ -31,7 +31,7 @@ def observe_landmarks(
     position_world: Float[np.ndarray, "n 3"],
     covariance_world: Float[np.ndarray, "p p"],
 ) -> LandmarkObservations:
-    """Returns landmarks as the solver reads them.
+    """Packs triangulated landmarks for the solver, with the model's mean and modes at each.
 
     Args:
         model: with the modes of the fit.
@@ -47,7 +47,8 @@ def observe_landmarks(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTerm:
-    """Is a term over (coefficients, pose, cameras, which it does not depend on)."""
+    """Computes the cost of the face's landmarks as a function of coefficients and pose. The cameras are unknowns of the
+    problem too, but the cost does not depend on them."""
 
     observed: LandmarkObservations
     stage: Stage
@@ -72,6 +73,6 @@ class LandmarkTerm:
 
 
 def landmark_points(observed: LandmarkObservations, state: State) -> Float[np.ndarray, "n 3"]:
-    """Returns where the head has the landmarks, world, mm."""
+    """Returns the positions (world, mm) of the landmarks on the head of a state."""
     moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
     return state.world_from_head.apply(observed.mean + moved)

@@ -19,8 +19,8 @@ UNIT_RANGE = (1.0, 40.0)  # px^3: noise of 0.5 px over 4 px; misfit of 2 px over
 
 
 def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
-    """Returns the evidence with what the residuals say of the model's misfit: unit, robust floor and, once, where
-    clutter is.
+    """Returns the evidence updated from the residuals of a stage: the noise unit, the robust floor and, the first time,
+    where clutter is.
 
     Clutter is found while the eigenheads alone still hold the shape: a wider basis would rather bulge into the hair
     than pay for it as an outlier, since every px of outline pays alone.
@@ -39,7 +39,8 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
 def with_clutter_of_start(
     problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage
 ) -> StageEvidence:
-    """Returns the evidence with what no head makes of the outlines, where found landmarks say how the head lies.
+    """Returns the evidence with clutter marked at the start: everything that reaches more than ``START_CLUTTER_MM``
+    beyond the mean head placed by landmarks.
 
     Long hair before a face is wider than any face, and pulls the first modes to it before residuals could tell.
     """
@@ -51,8 +52,8 @@ def with_clutter_of_start(
 
 
 def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:
-    """Returns l sigma^2 (px^3) of what the contours still miss, the model's misfit included; None where the settings
-    state both.
+    """Estimates the noise unit l sigma^2 (px^3) from the contours' residuals, misfit of the model included. Returns
+    None if the settings state both noise and correlation length.
 
     Means over blocks of B px of outline have the variance l sigma^2 / B where B is well above l, whatever l is.
     """
@@ -76,8 +77,9 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
 
 
 def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
-    """Tells whether a fit to the whole head explains cranium and ears, and the face as well as ``from_face``, the fit
-    to the face alone. An outline of hair is mostly no head's; where it is, that head has another face."""
+    """Tells whether the fit ``state`` to the whole head explains the outline of cranium and ears, and fits the face
+    about as well as ``from_face``, the fit to the face alone. An outline of hair seldom fits a head; where it does, the
+    fitted face is wrong."""
     rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
     region = problem.model.levels[stage.level].face_region
     other = np.flatnonzero(~region[rim.corner].all(axis=1))
@@ -94,5 +96,6 @@ def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, 
 
 
 def _robust_deviation_px(rim: Rim, chosen: Int[np.ndarray, " s"]) -> float:
-    """Robust standard deviation (px) of the residuals: hair on the forehead must not hide what the rest loses."""
+    """Returns the robust standard deviation (px) of the chosen residuals, from their median, which hair on the forehead
+    hardly changes."""
     return 1.4826 * float(np.median(np.abs(rim.residual[chosen]))) if len(chosen) else 0.0

@@ -65,7 +65,8 @@ def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_
 
 
 def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
-    """Estimated prior variance of a group of modes, by the unit prior's."""
+    """Estimates the prior variance of a group of modes, relative to the unit prior; 1 if too few of them are
+    determined."""
     assert fit.covariance is not None
     determined = float(np.clip(1.0 - np.diag(fit.covariance)[modes], 0.0, 1.0).sum())
     if determined < MIN_DETERMINED:
@@ -75,13 +76,12 @@ def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
 
 @traced
 def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation (mm) of every full-level vertex along its normal; zero where the fit has no
+    """Returns the standard deviation (mm) of every full-level vertex along its normal; zero if the fit has no
     covariance.
 
-    Taken on the cage and carried to the full level by its operator, whose rows are convex combinations: a posterior is
-    smooth there, and the cage has a twentieth of the vertices. Along the normal, since sliding along the surface
-    neither moves the surface nor shows in a silhouette. Relief that no mode follows stands beside what the modes leave
-    open.
+    It is computed on the cage, which has a twentieth of the vertices, and interpolated to the full level. Sliding along
+    the surface is left out, since it does not change the shape. Relief too fine for the modes (the fit's misfit) is
+    included.
     """
     operator = model.levels["full"].operator
     if fit.covariance is None:
@@ -90,7 +90,8 @@ def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
 
 
 def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
-    """Returns the variance (mm^2) of the cage's vertices along their normals, of a fit with a covariance."""
+    """Returns the variance (mm^2) of the cage's vertices along their normals, misfit included. The fit must have a
+    covariance."""
     assert fit.covariance is not None
     rows = normal_rows(model, fit)
     # One triangular factor instead of rows @ covariance twice; the jitter keeps rounding from making it indefinite.

@@ -25,18 +25,21 @@ TAIL = 2.0  # exponent of the weights' prior
 
 
 def weights_of(problem: ContourProblem, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, " e"]:
-    """Returns the weights of expressions among coefficients; none while a stage has none."""
+    """Returns the expression weights among the coefficients, negative ones as 0; an empty array in stages that do not
+    solve for them."""
     return np.maximum(coefficients[problem.model.posed.start : problem.model.posed.stop], 0.0)
 
 
 def weight_slope(weights: Float[np.ndarray, " e"], median: float) -> Float[np.ndarray, " e"]:
-    """Returns half the slope of ``2 TAIL log(1 + w / t)``, their part of the cost beside the Gaussian's."""
+    """Returns half the derivative of ``2 TAIL log(1 + w / t)`` at each weight w, where t is ``median``: the
+    non-Gaussian part of the prior on expression weights."""
     return TAIL / (median + weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PriorTerm:
-    """Is a term over (coefficients, pose, cameras where they are solved for)."""
+    """Computes the cost of the priors as a function of coefficients, pose and, in stages that solve for them,
+    cameras."""
 
     problem: ContourProblem
     stage: Stage
@@ -47,7 +50,7 @@ class PriorTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedPriorTerm:
-    """Holds the priors at one state."""
+    """Holds the prior term linearised at one state."""
 
     term: PriorTerm
     state: State

@@ -23,7 +23,7 @@ FIRST_NOISE_PX, FIRST_CORRELATION_PX = 1.0, 6.0  # before the residuals have bee
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Says where the solver stands."""
+    """Holds the current estimate of the solver: coefficients, pose and the correction of each camera."""
 
     coefficients: Float[np.ndarray, " m"]
     world_from_head: Similarity
@@ -45,8 +45,8 @@ class Stage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Holds feature points, packed: landmark vertex (row of the full level), view, pixel, and what the model says of
-    the landmark (head frame, mm)."""
+    """Holds feature points as arrays, one row each: vertex of the full level, view, observed pixel, and the model's
+    mean and modes at the vertex (head frame, mm)."""
 
     vertex: Int[np.ndarray, " n"]
     view: Int[np.ndarray, " n"]
@@ -57,9 +57,9 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkObservations:
-    """Holds places of the face that were found in the world (mm). ``corner`` and ``blend``: vertices of the full level
-    and their weights; ``whiten``: takes all differences (mm, stacked) to standard deviations; ``mean`` and ``basis``:
-    the places of the mean head and what the modes do to them, head frame."""
+    """Holds triangulated landmarks of the face. ``corner`` and ``blend``: vertices of the full level and their weights;
+    ``position_world``: mm; ``whiten``: turns the stacked differences (mm) into standard deviations; ``mean`` and
+    ``basis``: the model's mean and modes at the landmarks, head frame."""
 
     corner: Int[np.ndarray, "n 3"]
     blend: Float[np.ndarray, "n 3"]
@@ -71,17 +71,17 @@ class LandmarkObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelBasis:
-    """Holds the mean and modes contiguous by vertex, and what takes them to the level: for a decimated level its own
-    rows (2 MB), for the full one the cage's, through the level's operator (the full level's own rows would be 40 to 170
-    MB)."""
+    """Holds the mean and modes of a level, stored vertex by vertex, and the operator that turns them into the level's
+    vertices. A decimated level stores rows for its vertices (2 MB); the full level stores the cage's, since rows for
+    all its vertices would take 40 to 170 MB."""
 
     operator: sparse.csr_array
     mean: Float[np.ndarray, "v 3"]
     modes: Float32[np.ndarray, "v 3 m"]
 
     def vertices(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "V 3"]:
-        """Returns the vertices in the head frame, mm. The sum over modes is in single precision (1e-5 mm), a third of
-        the memory's traffic."""
+        """Returns the level's vertices (head frame, mm). The sum over modes is in single precision (1e-5 mm), which
+        needs a third of the memory traffic."""
         flat = self.modes.reshape(self.mean.size, -1)
         moved = flat[:, : len(coefficients)] @ coefficients.astype(np.float32)
         return self.operator @ (self.mean + moved.reshape(-1, 3))
@@ -89,7 +89,8 @@ class LevelBasis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourProblem:
-    """Holds everything that stays fixed during a fit."""
+    """Holds everything that stays fixed while the solver runs: model, cameras, silhouettes, feature points and
+    settings."""
 
     model: HeadModel
     rig: Rig
@@ -104,7 +105,8 @@ class ContourProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceObservations:
-    """Holds n observations of vertices of the full level; K cameras in the order of the solver's views."""
+    """Holds n point-to-plane observations at vertices of the full level; the K cameras are in the order of the solver's
+    views."""
 
     vertex: Int[np.ndarray, " n"]
     basis: Float32[np.ndarray, "m n 3"]  # the model's modes at those vertices, head frame
@@ -122,10 +124,10 @@ class SurfaceObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimNoise:
-    """Says how far an outline may be believed. ``unit``: l sigma^2 (px^3), what a px^2 of residual along a px of
-    outline is divided by; ``floor_px``: no robust scale below this, three standard deviations of the model's misfit;
-    ``clutter``: per view, in cells, where the input is hair or clothes, None where nobody has looked; ``is_settled``:
-    whether that comes from a fit, not from its start alone."""
+    """Holds how much an outline is trusted. ``unit``: l sigma^2 (px^3), the divisor of squared residual (px^2) per px
+    of outline; ``floor_px``: the least robust scale, three standard deviations of the model's misfit; ``clutter``: for
+    each view the cells with hair or clothes, None before the search; ``is_settled``: whether ``clutter`` comes from a
+    fit rather than from the start."""
 
     unit: float
     floor_px: float
@@ -135,7 +137,7 @@ class RimNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoEvidence:
-    """Holds what photographs say between the rims, and by level which vertices' outline is hair's."""
+    """Holds the surface observations from photographs, and for each level which vertices lie under hair."""
 
     surface: SurfaceObservations
     hair: Mapping[str, Bool[np.ndarray, " v"]]
@@ -143,15 +145,16 @@ class PhotoEvidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageEvidence:
-    """Holds what has been found out by the time a stage begins."""
+    """Holds what earlier stages have found: the noise of the outlines and, once measured, the evidence of the
+    photographs."""
 
     noise: RimNoise
     photographs: PhotoEvidence | None = None
 
 
 def first_evidence(settings: FittingSettings) -> StageEvidence:
-    """Returns the evidence before any residual has been seen: noise as stated, or that of a model that does not quite
-    fit."""
+    """Returns the evidence for the first stage, before any residual is known: the noise that the settings state, or a
+    default."""
     noise, length = settings.contour_noise_px or FIRST_NOISE_PX, settings.contour_correlation_px
     return StageEvidence(RimNoise(noise**2 * (length or FIRST_CORRELATION_PX), 0.0, None))
 
@@ -167,7 +170,7 @@ def make_problem(
     levels: tuple[str, ...] = ("p95", "full"),
     landmarks: LandmarkObservations | None = None,
 ) -> ContourProblem:
-    """Packs what stays fixed. Raises ValueError if no silhouette is usable."""
+    """Packs everything that stays fixed during a fit. Raises ValueError if no silhouette is usable."""
     usable = {name: s.distance for name, s in silhouettes.items() if s.quality.usable and name in rig}
     views = pack_views(rig, usable)
     rig = rig.subset(views.names)
@@ -189,8 +192,8 @@ def make_problem(
 
 @lru_cache(maxsize=4)  # models are few, jobs are many
 def level_basis(model: HeadModel, name: str) -> LevelBasis:
-    """Returns the mean and modes (mm, head frame) where a level's vertices come from them: a coarse level has its
-    own."""
+    """Returns the mean and modes (mm, head frame) of a level: at the level's vertices if they are fewer than the
+    cage's, else at the cage's."""
     level = model.levels[name]
     if level.count < len(model.mean):
         coarse_basis = model.basis(name, len(model.modes)).transpose(1, 2, 0)
@@ -201,8 +204,8 @@ def level_basis(model: HeadModel, name: str) -> LevelBasis:
 
 @lru_cache(maxsize=4)
 def level_topology(model: HeadModel, name: str) -> Topology:
-    """Returns a level's edges and regions. The neck below the chin never speaks: heads turn on it, collars hide it, and
-    its cut is no contour of anybody."""
+    """Returns a level's edges and regions. Faces of the neck below the chin belong to no region, since heads turn on
+    it, collars hide it, and its lower cut is no contour of a person."""
     level = model.levels[name]
     mean = model.vertices(np.zeros(0), name)
     chin = model.vertices(np.zeros(0))[model.landmarks["gnathion"], 1]
@@ -210,8 +213,8 @@ def level_topology(model: HeadModel, name: str) -> Topology:
 
 
 def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Float[np.ndarray, "6 6"]:
-    """Returns the inverse prior covariance of a camera's correction: its calibration's own, or ``error_px`` in the
-    image.
+    """Returns the inverse prior covariance of a camera's correction: from the camera's own covariance if it has one,
+    else from ``error_px`` in the image.
 
     A correction of the default prior moves a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS, half of it (in
     variance) by rotation and half by translation, which a head cannot tell apart.
@@ -228,7 +231,7 @@ def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Floa
 def pack_features(
     model: HeadModel, names: tuple[str, ...], features: Mapping[str, Mapping[str, np.ndarray]]
 ) -> Observed | None:
-    """Returns feature points (px) of the model's landmarks as arrays; None where no camera has one."""
+    """Packs the feature points (px) of the model's landmarks into arrays; returns None if no camera has one."""
     found = [
         (model.landmarks[landmark], names.index(camera), pixel)
         for landmark, views in sorted(features.items())
@@ -245,7 +248,7 @@ def pack_features(
 def landmark_basis(
     model: HeadModel, vertex: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
-    """Returns the mean and all modes at vertices of the full level."""
+    """Returns the mean (n 3) and all modes (m n 3) of the model at vertices of the full level, head frame, mm."""
     mean = np.asarray(model.levels["full"].operator[vertex] @ model.mean, float)
     return mean, model.basis("full", len(model.modes), vertex)
 
@@ -253,7 +256,7 @@ def landmark_basis(
 def blended_basis(
     model: HeadModel, corner: Int[np.ndarray, "n 3"], blend: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
-    """Returns the mean and all modes at places within triangles of the full level."""
+    """Returns the mean and all modes of the model at places inside triangles of the full level, head frame, mm."""
     rows, inverse = np.unique(corner, return_inverse=True)
     mean, basis = landmark_basis(model, rows)
     at = inverse.reshape(corner.shape)
@@ -262,7 +265,8 @@ def blended_basis(
 
 
 def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
-    """Returns the same problem with a model of the same mesh that has more modes, solved on ``levels``."""
+    """Returns the problem with its model replaced by ``model``, which has the same mesh and more modes, on the given
+    ``levels``."""
     features = problem.features
     if features is not None:
         mean, basis = landmark_basis(model, features.vertex)
@@ -276,12 +280,12 @@ def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) 
 
 
 def start_state(problem: ContourProblem, world_from_head: Similarity) -> State:
-    """Returns the mean head at a pose, every camera where it was calibrated."""
+    """Returns the start of a fit: the mean head at the given pose, with all cameras as calibrated."""
     return State(np.zeros(0), world_from_head, np.zeros((len(problem.views.names), PER_CAMERA)))
 
 
 def moved_views(problem: ContourProblem, state: State) -> Views:
-    """Returns the views with the cameras where the state has them."""
+    """Returns the views with the state's corrections applied to the cameras."""
     if not state.camera_shift.any():
         return problem.views
     turn = rotation_from_vector(state.camera_shift[:, :3])

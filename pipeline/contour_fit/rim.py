@@ -44,7 +44,7 @@ STEPS_OUT_PX = (0.3, 2.5)  # both must leave the mask: the second drops samples 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """Holds what the rim needs to know of a mesh level; computed once."""
+    """Holds the faces, edges and regions of a mesh level that the search for the rim needs."""
 
     faces: Int32[np.ndarray, "f 3"]
     edges: Int32[np.ndarray, "e 4"]  # from, to (as in face one), face one, face two or -1
@@ -54,7 +54,7 @@ class Topology:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Holds the cameras and their signed distances, packed for compiled loops."""
+    """Holds the cameras and the silhouettes' signed distances (px), packed for compiled loops."""
 
     names: tuple[str, ...]
     rotation: Float[np.ndarray, "k 3 3"]
@@ -65,7 +65,7 @@ class Views:
     offset: Int[np.ndarray, " k"]
 
     def packed(self) -> Float[np.ndarray, "k 22"]:
-        """Returns the cameras as ``packed_camera`` has them."""
+        """Returns one row for each camera: rotation (9), translation (3) and lens (10)."""
         return np.concatenate([self.rotation.reshape(-1, 9), self.translation, self.lens], axis=1)
 
 
@@ -89,8 +89,8 @@ def make_topology(
     face_region: Bool[np.ndarray, " v"],
     head_region: Bool[np.ndarray, " v"] | None = None,
 ) -> Topology:
-    """Returns edges with their two faces; ``head_region`` is the whole mesh by default. Raises ValueError where more
-    than two faces share an edge."""
+    """Builds the topology of a mesh: its edges, each with its two faces, and the faces of both regions. ``head_region``
+    is the whole mesh if None. Raises ValueError if more than two faces share an edge."""
     faces = np.ascontiguousarray(faces, np.int32)
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     owner = np.tile(np.arange(len(faces), dtype=np.int32), 3)
@@ -111,7 +111,7 @@ def make_topology(
 
 
 def pack_views(rig: Rig, distances: dict[str, Float32[np.ndarray, "h w"]]) -> Views:
-    """Returns the cameras of ``rig`` that have a signed distance."""
+    """Packs the cameras of ``rig`` that have a signed distance, with these distances (px), into flat arrays."""
     cameras = [camera for camera in rig if camera.name in distances]
     maps = [np.ascontiguousarray(distances[camera.name], np.float32) for camera in cameras]
     return Views(
@@ -133,8 +133,9 @@ def find_rim(
     whole_head: bool = False,
     averaged: bool = False,
 ) -> Rim:
-    """Returns the outer outline of a mesh in every view, and the input's signed distance there; ``averaged``: its mean
-    half way to the neighbours along the outline, for a mesh as fine as the outline (2 to 6 px)."""
+    """Finds samples of a mesh's outer outline in every view, with the silhouette's signed distance (px) at each. If
+    ``averaged``, that distance is a mean half way to the neighbouring samples, for a mesh as fine as the outline (2 to
+    6 px)."""
     faces = topology.head if whole_head else topology.face
     vertices = np.ascontiguousarray(vertices_world)
     normals, planes = normals_and_planes(vertices, topology.faces)
@@ -157,7 +158,8 @@ def _outlines(
     some: slice,
     averaged: bool,
 ) -> list[tuple[Int32[np.ndarray, "_ 2"], Float[np.ndarray, "_ 14"]]]:
-    """Of each view, at most VIEWS_A_WORD: corners, and samples as ``rim_kernels`` names their columns.
+    """Returns, for each of at most ``VIEWS_A_WORD`` views, the edges' corners and the samples; ``rim_kernels`` names
+    the samples' columns.
 
     Faces and vertices are swept once for all views, a bit for each; a view then only touches what lies on its rim.
     """
@@ -179,5 +181,6 @@ def _outlines(
 def project_with_slopes(
     points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-    """Returns the pixel of every point in the view named beside it, and d(pixel) / d(point)."""
+    """Returns the pixel of every point in the view of the same row in ``view``, and the derivative d(pixel) / d(point),
+    px per mm."""
     return projected_with_slopes(points_world, view, views.packed())

@@ -33,7 +33,7 @@ OUTSIDE_SCALE = 2.0  # robust scale where the model sticks out of the input, by 
 
 
 def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> Rim:
-    """Returns the rim of the head as it stands; samples that are not to be believed have no length."""
+    """Returns the rim of the head at ``state``; samples in clutter have length 0."""
     vertices = state.world_from_head.apply(problem.bases[stage.level].vertices(state.coefficients))
     # On a decimated mesh a sample's share of the outline is long enough to be half clutter: it would hide what is not.
     fine, whole = stage.level == "full", stage.whole_head or stage.contained
@@ -47,8 +47,8 @@ def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimTerm:
-    """Is the outline's term. ``reference_px``: outline length that the cost is scaled to, so that a fit gains nothing
-    by hiding its rim; None for the rim's own."""
+    """Computes the cost of the outlines. ``reference_px``: the outline length (px) that the cost is scaled to, so that
+    hiding part of the rim gains nothing; None for no scaling."""
 
     problem: ContourProblem
     evidence: StageEvidence
@@ -62,7 +62,7 @@ class RimTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedRimTerm:
-    """Holds the rim's part of the cost at one state."""
+    """Holds the rim term linearised at one state."""
 
     term: RimTerm
     state: State
@@ -76,7 +76,8 @@ class LinearisedRimTerm:
         return float((self.rim.length * rho).sum()) / self.term.evidence.noise.unit * share
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds a block a view: its samples touch shape, pose and their own camera."""
+        """Adds the rim's part to the normal equations, camera by camera: a sample depends on shape, pose and the camera
+        that sees it."""
         stage, rim = self.term.stage, active_samples(self.rim)
         rows = rim_rows(self.term.problem, self.state, rim, stage)
         weight = _loss(rim.residual, self.term.scale_px).weight(rim.residual**2)
@@ -100,18 +101,19 @@ class LinearisedRimTerm:
 
 
 def _loss(residual_px: Float[np.ndarray, " s"], scale_px: float) -> GemanMcClure:
-    """With another scale for each side of the input's outline."""
+    """Returns the robust loss, whose scale is ``OUTSIDE_SCALE`` times larger where the model sticks out of the
+    silhouette."""
     return GemanMcClure(np.where(residual_px < 0, scale_px, OUTSIDE_SCALE * scale_px))
 
 
 def active_samples(rim: Rim) -> Rim:
-    """Returns the samples that have any weight."""
+    """Returns the samples whose length is above 0."""
     kept = rim.length > 0
     return rim if kept.all() else Rim(*(getattr(rim, name)[kept] for name in Rim.__dataclass_fields__))
 
 
 def rim_rows(problem: ContourProblem, state: State, rim: Rim, stage: Stage) -> Float32[np.ndarray, "s q"]:
-    """Returns d(residual) / d(coefficients, pose, the correction of the sample's own camera)."""
+    """Returns d(residual) / d(coefficients, pose, camera correction) of each sample, for the camera that sees it."""
     pose, views = state.world_from_head, moved_views(problem, state)
     basis = problem.bases[stage.level]
     operator = basis.operator

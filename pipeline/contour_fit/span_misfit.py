@@ -20,7 +20,7 @@ LEVEL, STEPS = "p95", 4  # as the contour solver's own stage with more modes
 
 
 def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
-    """Returns the fit of a solution, with the misfit of its span.
+    """Returns the fit of a solution, with a misfit that covers what the eigenheads cannot represent.
 
     Args:
         solved: to the outlines, with the eigenheads alone.
@@ -42,8 +42,8 @@ def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_
 
 
 def judged_by(wider_model: HeadModel, wider: Fit, model: HeadModel, fit: Fit) -> Fit:
-    """Returns a fit with the misfit (mm, along the normals) that a wider one of the same outlines shows; both have
-    covariances."""
+    """Returns ``fit`` with its misfit (mm, along the normals) set from ``wider``, a fit of more modes to the same
+    outlines: from their distance and the variance that only the wider one has. Both need a covariance."""
     cage = fit.world_from_head.apply(model.cage(fit.coefficients))
     normals = vertex_normals(cage, model.levels["cage"].faces)
     apart = ((wider.world_from_head.apply(wider_model.cage(wider.coefficients)) - cage) * normals).sum(axis=1)

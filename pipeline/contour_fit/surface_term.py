@@ -32,7 +32,8 @@ def surface_residual(
     world_from_head: Similarity,
     camera_shift: Float[np.ndarray, "k 6"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Returns e (mm), 0 where a bound is kept, and where the vertices are now (world)."""
+    """Returns the residual e (mm) of each observation, 0 for a bound that is kept, and the current positions of the
+    vertices (world, mm)."""
     count = len(coefficients)
     moved = (coefficients.astype(np.float32) @ seen.basis[:count].reshape(count, -1)).reshape(-1, 3)
     points = world_from_head.apply(seen.mean + moved)
@@ -43,7 +44,8 @@ def surface_residual(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceTerm:
-    """Is a term over (coefficients, pose, cameras where they are solved for)."""
+    """Computes the cost of surface observations as a function of coefficients, pose and, in stages that solve for them,
+    cameras."""
 
     seen: SurfaceObservations
     stage: Stage
@@ -55,7 +57,8 @@ class SurfaceTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedSurfaceTerm:
-    """Holds the observations at one state: e (mm), and where the vertices are now (world)."""
+    """Holds the surface term linearised at one state: the residuals e (mm) and the current positions of the vertices
+    (world, mm)."""
 
     term: SurfaceTerm
     state: State
@@ -68,7 +71,7 @@ class LinearisedSurfaceTerm:
 
     @property
     def cameras(self) -> LinearisedQuadratic:
-        """Returns what the images say of the cameras alone."""
+        """Returns the quadratic cost of the cameras' corrections alone, as measured from the images."""
         seen = self.term.seen
         form = Quadratic(seen.camera_matrix, seen.camera_shift.ravel(), seen.camera_gradient)
         return form.at(self.state.camera_shift.ravel())
@@ -98,7 +101,8 @@ def surface_rows(
     *,
     cameras: bool,
 ) -> Float32[np.ndarray, "n p"]:
-    """Returns de / d(coefficients, rotation, translation, log scale, cameras)."""
+    """Returns the derivatives of the residual e by coefficients, rotation, translation, log scale and, if ``cameras``,
+    the cameras' corrections."""
     turned = (world_from_head.scale * (seen.normal @ world_from_head.rotation)).astype(np.float32)
     shape = np.einsum("nc,mnc->nm", turned, seen.basis[:count], optimize=True)
     arm = points - world_from_head.translation

@@ -19,7 +19,7 @@ CANDIDATES = 4  # vertices whose triangles are tried
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Associated:
-    """Holds n points and their places on the head."""
+    """Holds the n points that lie near a head, and the place on the head's mesh that each one shows."""
 
     row: Int[np.ndarray, " n"]  # of the points asked for
     triangle: Int[np.ndarray, " n"]
@@ -30,7 +30,8 @@ class Associated:
 def faces_at_vertices(
     faces: Int[np.ndarray, "f 3"], count: int
 ) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
-    """Returns where each vertex's faces begin, and the faces, vertex by vertex."""
+    """Returns the faces at each vertex in compressed rows: where the row of each vertex begins (one entry more than
+    there are vertices), and the face numbers, row after row."""
     corner = np.argsort(faces.ravel(), kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
     return start.astype(np.int64), (corner // 3).astype(np.int64)
@@ -38,7 +39,7 @@ def faces_at_vertices(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """Holds a head that points are asked for a place on, with what finds it."""
+    """Holds a head's mesh with the search tree that finds the closest place on it."""
 
     head: FannedMesh
     tree: KDTree
@@ -48,7 +49,7 @@ class Target:
     def of(
         cls, vertices: Float[np.ndarray, "v 3"], vertex_normals: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
     ) -> "Target":
-        """Builds it of a mesh (mm) with its unit vertex normals."""
+        """Builds a target from a mesh (mm) with unit vertex normals."""
         sides = [np.linalg.norm(vertices[faces[:, j]] - vertices[faces[:, j - 1]], axis=1) for j in range(3)]
         head = FannedMesh(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
         return cls(head, KDTree(vertices), float(np.max(sides, initial=0.0)))
@@ -97,11 +98,13 @@ def associate(
     reach_mm: float,
     least_agreement: float,
 ) -> Associated:
-    """Returns ``Target.closest`` of a head that is asked once; all in one frame, mm."""
+    """Returns the closest place on a head for every point within reach, as ``Target.closest`` does, for a head that is
+    searched only once. Points and head are in one frame, mm."""
     target = Target.of(vertices, vertex_normals, faces)
     return target.closest(points, normals, reach_mm=reach_mm, least_agreement=least_agreement)
 
 
 def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns values at n places of triangles, from those at their corners."""
+    """Returns the value at each of n places inside triangles: the sum of the values at the three corners, weighted by
+    the barycentric weights ``blend``."""
     return np.einsum("nk,nkc->nc", blend, corners)

@@ -34,7 +34,8 @@ OPEN = (
 
 
 def blinks_of(model: HeadModel) -> dict[str, int]:
-    """Returns the coefficient that closes each eye (``right``, ``left``), where the model's modes have one."""
+    """Returns, for each eye (``right``, ``left``), the index of the fit's coefficient that closes it. Eyes for which
+    the model has no blink expression are left out."""
     found: dict[str, int] = {}
     for name, place in zip(model.expressions.names, model.posed, strict=False):
         if plain_name(name) in BLINKS:
@@ -49,8 +50,8 @@ def estimate_eyelid_closure(
     surface: SurfacePoints,
     eyes: Mapping[str, EyeEvidence],
 ) -> tuple[dict[str, float], frozenset[str]]:
-    """Tells how far each eye is closed, 0 to 1, of those that the model can close, and the eyes that show nothing
-    though no blink of the model's lies nearer to the points: their lids are to be bridged.
+    """Estimates how far each eye that the model can close is closed (0 open, 1 closed). Also returns the eyes whose
+    lids must be bridged instead: they look closed, but no blink of the model brings its lids nearer to the points.
 
     Args:
         fit: of the photographs.
@@ -74,7 +75,8 @@ def estimate_eyelid_closure(
 
 
 def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[np.ndarray, "v 3"]:
-    """Returns what closes the fit's eyes that far, full level, world, mm."""
+    """Returns the displacement (full level, world frame, mm) that takes each eye from the fit's blink weight to the
+    weight in ``lids``."""
     shift, places = np.zeros((model.levels["full"].count, 3)), blinks_of(model)
     for side, share in lids.items():
         if (more := share - float(fit.coefficients[places[side]])) != 0.0:
@@ -83,13 +85,13 @@ def blink_shift(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Float[
 
 
 def _moved(fit: Fit, model: HeadModel, place: int) -> Float[np.ndarray, "v 3"]:
-    """An expression at weight 1, full level, world."""
+    """Returns the displacement of every vertex (full level, world frame, mm) by the mode ``place`` at weight 1."""
     moved = model.levels["full"].operator @ model.modes[place].astype(float)
     return fit.world_from_head.scale * moved @ fit.world_from_head.rotation.T
 
 
 def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
-    """Returns the fit with its eyes that far closed."""
+    """Returns the fit with the blink weight of each eye set to the value in ``lids`` (0 open, 1 closed)."""
     coefficients, places = fit.coefficients.copy(), blinks_of(model)
     for side, share in lids.items():
         coefficients[places[side]] = share
@@ -97,7 +99,8 @@ def with_lids(fit: Fit, model: HeadModel, lids: Mapping[str, float]) -> Fit:
 
 
 def plain_shape(fit: Fit, model: HeadModel, eigenheads: int) -> Float[np.ndarray, "v 3"]:
-    """Returns the fitted head (full level, world) as eigenheads and expressions alone have it."""
+    """Returns the fitted head (full level, world frame, mm) with eigenheads and expressions only: the coefficients of
+    all other modes are set to 0."""
     plain = fit.coefficients.copy()
     plain[np.setdiff1d(np.arange(eigenheads, len(plain)), model.posed)] = 0.0
     return fit.world_from_head.apply(model.vertices(plain))
@@ -111,10 +114,12 @@ def _nearest_closure(
     surface: SurfacePoints,
     slit: Fissure,
 ) -> tuple[float, float]:
-    """Returns the weight whose lids lie nearest, ``fitted`` where too few points tell or none is nearer; and the misfit
-    of half closed lids divided by that of open ones, 1 where too few points tell.
+    """Returns the blink weight whose lids lie nearest to the points, or ``fitted`` where too few points lie there or
+    none is nearer. Also returns the misfit of half closed lids divided by that of open ones, 1 where too few points lie
+    there.
 
-    ``moved`` is what closes open lids."""
+    ``moved`` is the displacement of a full blink (mm).
+    """
     middle = open_lids[slit.ellipse(0.5 * slit.length_mm, 0.4 * slit.length_mm)].mean(axis=0)
     off = np.linalg.norm(surface.points - middle, axis=1)
     about = surface.chosen((off < NEAR * slit.length_mm) & (surface.part != Part.UNSEEN))
@@ -133,7 +138,8 @@ def _nearest_closure(
 def _patch(
     vertices: Float[np.ndarray, "v 3"], model: HeadModel, middle: Float[np.ndarray, " 3"], radius_mm: float
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "f 3"]]:
-    """The head about an eye: its vertices, and its triangles between them."""
+    """Returns the vertices within ``radius_mm`` of an eye's middle, and the triangles between them, numbered within
+    this patch."""
     inside = np.linalg.norm(vertices - middle, axis=1) < radius_mm
     faces = model.levels["full"].faces
     places = np.cumsum(inside, dtype=np.int32) - np.int32(1)
@@ -143,7 +149,8 @@ def _patch(
 
 
 def _misfit(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], points: SurfacePoints) -> float:
-    """Mean of Geman and McClure's loss of the points' distances; a point without a place counts whole."""
+    """Returns the mean of Geman and McClure's loss over the points' distances to the mesh, 0 to 1. A point with no
+    place on the mesh within reach counts as 1."""
     normals = vertex_normals(vertices, faces)
     found = associate(
         points.points, points.normals, vertices, normals, faces, reach_mm=REACH_MM, least_agreement=AGREEMENT

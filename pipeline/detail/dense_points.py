@@ -28,8 +28,8 @@ TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage com
 def dense_points(
     depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh, settings: FineSettings
 ) -> SurfacePoints:
-    """Returns every place that enough views agree on, as a point with its part; at most one for each side of a small
-    cell.
+    """Returns the places that enough views agree on as one cloud of points, at most one for each cell of a grid, part
+    of the head and side of a sheet.
 
     Args:
         depth_maps: one a view.

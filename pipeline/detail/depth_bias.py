@@ -36,7 +36,8 @@ class OnFace:
 
 @traced
 def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
-    """Returns the points of skin near the fitted head's ``face`` (mm, world frame)."""
+    """Returns the points of skin whose closest place on the fitted head (world frame, mm) lies on a triangle with all
+    its corners in ``face``."""
     vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()
     skin = np.flatnonzero(surface.part == Part.SKIN)
     if not len(skin):
@@ -51,8 +52,9 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
 
 
 def measure_bias(seen: OnFace) -> WindowBias:
-    """Returns the robust line of what points and fit differ by, over the windowed height; none where too few points
-    tell."""
+    """Fits a robust straight line to the offset of the points from the fitted face over the windowed height: its
+    intercept is the common bias (mm), its slope the share. Returns no bias if there are fewer than ``MIN_POINTS``
+    points."""
     if len(seen.row) < MIN_POINTS:
         return WindowBias()
     columns = np.stack([np.ones(len(seen.row)), seen.windowed_mm], axis=1)
@@ -64,8 +66,8 @@ def measure_bias(seen: OnFace) -> WindowBias:
 
 
 def without_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:
-    """Returns the points where they would be without the windows: off the face, whose shape alone is known so well, by
-    what all err alike."""
+    """Returns the points corrected for the bias of the matching windows. Every point moves back along its normal by the
+    common bias; points on the face, the only place where the windowed height is known, also lose the share of it."""
     points = surface.points - bias.common_mm * surface.normals
     points[seen.row] = (
         surface.points[seen.row] - (bias.common_mm + bias.share * seen.windowed_mm)[:, None] * seen.normal

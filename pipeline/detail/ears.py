@@ -33,8 +33,8 @@ AGREEMENT = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Holds a similarity about the middle of an ear, with its robust cost (per point) and how many points it puts on
-    it."""
+    """Holds a similarity about the middle of an ear, its robust cost per point, and the number of points (``shown``)
+    whose closest place then lies on the ear."""
 
     cost: float
     scale: float
@@ -46,12 +46,13 @@ class Motion:
 def with_ears_in_place(
     vertices: Float[np.ndarray, "v 3"], model: HeadModel, surface: SurfacePoints
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the head with each ear where the skin's points say, if enough of them do.
+    """Returns the head with each ear moved to where the points of skin show it. An ear with too few points about it
+    stays where it is.
 
     Args:
         vertices: full level, world frame, mm.
         model: the topology.
-        surface: what the dense stage knows; thin, 1.5 to 3 mm apart.
+        surface: points of the dense stage; thin, 1.5 to 3 mm apart.
     """
     faces, ears = model.levels["full"].faces, head_regions(model)["ears"]
     middle = model.vertices(np.zeros(0))[:, 0] < 0
@@ -79,8 +80,9 @@ def _registered(
     points: SurfacePoints,
     model: HeadModel,
 ) -> Float[np.ndarray, "v 3"]:
-    """All vertices under the motion that explains the points about the ear best; as they were where hardly a point
-    shows the ear itself: under hair the cheek before it would drag it along."""
+    """Returns all vertices under the similarity that best fits the ear to the points about it. Returns them unchanged
+    if fewer than ``MIN_SHOWN`` points show the ear itself: where hair covers the ear, the cheek before it would drag it
+    along."""
     centre = vertices[ear].mean(axis=0)
     local = np.flatnonzero(np.linalg.norm(vertices - centre, axis=1) < np.linalg.norm(
         vertices[ear] - centre, axis=1).max() + BLEND_MM)  # fmt: skip
@@ -105,7 +107,7 @@ def _registered(
 def _axes(
     vertices: Float[np.ndarray, "v 3"], model: HeadModel
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Up and ahead of the head, unit, world frame."""
+    """Returns the unit vectors up and ahead of the head, world frame."""
     at = {name: vertices[row] for name, row in model.landmarks.items()}
     up = at["nasion"] - at["gnathion"]
     ahead = at["nasion"] - 0.5 * (at["tragion_left"] + at["tragion_right"])
@@ -121,9 +123,10 @@ def _descend(
     centre: Float[np.ndarray, " 3"],
     shift: Float[np.ndarray, " 3"],
 ) -> Motion:
-    """The best motion about ``centre`` from one start; ``target`` is the ear and its surroundings from there.
+    """Computes the similarity about ``centre`` to which iterated closest points converge from one starting ``shift``
+    (mm). ``target`` is the ear with its surroundings, relative to ``centre``.
 
-    The points are brought to the ear as it was, so that what finds places on it is made once.
+    The points are mapped back to the ear as it was, so that the search tree is built only once.
     """
     scale, turn, cost, shown = 1.0, np.eye(3), np.inf, 0
     prior = np.diag([TURN_SD**-2] * 3 + [SHIFT_SD_MM**-2] * 3 + [SCALE_SD**-2])

@@ -45,7 +45,8 @@ FIRST = 0.1  # weight at which the prior's tangent is taken first
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingBasis:
-    """Holds what may move the places: E expressions behind the other modes, mm, head frame."""
+    """Holds sample places of the mean head's face (head frame, mm) and the modes that move them; the last of the modes
+    are the expressions."""
 
     vertex: Int[np.ndarray, " n"]  # of the full level
     mean: Float[np.ndarray, "n 3"]
@@ -56,7 +57,8 @@ class ReadingBasis:
 
 @lru_cache(maxsize=1)  # 10 MB; studios work with one model
 def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> ReadingBasis:
-    """Returns all eigenheads of ``population``, the smooth modes of ``model`` (of the fit) and the expressions."""
+    """Returns the sample places with three groups of modes: all eigenheads of ``population``, then the smooth modes and
+    the expressions of ``model``, the model that the fit used."""
     full = population.levels["full"]
     inputs = (population.sha256, population.modes, model.modes, model.posed, eigenheads, SPACING_MM)
 
@@ -83,7 +85,8 @@ def with_read_expression(
     eigenheads: int,
     median: float,
 ) -> Fit:
-    """Returns the fit with the weights that the displaced head tells, and their deviations; all else as it was.
+    """Returns the fit with expression weights, and their deviations, estimated anew from the displaced head. Returns
+    the fit unchanged if the model has no expressions, or if the population does not explain the head.
 
     Args:
         fit: of the photographs.
@@ -127,8 +130,8 @@ def _solved(
     expressions: int,
     median: float,
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"], Float[np.ndarray, "n 3"], float]:
-    """Weights, their deviations, where the modelled places are then, and the variance of the kernel's modes (MacKay
-    1992, as in ``posterior``)."""
+    """Estimates the expression weights. Returns the weights, their deviations, the modelled places under them (head
+    frame, mm) and the variance of the kernel's modes (MacKay 1992, as in ``posterior``)."""
     count = len(basis.modes)
     arm = place - place.mean(axis=0)
     by_mode = np.einsum("mnc,nc->nm", basis.modes, normal.astype(np.float32), optimize=True)
@@ -171,7 +174,8 @@ def _solved(
 def _with_weights(
     fit: Fit, model: HeadModel, weights: Float[np.ndarray, " e"], deviation: Float[np.ndarray, " e"]
 ) -> Fit:
-    """The fit with other weights; its covariance scaled to their deviations."""
+    """Returns the fit with other expression weights, and its covariance scaled so that those weights have the given
+    deviations."""
     coefficients, posed = fit.coefficients.copy(), np.asarray(model.posed)
     coefficients[posed] = weights
     if fit.covariance is None:

@@ -39,8 +39,8 @@ MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.07, 0.1  # of lids that are half closed
 
 @dataclass(frozen=True, slots=True)
 class EyeEvidence:
-    """Holds what the photographs show between the lids: shares of the opening, 0 to 1; and how far the lids stand apart
-    where a face was found (``faces.eyes.eye_openings``)."""
+    """Holds what the photographs show between an eye's lids: the shares (0 to 1) of the opening that are white and
+    dark, and the opening of the lids where a face was found (``faces.eyes.eye_openings``)."""
 
     white: float
     dark: float
@@ -49,25 +49,26 @@ class EyeEvidence:
 
     @property
     def is_surely_closed(self) -> bool:
-        """Tells whether the lids lie nearer to each other than any half closed ones."""
+        """Tells whether the measured opening is smaller than that of any half closed eye."""
         return self.opening is not None and self.opening < MIN_HALF_OPENING
 
     @property
     def is_surely_open(self) -> bool:
-        """Tells whether the lids stand farther apart than any closed ones."""
+        """Tells whether the measured opening is larger than that of any closed eye."""
         return self.opening is not None and self.opening > MAX_CLOSED_OPENING
 
     @property
     def closed(self) -> bool:
-        """Tells whether there is skin, and nothing else, between lids that do not surely stand apart; or lids that
-        surely meet."""
+        """Tells whether the eye is closed: its lids surely meet, or some view shows neither white nor dark between them
+        and they do not surely stand apart."""
         nothing = self.views > 0 and self.white < WHITE_SHARE and self.dark < DARK_SHARE
         return self.is_surely_closed or (nothing and not self.is_surely_open)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fissure:
-    """Holds the slit between the lids on the mean head: its middle, its length, and every vertex's place about it."""
+    """Holds the slit between the lids of one eye on the mean head: its length, and the position of every vertex
+    relative to its middle, along the slit and above it (mm)."""
 
     length_mm: float
     along: Float[np.ndarray, " v"]  # mm from the middle, towards the corners
@@ -75,13 +76,14 @@ class Fissure:
     front: Bool[np.ndarray, " v"]
 
     def ellipse(self, half_length: float, half_height: float, below: float = 0.0) -> Bool[np.ndarray, " v"]:
-        """Returns vertices inside an ellipse about the middle, or ``below`` it (mm)."""
+        """Returns which vertices lie inside an ellipse (half axes in mm) whose centre lies ``below`` mm under the
+        middle of the fissure."""
         inside = (self.along / half_length) ** 2 + ((self.above + below) / half_height) ** 2 < 1.0
         return self.front & inside
 
 
 def eye_fissure(model: HeadModel, side: str) -> Fissure:
-    """Returns the fissure of the ``right`` or ``left`` eye."""
+    """Returns the fissure of the eye on one ``side``, ``right`` or ``left``."""
     mean = model.vertices(np.zeros(0))
     outer, inner = (mean[model.landmarks[f"{corner}canthion_{side}"]] for corner in ("exo", "endo"))
     chord = inner - outer
@@ -132,7 +134,7 @@ def _facing(
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
     rig: Rig,
 ) -> list[str]:
-    """The cameras that look at the eye most frontally."""
+    """Returns the names of the cameras, at most ``VIEWS``, that see the eye most frontally."""
     if not len(places) or not len(normals):
         return []
     middle, outward = places.mean(axis=0), normals.mean(axis=0)
@@ -147,7 +149,8 @@ def _facing(
 def _shares(
     image: UInt8[np.ndarray, "h w 3"], opening: Float[np.ndarray, "n 2"], skin: Float[np.ndarray, "m 2"]
 ) -> tuple[float, float] | None:
-    """Shares of the opening that are white, and dark; None where the photograph does not show it."""
+    """Returns the shares of the opening that are white and that are dark, compared with the skin about it; None where
+    too little of either lies inside the photograph."""
     eye, about = _colours(image, opening), _colours(image, skin)
     if len(eye) < MIN_VERTICES or len(about) < MIN_VERTICES:
         return None
@@ -165,13 +168,14 @@ def _colours(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "n 2"]
 
 
 def _light_and_chroma(colours: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Linear light, and how far red stands off blue by it: nothing in a white, whatever its shade."""
+    """Returns the linear light of each colour, and its red less blue divided by that light: about 0 for white in any
+    shade."""
     light = colours.mean(axis=1)
     return light, (colours[:, 0] - colours[:, 2]) / np.maximum(light, 1e-3)
 
 
 def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
-    """Both lids and what lies between them."""
+    """Returns the vertices of both lids and of what lies between them."""
     half_length, half_height = 0.5 * slit.length_mm + MARGIN_MM, BRIDGE_HEIGHT * slit.length_mm
     return np.flatnonzero(slit.ellipse(half_length, half_height, -BRIDGE_RAISED * slit.length_mm))
 
@@ -179,13 +183,13 @@ def _lids(slit: Fissure) -> Int[np.ndarray, " r"]:
 def with_plain_lids(
     vertices: Float[np.ndarray, "v 3"], shape: Float[np.ndarray, "v 3"], model: HeadModel
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the head with the lids that ``shape`` has, moved as smoothly as their surroundings are.
+    """Returns the head with the lids of ``shape``, displaced as smoothly as the skin around them is displaced.
 
     Displacements along the normals tear lids apart: their margins' normals point at each other.
 
     Args:
         vertices: full level, mm.
-        shape: the same head as its eigenheads alone have it.
+        shape: the same head with eigenheads and expressions only.
         model: the topology.
     """
     moved, faces = vertices - shape, model.levels["full"].faces
@@ -218,7 +222,8 @@ def _smoothest(
     faces: Int[np.ndarray, "f 3"],
     rows: Int[np.ndarray, " r"],
 ) -> Float[np.ndarray, "r 3"]:
-    """Values of ``rows`` that minimise the squared Laplacian, the others held."""
+    """Returns the values at the vertices ``rows`` that minimise the squared Laplacian while all other vertices keep
+    theirs."""
     inside = np.zeros(len(vertices), bool)
     inside[rows] = True
     for _ in range(2):  # the Laplacian's own reach, squared

@@ -15,7 +15,7 @@ GIVING_WAY = 0.8  # what a sweep leaves of a displacement, in the second half of
 def folded(
     before: Float[np.ndarray, "v 3"], after: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " f"]:
-    """Returns triangles that a displacement turns over or squeezes to nothing."""
+    """Tells which triangles a displacement turns over or squeezes to almost no area."""
     old, new = face_normals(before, faces), face_normals(after, faces)
     size, length = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
     return ((old * new).sum(axis=1) <= MAX_TURN * size * length) | (length < MIN_AREA * size)
@@ -24,9 +24,11 @@ def folded(
 def unfolded(
     before: Float[np.ndarray, "v 3"], after: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns ``after`` without folds: about each, the displacement is smoothed until there is none.
+    """Returns the vertices ``after`` a displacement, with folds removed: about each fold the displacement is smoothed
+    until no triangle is turned over.
 
-    Where smoothing does not help (two displacements that meet), the place goes back towards ``before``.
+    In the second half of the sweeps the displacement there also shrinks, so that the vertices go back towards
+    ``before``.
     """
     bad = faces[folded(before, after, faces)]
     if not len(bad):
@@ -51,7 +53,7 @@ def unfolded(
 def _around(
     chosen: Int[np.ndarray, "b 3"], faces: Int[np.ndarray, "f 3"], count: int, rings: int
 ) -> Int[np.ndarray, "g 3"]:
-    """The faces within some rings of the chosen ones."""
+    """Returns the faces within the given number of rings about the chosen faces."""
     about = np.zeros(count, bool)
     about[chosen] = True
     for _ in range(rings - 1):
@@ -60,7 +62,8 @@ def _around(
 
 
 def _neighbour_mean(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_array:
-    """The mean over the faces at a vertex of their corners: the vertex itself and what is beside it."""
+    """Returns the matrix that takes, for each vertex, the mean over the corners of the faces at it; the vertex itself
+    is among those corners."""
     rows, columns = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel()
     share = 1.0 / np.maximum(np.bincount(rows, minlength=count), 1)
     return sparse.csr_array((share[rows], (rows, columns)), shape=(count, count))

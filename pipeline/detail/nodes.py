@@ -22,7 +22,8 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeMesh:
-    """Holds control points of a displacement: ``full = operator @ nodes``."""
+    """Holds a mesh of control points, the nodes. A displacement of the nodes gives that of the full level: ``full =
+    operator @ nodes``."""
 
     faces: Int[np.ndarray, "f 3"]
     operator: sparse.csr_array  # (v, n)
@@ -31,7 +32,7 @@ class NodeMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nodes:
-    """Holds the two meshes."""
+    """Holds the coarse and the fine mesh of control points that a displacement is solved on."""
 
     coarse: NodeMesh
     fine: NodeMesh
@@ -39,7 +40,7 @@ class Nodes:
 
 @lru_cache(maxsize=2)  # models are few, jobs are many
 def solving_nodes(model: HeadModel) -> Nodes:
-    """Returns both meshes of a model."""
+    """Returns the coarse and the fine control mesh of a model."""
     full, cage = model.levels["full"], model.levels["cage"]
     if full.count == cage.count:
         full_nodes = node_mesh(full.faces, sparse.csr_array(sparse.identity(full.count, format="csr")))
@@ -53,7 +54,8 @@ def solving_nodes(model: HeadModel) -> Nodes:
 
 
 def node_mesh(faces: Int[np.ndarray, "f 3"], operator: sparse.csr_array) -> NodeMesh:
-    """Returns the control mesh of a subdivision, which keeps old vertices first: node i is laid out by vertex i."""
+    """Returns the control mesh of a subdivision ``operator``. Node i lies at vertex i, since subdivision keeps old
+    vertices first."""
     total, count = row_count(operator), row_count(sparse.csr_array(operator.T))
     shape = sparse.csr_array((np.ones(count), (np.arange(count), np.arange(count))), shape=(count, total))
     return NodeMesh(faces, sparse.csr_array(operator), shape)

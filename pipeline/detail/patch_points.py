@@ -42,7 +42,8 @@ class PatchPlaces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchSearch:
-    """Holds the photographs, the cameras where the fit has them, and the patches of a model."""
+    """Holds what a search with patches needs: the photographs, the cameras with the fit's corrections, and the patches
+    of a model."""
 
     model: HeadModel
     patches: Patches
@@ -53,7 +54,8 @@ class PatchSearch:
     settings: PhotoSettings
 
     def places(self, vertices: Float[np.ndarray, "v 3"]) -> PatchPlaces:
-        """Returns what the photographs say of a head (world, mm)."""
+        """Finds where the photographs see the surface near a head (world frame, mm). Keeps the patches with a clear
+        match in several views that hair does not cover."""
         level, coarse = self.model.levels["full"], self.model.levels[DEPTH_LEVEL]
         head, hiding = Mesh(vertices, level.faces), Mesh(vertices[coarse.rows], coarse.faces)
         speaks = self.photographs.speaks
@@ -80,7 +82,7 @@ def patch_search(
     *,
     settings: PhotoSettings,
 ) -> PatchSearch:
-    """Returns patches of ``model`` in the photographs of the views that the fit has.
+    """Prepares the search: lays patches on ``model`` and loads the photographs of the views that have a silhouette.
 
     Args:
         model: whose full level the patches lie on.

@@ -49,7 +49,8 @@ SEED = 16
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds one association and one solution. ``agreement``: least cosine between a point's normal and the head's."""
+    """Holds the limits of one round, which finds the places of the points and then solves for the displacement.
+    ``agreement`` is the least cosine between a point's normal and the head's."""
 
     reach_mm: float
     loose_reach_mm: float
@@ -65,7 +66,7 @@ PATCH_REACH_MM = 4.0  # about a patch no dense point is asked: a window reaches 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeformedSurface:
-    """Holds the head in the world frame, mm, and what is known of it."""
+    """Holds the displaced head (world frame, mm), the deviation of each vertex, and how far its eyes are closed."""
 
     vertices: Float[np.ndarray, "v 3"]
     deviation_mm: Float[np.ndarray, " v"]  # along the normal
@@ -87,7 +88,7 @@ def refine_to_surface(
     patches: PatchSearch | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
-    """Returns a fit's head drawn to the dense surface.
+    """Displaces the fitted head to the dense surface.
 
     Args:
         fit: with its posterior.
@@ -145,7 +146,7 @@ def deform_to_points(
     look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
-    """Returns a surface displaced to points of another, as far as those speak.
+    """Displaces a surface to points that another surface shows, where there are points near it.
 
     Args:
         vertices: of the surface, mm.
@@ -207,8 +208,8 @@ def observe(
     settings: FineSettings,
     floor_mm: float,
 ) -> tuple[Observed, Bool[np.ndarray, " v"]]:
-    """Returns what the points say of the head as it stands ``now``, as offsets from ``base``; and the vertices that
-    skin shows.
+    """Returns what the points say of the head at ``now``: their offsets (mm) from ``base``, and which vertices belong
+    to a triangle that a point of skin shows. Points of hair count only where the head stands out of them.
 
     A normal is half the point's, half the head's (Rusinkiewicz 2019, *A symmetric objective function for ICP*): exact
     to second order where both are curved.
@@ -250,7 +251,8 @@ def with_patches(
     faces: Int[np.ndarray, "f 3"],
     robust_mm: float,
 ) -> Observed:
-    """Returns what patches of the head as it stands ``now`` say, and dense points where no patch is near."""
+    """Returns the observations of the patches, measured on the head at ``now``, with the dense observations farther
+    than ``PATCH_REACH_MM`` from every patch."""
     vertex, normals = found.vertex, vertex_normals(now, faces)[found.vertex]
     if not len(vertex):
         return observed
@@ -276,7 +278,8 @@ def _local_density(
     faces: Int[np.ndarray, "f 3"],
     correlation_mm: float,
 ) -> Float[np.ndarray, " n"]:
-    """How many points err alike with each, itself included: those within the area over which dense matching does."""
+    """Returns, for each point, how many points share its error, itself included: those within ``correlation_mm`` of it,
+    by the density of points there."""
     area = np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
                                    vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1) / 6.0  # fmt: skip
     mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
@@ -298,8 +301,8 @@ def field_deviation(
     observed: Bool[np.ndarray, " v"],
     settings: FineSettings,
 ) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation along the normal: from draws about what was observed, the fit's own far from it;
-    what all points may err alike stands beside the former."""
+    """Returns the standard deviation (mm) of every vertex along its normal. Near observed vertices it comes from draws
+    of the posterior and from the error that all points share; far from them it is at least ``deviation_mm``."""
     draws = posterior.draws(np.random.default_rng(SEED), settings.draws)
     square = np.full(len(normals), settings.common_mm**2)
     for k in range(settings.draws):

@@ -23,7 +23,7 @@ MAX_COTANGENT = 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothField:
-    """Holds unit-variance Matern field on the v vertices of a mesh."""
+    """Holds a Matern field of unit variance on the v vertices of a mesh."""
 
     operator: sparse.csr_array  # K, (v, v), symmetric
     mass: Float[np.ndarray, " v"]  # mm^2
@@ -31,7 +31,7 @@ class SmoothField:
 
     @property
     def precision_scale(self) -> float:
-        """Returns tau^2 of unit deviation."""
+        """Returns tau^2, the factor that gives the field unit variance."""
         return self.length_mm**2 / (4.0 * np.pi)
 
     def draw(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "v n"]:

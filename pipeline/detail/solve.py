@@ -35,19 +35,19 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directions:
-    """Says how the head moves with the field: (3 v, d n), coordinates of a vertex and directions of a node side by
-    side."""
+    """Holds the matrix (3 v, d n) that turns the field into displacements: rows are the coordinates of the v vertices,
+    columns the d directions of the n nodes."""
 
     matrix: sparse.csr_array
     count: int  # d
 
     def moved(self, field: Float[np.ndarray, " u"]) -> Float[np.ndarray, "v 3"]:
-        """Returns the displacement, mm."""
+        """Returns the displacement (mm) of every vertex under the given values of the field."""
         return (self.matrix @ field).reshape(-1, 3)
 
 
 def free_directions(mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"]) -> Directions:
-    """Lets every node move as it likes."""
+    """Returns directions in which every node may move along x, y and z, scaled by its amplitude (mm)."""
     scaled = mesh.operator @ sparse.diags_array(amplitude_mm)
     return Directions(sparse.csr_array(sparse.kron(scaled, sparse.identity(3), format="csr")), 3)
 
@@ -55,7 +55,8 @@ def free_directions(mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"]) -> Di
 def normal_directions(
     mesh: NodeMesh, amplitude_mm: Float[np.ndarray, " n"], normals: Float[np.ndarray, "v 3"]
 ) -> Directions:
-    """Moves every vertex along its own normal, by the blend of its nodes."""
+    """Returns directions in which every vertex moves along its own normal only, by the interpolated amounts of its
+    nodes."""
     scaled = sparse.csr_array(mesh.operator @ sparse.diags_array(amplitude_mm))
     vertices = len(normals)
     along = sparse.csr_array(
@@ -67,7 +68,7 @@ def normal_directions(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
-    """Holds a Gaussian over the field's nodes: its mean, and its precision's factor."""
+    """Holds the Gaussian posterior of the field at the nodes: its mean and the factorised precision matrix."""
 
     mean: Float[np.ndarray, " u"]
     factor: SuperLU
@@ -76,7 +77,7 @@ class Posterior:
     directions: Directions
 
     def draws(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "u c"]:
-        """Draws about the mean."""
+        """Returns ``count`` random deviations of the field from the posterior mean, one per column."""
         d = self.directions.count
         prior = self.field.draw(rng, count * d).reshape(-1, d, count).reshape(-1, count)
         noise = rng.standard_normal((row_count(self.rows), count))
@@ -85,7 +86,7 @@ class Posterior:
 
 @traced
 def solve_field(field: SmoothField, directions: Directions, observed: Observed) -> Posterior:
-    """Returns the field's posterior.
+    """Computes the posterior of the displacement field from its prior and the observations.
 
     Args:
         field: the unit field's prior on the nodes.
@@ -102,7 +103,8 @@ def solve_field(field: SmoothField, directions: Directions, observed: Observed) 
 
 
 def _planes(observed: Observed, coordinates: int) -> sparse.csr_array:
-    """sqrt(q) n . X of each observation, by the coordinates of all vertices."""
+    """Returns the matrix that maps the coordinates of all vertices to sqrt(information) normal . X of each observation,
+    with X the place on the head."""
     count = len(observed.corner)
     value = np.sqrt(observed.information)[:, None, None] * observed.blend[:, :, None] * observed.normal[:, None, :]
     column = 3 * observed.corner[:, :, None].astype(np.int64) + np.arange(3)

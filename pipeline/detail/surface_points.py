@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePoints:
-    """Holds n points of the visible surface in the world frame, each with what it shows."""
+    """Holds n points of the visible surface in the world frame, each with its normal, its deviation and the part of the
+    head that it shows."""
 
     points: Float[np.ndarray, "n 3"]  # mm
     normals: Float[np.ndarray, "n 3"]  # unit, outwards
@@ -16,12 +17,13 @@ class SurfacePoints:
     part: UInt8[np.ndarray, " n"]  # codes of ``Part``
 
     def chosen(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> "SurfacePoints":
-        """Returns the given rows."""
+        """Returns the points of the chosen rows."""
         return SurfacePoints(self.points[rows], self.normals[rows], self.deviation_mm[rows], self.part[rows])
 
 
 def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
-    """Returns at most one point for each cell of a grid, part and side of a sheet: the means, weighted by information.
+    """Returns at most one point for each cell of a grid, part of the head and main direction of the normal: the mean of
+    the points there, weighted by their information.
 
     The deviation stays that of a single point: neighbours err alike, since their windows overlap.
 

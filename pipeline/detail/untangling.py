@@ -29,7 +29,8 @@ ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """Holds triangles, which of them share an edge, and which vertices do (1 in ``beside``)."""
+    """Holds a mesh's triangles, the pairs of triangles that share an edge, and a matrix with 1 for every two vertices
+    joined by an edge (``beside``)."""
 
     faces: Int[np.ndarray, "f 3"]
     pairs: Int[np.ndarray, "e 2"]
@@ -57,12 +58,13 @@ def head_topology(model: HeadModel) -> Topology:
 def untangled_head(
     model: HeadModel, vertices: Float[np.ndarray, "v 3"], deviation_mm: Float[np.ndarray, " v"]
 ) -> tuple[Mesh, Float[np.ndarray, " v"]]:
-    """Returns the head without spoilt triangles, and its deviation with what that moved each vertex by.
+    """Returns the head without spoilt triangles, and the deviation of each vertex enlarged by the distance that it
+    moved.
 
     Args:
         model: the topology.
         vertices: full level, mm.
-        deviation_mm: standard deviation of each.
+        deviation_mm: standard deviation of each vertex.
     """
     clean = untangled(vertices, head_topology(model))
     moved_mm = np.linalg.norm(clean - vertices, axis=1)
@@ -70,7 +72,8 @@ def untangled_head(
 
 
 def untangled(vertices: Float[np.ndarray, "v 3"], topology: Topology) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices with every spoilt spot made smooth; it is clean in single precision, as files hold it."""
+    """Returns the vertices with every spoilt spot smoothed. The result is tested in single precision, as files store
+    it."""
     out, faces = vertices.astype(np.float32, order="C").astype(float), topology.faces
     times, touched = np.zeros(len(out), int), np.zeros(len(out), bool)
     spoilt = spoilt_faces(out, topology)
@@ -89,8 +92,8 @@ def untangled(vertices: Float[np.ndarray, "v 3"], topology: Topology) -> Float[n
 def spoilt_faces(
     vertices: Float[np.ndarray, "v 3"], topology: Topology, within: Bool[np.ndarray, " v"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Returns the triangles that are turned over, folded onto a neighbour or crossing another; only of those at the
-    vertices ``within``, and what crosses them, where given."""
+    """Tells which triangles are turned over, folded onto a neighbour or crossing another one. With ``within``, looks
+    only at triangles with a corner among those vertices, and at what they touch or cross."""
     active = None if within is None else _any_corner(within, topology.faces)
     return turned_faces(vertices, topology, active) | crossing_faces(vertices, topology.faces, active)
 
@@ -98,8 +101,8 @@ def spoilt_faces(
 def turned_faces(
     vertices: Float[np.ndarray, "v 3"], topology: Topology, active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Returns the triangles that look against the mean normal of their corners, and every two that share an edge and
-    are folded by more than ``MAX_FOLD_DEG``; only among the ``active`` and their neighbours, where given."""
+    """Tells which triangles face against the mean normal of their corners, or are folded by more than ``MAX_FOLD_DEG``
+    against a triangle across an edge. With ``active``, looks only at those triangles and their neighbours."""
     faces, count = topology.faces, len(vertices)
     near = np.ones(len(faces), bool) if active is None else _around(_around(active, faces, count), faces, count)
     rows, pairs = np.flatnonzero(near), topology.pairs
@@ -122,7 +125,7 @@ def turned_faces(
 
 
 def _around(chosen: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"], count: int) -> Bool[np.ndarray, " f"]:
-    """The chosen triangles and those that share a corner with them."""
+    """Returns the chosen triangles and those that share a corner with them."""
     corner = np.zeros(count, bool)
     corner[faces[chosen]] = True
     return _any_corner(corner, faces)
@@ -135,7 +138,8 @@ def _any_corner(vertex: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -
 def _with_rings(
     times: Int[np.ndarray, " v"], spoilt: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " v"]:
-    """The corners of spoilt triangles with as many rings about each as the times that it was spoilt ask for."""
+    """Returns the vertices of all spots: the corners of the spoilt triangles and the rings about them. The number of
+    rings (``RINGS``) grows with how often a corner was spoilt."""
     spot, reach = np.unique(faces[spoilt]), np.zeros(len(times), int)
     reach[spot] = 1 + np.array(RINGS)[np.minimum(times[spot], len(RINGS)) - 1]
     for _ in range(int(reach.max()) - 1):
@@ -145,7 +149,7 @@ def _with_rings(
 
 
 def _with_enclosed(spot: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " v"]:
-    """The spot and the small pieces that it cuts off from the rest."""
+    """Returns the spot together with the small pieces of the mesh that it cuts off from the rest."""
     piece = component_of(faces[~_any_corner(spot, faces)].astype(np.int32, copy=False), len(spot))
     size = np.bincount(piece[~spot], minlength=len(spot))
     return spot | (size[piece] < ENCLOSED_SHARE * len(spot))
@@ -154,7 +158,8 @@ def _with_enclosed(spot: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) 
 def _membrane(
     vertices: Float[np.ndarray, "v 3"], rows: Int[np.ndarray, " r"], topology: Topology
 ) -> Float[np.ndarray, "r 3"]:
-    """Places of ``rows`` at which each is the mean of its neighbours, the others held."""
+    """Returns the positions of the vertices ``rows`` at which each is the mean of its neighbours while all other
+    vertices stay."""
     beside, free = topology.beside[rows], np.zeros(len(vertices), bool)
     free[rows] = True
     count = np.asarray(beside.sum(axis=1)).ravel()

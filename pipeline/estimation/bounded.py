@@ -41,11 +41,11 @@ def _least_in_box(
     lower: Float[np.ndarray, " k"],
     upper: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"]:
-    """The same where every unknown has a bound, by block principal pivoting (Judice and Pires 1994, *A block principal
-    pivoting algorithm for large-scale strictly monotone linear complementarity problems*).
+    """Minimises the same form where every unknown has a bound, by block principal pivoting (Judice and Pires 1994, *A
+    block principal pivoting algorithm for large-scale strictly monotone linear complementarity problems*).
 
-    Each unknown is at one of its bounds or free. Those that violate their conditions change their side, all together;
-    where that does not lead on, the last of them alone (Murty's rule, which ends in any case).
+    Each unknown is free or at one of its bounds. All unknowns that violate their conditions change together; if that
+    makes no progress, only the last of them changes (Murty's rule, which always ends).
     """
     side, fewest, patience = np.zeros(len(gradient), int), len(gradient) + 1, PATIENCE
     slack = ROUNDING * np.where(np.isfinite(upper - lower), upper - lower, 1.0)

@@ -32,7 +32,8 @@ Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.n
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Holds when to stop, and how to begin. ``tolerance``: predicted fall of the cost (squared standard deviations)."""
+    """Holds the stopping rule and the first damping of a search. ``tolerance``: the least predicted fall of the cost
+    (squared standard deviations) that is worth another step."""
 
     steps: int = 50
     tolerance: float = 1e-6
@@ -43,7 +44,8 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Says how a solution came about; ``predicted_fall``: of the last step tried, in squared standard deviations."""
+    """Holds how a search ended. ``predicted_fall``: the fall of the cost predicted for the last step, in squared
+    standard deviations."""
 
     termination_reason: Reason
     evaluations: int
@@ -54,7 +56,8 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution(Generic[Value]):
-    """Holds the best value found, the problem there (for its normal equations), and the evidence."""
+    """Holds the best value of a search, the problem linearised there (for its normal equations), and how the search
+    ended."""
 
     value: Value
     at: Linearised
@@ -62,7 +65,8 @@ class Solution(Generic[Value]):
 
 
 def cholesky_solve(matrix: Float[np.ndarray, "p p"], right: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """Returns the solution of a symmetric positive definite system. Raises LinAlgError where it is not definite."""
+    """Solves a symmetric positive definite system of equations. Raises LinAlgError if the matrix is not positive
+    definite."""
     # Not ``solve(assume_a="pos")``: its estimate of the condition warns of unknowns with different units.
     return scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix, check_finite=False), right, check_finite=False)
 
@@ -76,7 +80,7 @@ def minimise(
     at_start: Linearised | None = None,
     watch: Callable[[], None] = lambda: None,
 ) -> Solution[Value]:
-    """Returns a local minimum of the problem's cost.
+    """Searches for a local minimum of the problem's cost by Levenberg-Marquardt.
 
     Args:
         problem: terms, unknowns, and how a step moves a value.
@@ -122,7 +126,7 @@ def minimise(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place(Generic[Value]):
-    """A value with the problem there and its cost."""
+    """Holds a value with the problem linearised there and its cost."""
 
     value: Value
     at: Linearised
@@ -135,7 +139,7 @@ def _place(problem: Problem[Value], value: Value) -> _Place[Value]:
 
 
 def _damped_step(equations: NormalEquations, damping: float, solve: Solve) -> Float[np.ndarray, " p"] | None:
-    """The step, or None where the damped matrix is not positive definite."""
+    """Returns the step of the damped equations, or None if their matrix is not positive definite."""
     try:
         return -solve(_damped(equations, damping), equations.gradient)
     except np.linalg.LinAlgError:
@@ -155,7 +159,7 @@ def _within(
     step: Float[np.ndarray, " p"],
     room: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
 ) -> tuple[Float[np.ndarray, " p"], float]:
-    """The step within its room, and the fall of the cost that the damped model predicts for it."""
+    """Returns the step limited to its bounds ``room``, and the fall of the cost that the equations predict for it."""
     if ((step >= room[0]) & (step <= room[1])).all():
         return step, -float(equations.gradient @ step)
     damped = _damped(equations, damping)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 
 def inverse(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Returns M^-1, symmetric to the last bit."""
+    """Returns M^-1, exactly symmetric."""
     root = _root(matrix)
     (invert,) = scipy.linalg.get_lapack_funcs(("potri",), (root,))
     found, fault = invert(root, lower=1)
@@ -25,5 +25,5 @@ def inverse_diagonal(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"
 
 
 def _root(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """L, with zeros above its diagonal."""
+    """Returns the lower Cholesky factor L, with zeros above its diagonal."""
     return scipy.linalg.cholesky(matrix, lower=True, check_finite=False)

@@ -20,13 +20,13 @@ class Loss(Protocol):
         ...
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Returns rho'(s): 1 at 0, less for what is forgiven."""
+        """Returns rho'(s): 1 at 0, less for residuals that the loss forgives."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class LeastSquares:
-    """Is rho(s) = s: a Gaussian."""
+    """Computes the loss rho(s) = s of Gaussian errors."""
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         return squares
@@ -37,9 +37,10 @@ class LeastSquares:
 
 @dataclass(frozen=True, slots=True)
 class GemanMcClure:
-    """Is rho(s) = s / (1 + s / c^2), at most c^2: a residual of many c says nothing. Geman and McClure 1987.
+    """Computes the loss rho(s) = s / (1 + s / c^2), at most c^2, so that residuals of many c have almost no weight.
+    Geman and McClure 1987.
 
-    ``scale``: c, in the unit of the residual whose square is given; an array for one of each residual's own.
+    ``scale``: c, in the unit of the unsquared residual; an array sets it for each residual.
     """
 
     scale: float | Float[np.ndarray, "*n"]
@@ -53,7 +54,7 @@ class GemanMcClure:
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    """Is rho(s) = c^2 log(1 + s / c^2)."""
+    """Computes the loss rho(s) = c^2 log(1 + s / c^2), where ``scale`` is c."""
 
     scale: float
 
@@ -66,7 +67,7 @@ class Cauchy:
 
 @dataclass(frozen=True, slots=True)
 class Huber:
-    """Is rho(s) = s up to c^2, 2 c sqrt(s) - c^2 beyond. Huber 1964."""
+    """Computes the loss rho(s) = s up to c^2, 2 c sqrt(s) - c^2 beyond, where ``scale`` is c. Huber 1964."""
 
     scale: float
 

@@ -20,7 +20,7 @@ from pipeline.estimation.robust import LeastSquares, Loss
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Holds j^T W J and J^T W r over p unknowns."""
+    """Holds the matrix J^T W J and the gradient J^T W r over p unknowns."""
 
     matrix: Float[np.ndarray, "p p"]
     gradient: Float[np.ndarray, " p"]
@@ -36,13 +36,14 @@ ValueIn = TypeVar("ValueIn", contravariant=True)
 
 @runtime_checkable
 class Linearised(Protocol):
-    """Describes a term at one value: its cost, and its normal equations for who asks."""
+    """Describes a term at one value: its cost, and a method that adds its normal equations to others."""
 
     @property
     def cost(self) -> float: ...
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds its part in place: sums of a thousand unknowns are 8 MB each."""
+        """Adds the term's matrix and gradient to ``equations`` in place, since matrices of a thousand unknowns take 8
+        MB each."""
         ...
 
 
@@ -55,7 +56,7 @@ class Term(Protocol[ValueIn]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Holds residuals at a value, with the Jacobian to be had: cost ``sum_i rho(|r_i|^2)``.
+    """Holds residuals at one value and a function that computes their Jacobian; the cost is ``sum_i rho(|r_i|^2)``.
 
     ``residual``: n residuals of d components, in standard deviations; ``jacobian`` computes their derivatives by the
     unknowns. The loss is of the norm of all d components.
@@ -82,8 +83,9 @@ class Residuals:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quadratic:
-    """Holds ``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector: a Gaussian prior where g is zero, or what another
-    problem, solved for everything else, says of x. ``matrix`` M, ``centre`` c, ``pull`` g (towards the minimum)."""
+    """Holds the quadratic form ``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector x, with ``matrix`` M, ``centre`` c
+    and ``pull`` g (towards the minimum). With g zero it is a Gaussian prior; it can also summarise another problem that
+    is solved for everything but x."""
 
     matrix: Float[np.ndarray, "p p"]
     centre: Float[np.ndarray, " p"]
@@ -91,7 +93,7 @@ class Quadratic:
 
     @classmethod
     def prior(cls, information: Float[np.ndarray, "p p"], mean: Float[np.ndarray, " p"]) -> "Quadratic":
-        """Returns N(mean, information^-1)."""
+        """Returns the form of the Gaussian prior N(mean, information^-1)."""
         return cls(information, mean, np.zeros(len(mean)))
 
     def at(self, value: Float[np.ndarray, " p"]) -> "LinearisedQuadratic":
@@ -100,7 +102,7 @@ class Quadratic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedQuadratic:
-    """Holds ``Quadratic`` at a distance from its centre."""
+    """Holds the form ``term`` at the distance ``away`` from its centre."""
 
     term: Quadratic
     away: Float[np.ndarray, " p"]
@@ -116,7 +118,7 @@ class LinearisedQuadratic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sum:
-    """Holds several terms at one value."""
+    """Holds several terms at one value, as one term."""
 
     parts: tuple[Linearised, ...]
 
@@ -131,7 +133,7 @@ class Sum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeOnly:
-    """Holds a term's part over some of its unknowns; the others stay where they are. ``free``: which of all q move."""
+    """Holds a term restricted to the unknowns that are ``free`` (one flag for each of all q); the others stay fixed."""
 
     whole: Linearised
     free: Bool[np.ndarray, " q"]
@@ -149,10 +151,10 @@ class FreeOnly:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem(Generic[Value]):
-    """Holds a complete problem: all terms, the number of unknowns, and what a step in them does to a value.
+    """Holds a complete problem: its terms, the number of unknowns, and the function that applies a step to a value.
 
-    ``free``: which of the unknowns move, all by default. ``moved(value, step)`` gets steps of all unknowns.
-    ``room(value)``: the least and the largest step of each free unknown, infinite where nothing bounds it.
+    ``free``: which of the unknowns move, all by default. ``moved(value, step)`` receives steps of all unknowns.
+    ``room(value)``: the least and the largest step of each free unknown, infinite where it has no bound.
     """
 
     terms: tuple[Term[Value], ...]
@@ -163,7 +165,7 @@ class Problem(Generic[Value]):
 
     @property
     def size(self) -> int:
-        """Tells how many unknowns move."""
+        """Returns the number of free unknowns."""
         return self.unknowns if self.free is None else int(np.count_nonzero(self.free))
 
     def at(self, value: Value) -> Linearised:
@@ -177,7 +179,7 @@ class Problem(Generic[Value]):
         return equations
 
     def after(self, value: Value, step: Float[np.ndarray, " f"]) -> Value:
-        """Returns ``value`` moved by a step of the free unknowns."""
+        """Returns ``value`` after a step of the free unknowns."""
         if self.free is None:
             return self.moved(value, step)
         whole = np.zeros(self.unknowns)

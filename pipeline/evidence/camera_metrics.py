@@ -29,13 +29,13 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """Says how well the fitted head explains one camera.
+    """Holds how well the fitted head explains one camera's silhouette.
 
     ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none trimmed; ``excluded_share`` is the
-    part of them (0 to 1) that the fit did not believe. ``xor_cost`` is eq. (5) of the fitted head, ``xor_cost_start``
-    of the head that the fit started from. ``outside_rms_px`` counts only how far the head reaches beyond the mask: what
-    lies inside it may be hidden by hair, hands or shoulders. A figure that a view cannot have (no rim sample in it) is
-    None.
+    part of them (0 to 1) whose residual is too large for the fit to use. ``xor_cost`` is eq. (5) of the fitted head,
+    ``xor_cost_start`` of the head that the fit started from. ``outside_rms_px`` counts only how far the head reaches
+    beyond the mask: what lies inside it may be hidden by hair, hands or shoulders. A figure that a view cannot have (no
+    rim sample in it) is None.
     """
 
     used: bool
@@ -56,10 +56,8 @@ def camera_figures(
     fitted: Masks,
     started: Masks,
 ) -> dict[str, CameraFigures]:
-    """Returns figures of every camera, in the rig's order; rim figures over the face region, none trimmed.
-
-    The cameras stand where their calibration says, not where the fit has moved them.
-    """
+    """Computes the figures of every camera, in the rig's order, with the cameras as calibrated rather than as the fit
+    corrected them."""
     level = model.levels["full"]
     vertices = fit.world_from_head.apply(model.vertices(fit.coefficients))
     views = pack_views(rig, {camera.name: silhouettes[camera.name].distance for camera in rig})
@@ -91,7 +89,8 @@ def _rms(values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> fl
 
 
 def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) -> list[float]:
-    """Eq. (5) of each model. Beyond the box around all of them nothing differs, and nothing there is nearest."""
+    """Returns the cost of eq. (5) for each model's mask. Only the box around all masks is compared, since nothing
+    differs outside."""
     everything = observed.copy()
     for model in models:
         everything |= model
@@ -101,7 +100,7 @@ def _costs(observed: Bool[np.ndarray, "h w"], *models: Bool[np.ndarray, "h w"]) 
 
 
 def _zone(camera: Camera, face_world: Float[np.ndarray, "v 3"]) -> Bool[np.ndarray, "h w"]:
-    """The hull of the face in the image, a little wider: where hair and shoulders do not decide."""
+    """Marks the convex hull of the face in the image and a margin, where hair and shoulders do not matter."""
     zone = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
     pixels = camera.project(face_world)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -114,13 +113,13 @@ def _zone(camera: Camera, face_world: Float[np.ndarray, "v 3"]) -> Bool[np.ndarr
 def _overlap(
     observed: Bool[np.ndarray, "h w"], fitted: Bool[np.ndarray, "h w"], zone: Bool[np.ndarray, "h w"]
 ) -> float | None:
-    """Intersection over union inside the zone."""
+    """Returns the intersection over union of two masks inside the zone; None if both are empty there."""
     union = np.count_nonzero((observed | fitted) & zone)
     return float(np.count_nonzero(observed & fitted & zone) / union) if union else None
 
 
 def start_masks(model: HeadModel, world_from_head: Similarity, rig: Rig) -> dict[str, Bool[np.ndarray, "h w"]]:
-    """Returns the mean head where the alignment put it, as each camera sees it."""
+    """Returns the mask of the mean head in each camera, at the pose of the alignment."""
     vertices = world_from_head.apply(model.vertices(np.zeros(0), START_LEVEL))
     depths = depth_maps(rig, Mesh(vertices, model.levels[START_LEVEL].faces))
     return {name: np.isfinite(depth) for name, depth in depths.items()}

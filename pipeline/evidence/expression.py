@@ -20,8 +20,8 @@ CLOSED = 0.8  # lids that are so far closed show no eye
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Holds an expression of a head: its name in the model, its weight from 0 to 1, and the weight's standard deviation
-    (None where the fit has none)."""
+    """Holds one expression of a head: its name in the model, its weight from 0 to 1, and the weight's standard
+    deviation (None if the fit has none)."""
 
     name: str
     weight: float
@@ -34,8 +34,8 @@ class Found:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlendshapeRig:
-    """Holds a neutral head and what it can do. ``missing``: Apple's names that the model has no counterpart for; their
-    morphs move nothing."""
+    """Holds a neutral head, the morphs that animate it, and their weights on the photographed head. ``missing``:
+    Apple's names without a counterpart in the model; their morphs move nothing."""
 
     neutral_world: Mesh
     morphs: Mapping[str, Float[np.ndarray, "v 3"]]  # mm, head frame, at weight 1
@@ -44,13 +44,14 @@ class BlendshapeRig:
 
 
 def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
-    """Returns every expression of the fit's model; nothing where it has none."""
+    """Returns the fitted weight of every expression of the model, by name; empty if the model has none."""
     fitted = fit.coefficients[model.posed.start : model.posed.stop] if len(model.posed) else ()
     return dict(zip(model.expressions.names, (float(w) for w in fitted), strict=False))
 
 
 def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = MIN_SIGMA) -> tuple[Found, ...]:
-    """Returns what the head does, the strongest first: weights of more than ``least_sigma`` deviations."""
+    """Returns the expressions whose weight is at least ``TOLD`` and more than ``least_sigma`` standard deviations, the
+    strongest first."""
     weights = fitted_weights(model, fit)
     spread = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance))[np.asarray(model.posed, int)]
     found = []
@@ -62,12 +63,12 @@ def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = MIN_SIGMA
 
 
 def shut_eyes(model: HeadModel, fit: Fit) -> frozenset[str]:
-    """Returns eyes whose fitted lids are closed."""
+    """Returns the eyes (``right``, ``left``) whose fitted lids are closed."""
     return frozenset(side for side, share in closed_lids(fitted_weights(model, fit)).items() if share >= CLOSED)
 
 
 def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]) -> Mesh:
-    """Returns the head without its expressions: what no blendshape made stays."""
+    """Returns the head with the displacement of its expressions subtracted; all other detail stays."""
     moved = model.levels["full"].operator @ model.expressions.moved({each.name: each.weight for each in found})
     back = place.scale * moved @ place.rotation.T
     return Mesh(mesh_world.vertices - back, mesh_world.faces, mesh_world.colours)
@@ -76,8 +77,8 @@ def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: C
 def build_blendshape_rig(
     model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]
 ) -> BlendshapeRig:
-    """Returns the neutral head with Apple's 52 morphs, and one of its own for whatever of the found expression they
-    leave out, so that the morphs' weights give the head as photographed."""
+    """Builds the neutral head with Apple's 52 morphs. Adds a morph for every found expression that they do not fully
+    reproduce, so that the weights give the head as photographed."""
     operator, names = model.levels["full"].operator, model.expressions.names
     expression_weights = {each.name: each.weight for each in found}
     morphs, weights, left = {}, {}, dict(expression_weights)

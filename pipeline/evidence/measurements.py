@@ -69,9 +69,10 @@ class Measurement:
 
 
 def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None) -> dict[str, Landmark]:
-    """Returns the model's landmarks on the fitted head, world frame.
+    """Returns the model's landmarks on the fitted head, world frame, mm.
 
-    ``vertices``: the head as delivered (full level, world, mm) where it goes beyond the fit; deviations stay the fit's.
+    ``vertices``: the head as delivered (full level, world, mm) if it was refined beyond the fit; deviations stay the
+    fit's.
     """
     names = list(model.landmarks)
     index = np.array([model.landmarks[name] for name in names])
@@ -89,7 +90,7 @@ def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | N
 def measurements(
     model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None
 ) -> dict[str, Measurement]:
-    """Returns every distance of ``DISTANCES`` whose two points the model has; ``vertices`` as for ``landmarks``."""
+    """Returns every distance of ``DISTANCES`` whose end points the model has; ``vertices`` as for ``landmarks``."""
     rows = dict(model.landmarks) | _cranial_points(model, fit)
     found = {name: ends for name, ends in DISTANCES.items() if ends[0] in rows and ends[1] in rows}
     index = np.array([[rows[a], rows[b]] for a, b in found.values()], int).reshape(-1)
@@ -109,7 +110,7 @@ def measurements(
 
 
 def _normals(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None) -> Float[np.ndarray, "v 3"]:
-    """Of the head as delivered, world frame."""
+    """Returns the vertex normals (world frame) of the delivered head or, if None, of the fitted one."""
     head = fit.world_from_head.apply(model.vertices(fit.coefficients)) if vertices is None else vertices
     return vertex_normals(head, model.levels["full"].faces)
 
@@ -120,7 +121,8 @@ def _sliding_apart(
     first_normals: Float[np.ndarray, "n 3"],
     second_normals: Float[np.ndarray, "n 3"],
 ) -> Float[np.ndarray, " n"]:
-    """Variance of distances along ``units`` between places that slide with unit variance, each in its tangent plane."""
+    """Returns the variance of distances along ``units`` between places that slide in their tangent planes with unit
+    variance. Near places slide together."""
     first, second = (
         units - normals * (units * normals).sum(axis=1, keepdims=True) for normals in (first_normals, second_normals)
     )
@@ -132,7 +134,8 @@ def _sliding_apart(
 def _points(
     model: HeadModel, fit: Fit, vertices: np.ndarray
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 p"]]:
-    """World positions of full-level vertices, and their derivative by the parameters in the order of ``Fit``."""
+    """Returns the world positions of full-level vertices, and their derivatives by the parameters in the order of
+    ``Fit``."""
     place = fit.world_from_head
     count = len(fit.coefficients)
     basis = model.basis("full", count, vertices).astype(float)
@@ -146,7 +149,8 @@ def _points(
 
 
 def _cranial_points(model: HeadModel, fit: Fit) -> dict[str, int]:
-    """Euryon right and left and opisthocranion, as full-level vertices, on heads that have a cranium."""
+    """Finds the full-level vertices of the right and left euryon and the opisthocranion; empty for models without a
+    cranium."""
     if not {"glabella", "tragion_right", "tragion_left"} <= set(model.landmarks):
         return {}
     head = model.vertices(fit.coefficients)

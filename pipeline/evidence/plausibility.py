@@ -35,11 +35,11 @@ UNEXPLAINED_MM = 5.0  # and median over the views of the rim's RMS distance from
 
 
 class UnexplainedOutlines(EigenheadError):
-    """Reports a head that explains hardly any outline is none of this subject."""
+    """Reports a fitted head that explains hardly any outline, so that it is not the subject's."""
 
 
 class ImplausibleResult(EigenheadError):
-    """Reports a result with warnings that the settings do not let pass."""
+    """Reports a result with warnings that the settings treat as failures."""
 
     def __init__(self, warnings: Sequence[ReportWarning]) -> None:
         reasons = [compose("warning-of-code", warning=warning.code, text=warning) for warning in warnings]
@@ -49,7 +49,7 @@ class ImplausibleResult(EigenheadError):
 def plausibility_warnings(
     fit: Fit, model: HeadModel, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
 ) -> list[ReportWarning]:
-    """Returns what speaks against a result.
+    """Returns the warnings against a result: an unlikely shape, scale or size, or a poor contour.
 
     Args:
         fit: coefficients in standard deviations; scale against the model's own size.
@@ -65,7 +65,7 @@ def plausibility_warnings(
 
 
 def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mapping[str, float]) -> ReportWarning | None:
-    """Says that a head explains hardly any outline, whichever view is asked; None where it does.
+    """Returns a warning if the head explains hardly any outline in most views; otherwise None.
 
     Args:
         cameras: contour residuals of every camera.
@@ -84,14 +84,15 @@ def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mappin
 
 
 def refuse(warnings: Iterable[ReportWarning], fail_on: Sequence[str]) -> None:
-    """Raises ImplausibleResult where a warning has one of the codes that the settings name."""
+    """Raises ImplausibleResult if any warning has a code listed in ``fail_on``."""
     fatal = [warning for warning in warnings if warning.code in fail_on]
     if fatal:
         raise ImplausibleResult(fatal)
 
 
 def _shape(coefficients: Float[np.ndarray, " m"]) -> list[ReportWarning]:
-    """Against the prior z ~ N(0, 1): the largest, and the sum of squares."""
+    """Returns a warning if the largest coefficient, or the sum of all squares, is unlikely under the prior z ~ N(0,
+    1)."""
     if not len(coefficients):
         return []
     largest = float(np.abs(coefficients).max())
@@ -110,8 +111,8 @@ def _scale(scale: float) -> list[ReportWarning]:
 
 
 def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
-    """Tells how large the face is against the mean one's (RMS distance from its middle), and by how many standard
-    deviations of the population: shape and scale together, whichever of them took it up."""
+    """Returns the size of the face relative to the mean face (RMS distance from its middle, shape and scale together),
+    and its deviation in standard deviations of the population."""
     by_mode = size_by_mode(model)
     z = fit.coefficients[: len(by_mode)]
     size = float(np.log(fit.world_from_head.scale) + z @ by_mode[: len(z)])
@@ -120,7 +121,7 @@ def size_of(fit: Fit, model: HeadModel) -> tuple[float, float]:
 
 @lru_cache(maxsize=2)
 def size_by_mode(model: HeadModel) -> Float[np.ndarray, " m"]:
-    """Returns the derivative of the face's log size by each coefficient; 0 for expressions."""
+    """Returns the derivative of the logarithm of the face's size by each coefficient; 0 for expressions."""
     face = model.levels["cage"].face_region
     mean = model.mean[face].astype(float)
     mean -= mean.mean(axis=0)
@@ -137,9 +138,10 @@ def _size(size: float, sigmas: float) -> list[ReportWarning]:
 
 
 def _contours(cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]) -> list[ReportWarning]:
-    """Cameras that take part and beyond whose outline the head reaches by far more than beyond the others'.
+    """Returns a warning for each camera beyond whose outline the head reaches much farther than in most cameras.
 
-    A rim inside the outline says nothing: seen from above, a chin lies before the shirt, a hundred pixels inside."""
+    A rim inside the outline is no fault: seen from above, a chin lies before the shirt, a hundred pixels inside.
+    """
     rms = {name: of.outside_rms_px for name, of in cameras.items() if of.used and of.outside_rms_px is not None}
     if not rms:
         return []

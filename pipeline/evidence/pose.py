@@ -32,9 +32,9 @@ RIVAL_MARGIN = 0.03  # of the cost of the outlines: a rival so near to the best 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEvidence:
-    """Says how well the pose is known. ``off``: by camera, the RMS distance of the head's landmarks from the found
-    ones, by the face's size. ``rival``: how much more the best other pose costs, as a share of the cost; None where
-    none was tried."""
+    """Holds how well the pose is known. ``off``: for each camera, the RMS distance of the head's landmarks from those
+    of the face in the photograph, relative to the face's size. ``rival``: how much more the best other pose costs, as a
+    share of the cost; None if none was tried."""
 
     method: str
     off: Mapping[str, float]
@@ -43,7 +43,7 @@ class PoseEvidence:
 
     @property
     def is_on_face(self) -> bool:
-        """Tells whether the face was found, and in every view where the head has it."""
+        """Tells whether a face was found and, in every view with one, lies where the head's face is."""
         return bool(self.off) and max(self.off.values()) <= ELSEWHERE
 
 
@@ -57,7 +57,8 @@ def judge_pose(
     method: str,
     rival: float | None,
 ) -> tuple[PoseEvidence, list[ReportWarning]]:
-    """Compares the delivered head with the faces that were found.
+    """Compares the delivered head with the faces in the photographs. Returns the evidence and the warnings about the
+    pose.
 
     Args:
         head_world: full level, mm.
@@ -92,9 +93,10 @@ def judge_pose(
 def landmark_offsets(
     subject: SubjectFaces, places: LandmarkMap, head_world: Mesh, world_from_head: Similarity, rig: Rig
 ) -> dict[str, float]:
-    """Returns by camera how far the head's landmarks lie from those that were found, by the face's size.
+    """Returns, for each camera, the RMS distance of the head's landmarks from those found in the photograph, relative
+    to the face's size.
 
-    Of a view with several faces the nearest one counts: others may be a poster, or somebody behind.
+    In a view with several faces the nearest one counts: others may be a poster or a bystander.
     """
     turned = world_from_head.scale * places.offset_mm @ world_from_head.rotation.T
     expected_world = (places.points(head_world.vertices) + turned)[~places.slides]
@@ -106,15 +108,15 @@ def landmark_offsets(
 
 
 def cameras_in_front(world_from_head: Similarity, rig: Rig) -> tuple[str, ...]:
-    """Returns the cameras that see the head from the front."""
+    """Returns the names of the cameras that see the head from the front."""
     facing, middle = world_from_head.rotation[:, 2], world_from_head.translation
     towards = {camera.name: camera.centre_world - middle for camera in rig}
     return tuple(name for name, way in towards.items() if way @ facing > MIN_FACING * np.linalg.norm(way))
 
 
 def _seen(subject: SubjectFaces) -> dict[str, tuple[FaceDetection, ...]]:
-    """The subject's face by camera; where views do not agree on one, whatever each shows, but for doubtful faces in one
-    view alone."""
+    """Returns the subject's face in each camera. If the views agree on no face, returns all faces of each view, unless
+    there are only uncertain ones in too few views."""
     if subject.matched is None:
         seen = {name: faces for name, faces in subject.found.items() if faces}
         doubtful = len(seen) < MIN_VIEWS and all(f.score < CERTAIN_SCORE for faces in seen.values() for f in faces)

@@ -23,7 +23,8 @@ SILENT_PX = -1000.0  # an outline that is so far away bounds nothing
 
 @traced
 def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray, " k"]]:
-    """Returns the views without the outlines that others contradict, and by view the share of its crop that was."""
+    """Removes the outlines where other views contradict them. Returns the views with those pixels' outline distance set
+    to ``SILENT_PX``, and for each view the share of its crop that was contradicted."""
 
     def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
         height, width = views.sizes[v]
@@ -45,8 +46,8 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
 
 
 def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels in and next to solid blocks, of those connected ones that reach farther beyond the outline than windows
-    make anything wider."""
+    """Returns the pixels in and next to solid blocks. Keeps only connected groups of blocks that reach farther than
+    ``WIDENED_PX`` beyond the outline, since matching windows widen things by up to that."""
     height, width = outline_px.shape
     count, found = cv2.connectedComponents(cv2.dilate(solid.view(np.uint8), np.ones((3, 3), np.uint8)))
     labels = np.asarray(found, np.int32)

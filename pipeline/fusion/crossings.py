@@ -19,7 +19,8 @@ HALVINGS = 6  # rounds in which vertices go half their way; later ones go all of
 def crossing_faces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Returns triangles that cross another one, among pairs of which one is ``active`` (all of them, if None)."""
+    """Tells which triangles cross another one. With ``active``, only pairs with at least one active triangle are
+    tested."""
     faces = faces.astype(np.int32)  # a copy: a model's own are read-only, which is another type
     if active is None:
         return _crossing_by_size(vertices, faces)
@@ -30,8 +31,9 @@ def crossing_faces(
 
 
 def _crossing_by_size(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
-    """All triangles that cross another one: cells as wide as the neck's triangles hold too many of the face's, so that
-    each size is compared with itself and with what is smaller, in cells of its own."""
+    """Tells which triangles cross another one, one class of sizes at a time. Each class is tested against itself and
+    all smaller triangles in a grid of its own: cells as wide as the neck's triangles would hold too many of the face's.
+    """
     boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
     wide = (boxes[:, 3:] - boxes[:, :3]).max(axis=1)
     widest = float(wide.max(initial=0.0))
@@ -62,7 +64,7 @@ def _crossing(
 
 
 def _near(boxes: Float[np.ndarray, "f 6"], active: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Triangles in or beside the cells that active ones lie in."""
+    """Tells which triangles lie in or beside a cell of the grid that holds an active triangle."""
     middle = 0.5 * (boxes[:, :3] + boxes[:, 3:])
     wide = max(float((boxes[:, 3:] - boxes[:, :3]).max(initial=0.0)), 1e-9)
     cell = ((middle - middle.min(axis=0, initial=np.inf)) / wide).astype(np.int64) + 1
@@ -73,8 +75,8 @@ def _near(boxes: Float[np.ndarray, "f 6"], active: Bool[np.ndarray, " f"]) -> Bo
 
 @traced
 def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh, int]:
-    """Returns the mesh without self-intersections, and how many of its vertices moved; with all vertices in their
-    ``safe`` places it has none."""
+    """Moves vertices of crossing triangles towards their ``safe`` positions until no triangles cross. Returns the mesh
+    and the number of vertices moved. With all vertices at ``safe`` the mesh must not cross itself."""
     vertices, faces = mesh.vertices.copy(), mesh.faces
     moved = np.zeros(len(vertices), bool)
     active: Bool[np.ndarray, " f"] | None = None
@@ -95,8 +97,9 @@ def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh,
 
 @traced
 def without_coincidences(mesh: Mesh) -> Mesh:
-    """Moves vertices that lie at one place, to the precision of a file, towards their own neighbours: a program that
-    merges vertices by place would join sheets there, and find the surface open."""
+    """Separates vertices that coincide in single precision, as files store them: each moves a little towards the mean
+    of its neighbours. A program that merges vertices by position would otherwise join sheets there and find the surface
+    open."""
     stored = mesh.vertices.astype(np.float32)
     _, same, count = np.unique(stored, axis=0, return_inverse=True, return_counts=True)
     rows = np.flatnonzero(count[same.ravel()] > 1)

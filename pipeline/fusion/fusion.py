@@ -53,7 +53,7 @@ class BustSurface:
 
     @property
     def seen(self) -> Bool[np.ndarray, " v"]:
-        """Returns vertices that some photograph measures."""
+        """Tells which vertices some photograph measures."""
         return self.views > 0
 
 
@@ -118,8 +118,8 @@ def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) 
 
 @traced
 def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
-    """Returns the subject's piece of the zero level, and places of its vertices at which it cannot cross itself: the
-    corners of the cubes about the inner nodes."""
+    """Returns the mesh of the zero level, only the piece that is the subject, and safe positions of its vertices (mm,
+    world frame): with every vertex at the middle of its cell the mesh cannot cross itself."""
     grid, field = level.grid, level.field.copy()
     compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
     net = surface_net(field, grid.index, grid.neighbours)
@@ -135,8 +135,8 @@ def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.nd
 def _subject(
     vertices: Float[np.ndarray, "v 3"], faces: np.ndarray, head: Float[np.ndarray, "h 3"] | None
 ) -> Bool[np.ndarray, " f"]:
-    """Faces of the piece that lies at most of the fitted head's vertices: who stands behind may be larger. Without a
-    head, of the piece that holds the greatest volume; cavities hold a negative one."""
+    """Tells which faces belong to the subject. With a fitted head, that is the solid piece nearest to most of its
+    vertices, since a bystander may be larger. Without a head, it is the piece of greatest volume."""
     piece = component_of(faces, len(vertices))
     towards = vertices[faces[:, 0]] - vertices.mean(axis=0)
     volume = np.bincount(piece[faces[:, 0]], (face_normals(vertices, faces) * towards).sum(axis=1))

@@ -15,8 +15,9 @@ from pipeline.geometry.surface_nets import link_nodes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Holds nodes at ``corner + step_mm * index``, world frame. ``neighbours`` are rows towards -x +x -y +y -z +z, -1
-    where there is none; ``outer`` nodes lack one of their 26 neighbours."""
+    """Holds the nodes of a sparse grid; node i lies at ``corner + step_mm * index[i]``, world frame. ``neighbours`` are
+    the rows of the nodes towards -x +x -y +y -z +z, -1 where there is none; ``outer`` nodes lack one of their 26
+    neighbours."""
 
     corner: Float[np.ndarray, " 3"]
     step_mm: float
@@ -30,7 +31,7 @@ class Grid:
 
 
 def whole_box(corner: Float[np.ndarray, " 3"], edges_mm: Float[np.ndarray, " 3"], step_mm: float) -> Grid:
-    """Returns every node of a box."""
+    """Returns the grid with every node of a box, from its corner, edges and step (mm, world frame)."""
     shape = tuple(int(n) for n in np.ceil(edges_mm / step_mm).astype(int) + 1)
     index = np.stack(np.meshgrid(*(np.arange(n, dtype=np.int32) for n in shape), indexing="ij"), axis=-1)
     return _linked(corner, step_mm, (shape[0], shape[1], shape[2]), index.reshape(-1, 3))
@@ -47,14 +48,15 @@ def refined(coarse: Grid, wanted: Bool[np.ndarray, "nx ny nz"]) -> Grid:
 
 
 def everywhere(grid: Grid, values: Float32[np.ndarray, " n"], box: Float32[np.ndarray, "_ _ _"]) -> np.ndarray:
-    """Returns a volume over the grid's whole box: its nodes' values, beyond them those of the coarser ``box``."""
+    """Returns a volume of values over the grid's whole box: at the grid's nodes their ``values``, elsewhere values
+    interpolated from ``box``, a volume of twice the step."""
     fine = kernels.doubled(box)
     fine[tuple(grid.index.T)] = values
     return fine
 
 
 def marked_box(grid: Grid, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "nx ny nz"]:
-    """Returns the chosen nodes as a volume over the whole box."""
+    """Returns a volume over the grid's whole box that is True at the chosen nodes."""
     box = np.zeros(grid.shape, bool)
     box[tuple(grid.index[chosen].T)] = True
     return box

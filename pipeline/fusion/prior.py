@@ -17,10 +17,11 @@ NEAREST, EVEN_MM = 64, 5.0  # vertices that a mean is taken of, and the distance
 def distance_to_head(
     places: Float[np.ndarray, "n 3"], head_world: Mesh, seen: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the signed distance (mm, positive outside) of places to the head with its hair; -inf where the model
-    ends.
+    """Returns the signed distance (mm, positive outside) of places to the outside of the head's hair; -inf near the
+    open rim where the model ends.
 
-    Hair is as thick over each vertex as the ``seen`` points of the surface say, and evenly so between them.
+    The thickness of the hair over each vertex is measured from the ``seen`` points of the surface, and interpolated
+    where there are none.
     """
     vertices, normals = head_world.vertices[::EVERY], head_world.normals()[::EVERY]
     tree = KDTree(vertices, balanced_tree=False, compact_nodes=False)
@@ -34,8 +35,8 @@ def distance_to_head(
 def _thickness(
     tree: KDTree, normals: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " v"]:
-    """Mean height of the seen points over each vertex; between those that have some, the mean of the nearest of them,
-    by the inverse square of their distance."""
+    """Returns the thickness of the hair (mm) over each vertex: the mean height of the seen points above it. Vertices
+    with too few points take the mean of the nearest others, weighted by the inverse square of the distance."""
     vertices = np.asarray(tree.data)
     far, near = nearest(tree, seen, within=THICKEST_MM)
     near, points = near[np.isfinite(far)], seen[np.isfinite(far)]
@@ -53,7 +54,7 @@ def _thickness(
 
 
 def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Returns which places lie near the open rim of the head."""
+    """Tells which places lie within ``RIM_MM`` of the open rim of the head."""
     rim = np.unique(boundary_edges(head_world.faces))
     if not len(rim):
         return np.zeros(len(places), bool)

@@ -21,7 +21,8 @@ ISLAND_MM2 = 100.0
 
 
 def without_islands(mesh: Mesh, measured: Measured) -> Measured:
-    """Returns the same, where a patch of seen triangles below ``ISLAND_MM2`` counts as seen by nobody."""
+    """Returns the measurements with small patches discarded: the vertices of a connected patch of seen triangles
+    smaller than ``ISLAND_MM2`` count as seen by no view."""
     seen = measured.views > 0
     faces = mesh.faces[seen[mesh.faces].all(axis=1)]
     piece = component_of(faces, len(seen))
@@ -31,8 +32,8 @@ def without_islands(mesh: Mesh, measured: Measured) -> Measured:
 
 
 def deviation_mm(mesh: Mesh, measured: Measured) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation along the normal: of the views' mean where some see the vertex (their own
-    deviations, or their scatter where that is larger), of a guess elsewhere, by the distance to what is seen."""
+    """Returns the standard deviation (mm) of each vertex along its normal. Seen vertices have that of
+    ``seen_deviation_mm``; the others a guess that grows with the distance to the nearest seen vertex."""
     seen = measured.views > 0
     out = np.full(len(seen), MAX_MM)
     if not seen.any():
@@ -45,7 +46,8 @@ def deviation_mm(mesh: Mesh, measured: Measured) -> Float[np.ndarray, " v"]:
 
 
 def seen_deviation_mm(measured: Measured) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation along the normal of what some view sees; 0 of the rest."""
+    """Returns the standard deviation (mm) along the normal of every vertex that a view sees, from the views'
+    information or, if larger, their scatter; 0 for all other vertices."""
     seen = measured.views > 0
     views = measured.views[seen].astype(float)
     variance = np.maximum(1.0 / measured.information[seen], measured.scatter[seen] / np.maximum(views - 1.0, 1.0))

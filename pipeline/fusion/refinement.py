@@ -21,8 +21,8 @@ ROUNDS, SWEEPS = 2, 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Holds what the views say of every vertex: ``information`` (1/mm2) and ``scatter`` (mm2) as in
-    ``refinement_kernels.measure``, and how many ``views`` see it."""
+    """Holds what the views measure at every vertex: its offset (mm) along the normal, ``information`` (1/mm2) and
+    ``scatter`` (mm2) as in ``refinement_kernels.measure``, and how many ``views`` see it."""
 
     offset_mm: Float[np.ndarray, " v"]
     information: Float[np.ndarray, " v"]
@@ -32,7 +32,8 @@ class Measured:
 
 @traced
 def refine_vertices(mesh_world: Mesh, views: ViewStack, step_mm: float) -> tuple[Mesh, Measured]:
-    """Returns the mesh with its vertices moved along their normals, and what the views say of the result."""
+    """Moves the vertices along their normals to where the depth maps see the surface. Returns the moved mesh, and the
+    views' measurements at its vertices."""
     starts, indices = neighbours(mesh_world.faces, len(mesh_world.vertices))
     mesh = mesh_world
     for _ in range(ROUNDS):
@@ -45,15 +46,16 @@ def refine_vertices(mesh_world: Mesh, views: ViewStack, step_mm: float) -> tuple
 
 
 def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]]:
-    """Returns vertices next to each one of a closed mesh, in compressed rows: starts (count + 1) and indices."""
+    """Returns the neighbours of each vertex of a closed mesh in compressed rows: where each row starts (count + 1), and
+    the vertex numbers, row after row."""
     starts = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
     order = np.argsort(faces.ravel(), kind="stable")  # a closed mesh has each edge once in either direction
     return starts, np.roll(faces, -1, axis=1).ravel()[order].astype(np.int32)
 
 
 def measure_vertices(mesh: Mesh, normals: Float[np.ndarray, "v 3"], views: ViewStack, gate_mm: float) -> Measured:
-    """Measures every vertex against the depth maps; a view that is farther off than ``gate_mm`` shows another
-    surface."""
+    """Measures every vertex against the depth maps of all views. A view whose depth differs by more than ``gate_mm``
+    shows another surface and does not count."""
     count = len(mesh.vertices)
     offset, information, scatter = (np.zeros(count) for _ in range(3))
     seen = np.zeros(count, np.uint8)

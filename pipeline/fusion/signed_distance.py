@@ -52,13 +52,14 @@ UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
 
 
 class NoSurface(EigenheadError):
-    """Reports photographs that do not tell where the surface is."""
+    """Reports that the photographs do not determine a surface: depth is known in too few views, or is contradictory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Votes:
-    """Holds at every node of a grid: signed distance (mm), its weight (0: nobody sees the place), and the distance (mm)
-    by which the body's outline leaves the node out at least. See ``vote_kernels.vote``."""
+    """Holds for every node of a grid what all views together say: the signed distance to the surface (mm), its weight
+    (above 0 only where a view sees the place), and the least distance (mm) by which the node lies outside the outlines.
+    See ``vote_kernels.vote``."""
 
     value: Field
     weight: Field
@@ -67,7 +68,8 @@ class Votes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds the field on one grid: signed distance (mm, negative inside), and the weight of the votes behind it."""
+    """Holds the solution on one grid: at each node the signed distance (mm, negative inside) and the weight of the
+    votes there."""
 
     grid: Grid
     field: Field
@@ -75,7 +77,8 @@ class Level:
 
 
 def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
-    """Returns the field that the votes, the silhouettes and, where nothing is known, ``start`` make."""
+    """Computes the signed distance on one grid. It follows the votes where there are some, stays outside the
+    silhouettes, and is drawn to ``start`` where no view sees the place."""
     reach = np.float32(REACH * grid.step_mm)
     start = np.clip(start, -reach, reach)
     unseen = votes.weight <= 0
@@ -95,7 +98,7 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
 
 
 def votes_at(grid: Grid, views: ViewStack) -> Votes:
-    """Returns what the views say of every node."""
+    """Computes what the views together say of every node of the grid."""
     value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
     step = grid.step_mm
     limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
@@ -110,7 +113,8 @@ def votes_at(grid: Grid, views: ViewStack) -> Votes:
 
 @traced
 def solve(depth_maps: Sequence[DepthMap], views: ViewStack, head_world: Mesh | None, spacing_mm: float) -> Level:
-    """Returns the field about the surface, on a grid of ``spacing_mm``."""
+    """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
+    fine."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
@@ -130,7 +134,8 @@ def solve(depth_maps: Sequence[DepthMap], views: ViewStack, head_world: Mesh | N
 def _finer(
     coarse: Grid, box: Float32[np.ndarray, "nx ny nz"], wanted: Bool[np.ndarray, "nx ny nz"], views: ViewStack
 ) -> Level:
-    """The field at half the step about the ``wanted`` nodes, and farther where the surface would leave the grid."""
+    """Computes the signed distance at half the step about the ``wanted`` nodes. The grid is widened while the surface
+    would leave it; raises NoSurface if it still does after ``WIDENINGS``."""
     for _ in range(WIDENINGS + 1):
         grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)
@@ -144,7 +149,8 @@ def _finer(
 def _box(
     depth_maps: Sequence[DepthMap], seen: Points, step_mm: float
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Corner and edges of a box about the points that are seen, and as far behind them as a body may be."""
+    """Returns the corner and the edges (mm, world frame) of a box that holds the seen points and the space behind them
+    that an unseen body may fill."""
     low, high = np.percentile(seen, [STRAYS, 100 - STRAYS], axis=0)
     behind = np.array([depth_map.camera.axis_world for depth_map in depth_maps]) * UNSEEN_DEPTH_MM
     middle = np.median(seen, axis=0)
@@ -155,7 +161,8 @@ def _box(
 
 
 def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> Field:
-    """The hull, cut down to the fitted head where that is known."""
+    """Returns the first guess of the signed distance: the visual hull, cut down to the fitted head with its hair where
+    there is a head."""
     prior = np.maximum(votes.value, votes.bound).astype(float)
     if head_world is not None:
         unseen = (prior < 0) & (votes.weight <= 0)
@@ -166,8 +173,9 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> F
 
 
 def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
-    """Returns the guess (mm, negative inside) on a whole box, without what no ball of ``HORN_MM`` fits into: beyond the
-    photographs cones of sight that no outline bounds end in fins and horns. Beside what is seen the guess stays."""
+    """Returns the guess (mm, negative inside) on a whole box without thin fins and horns: parts into which no ball of
+    radius ``HORN_MM`` fits. They arise where no outline bounds the cones of sight. Within ``AWAY_MM`` of seen places
+    the guess stays."""
     from scipy.ndimage import distance_transform_edt  # 0.05 s, and only a bust needs it
 
     radius = HORN_MM / grid.step_mm
@@ -178,7 +186,7 @@ def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> F
 
 
 def _near_points(grid: Grid, points: Points) -> Bool[np.ndarray, "nx ny nz"]:
-    """Nodes whose eight finer ones hold a seen point, and their neighbours."""
+    """Marks the nodes of cells that hold a seen point, and their neighbours, as a volume over the whole box."""
     box = np.zeros(grid.shape, bool)
     at = np.floor((points - grid.corner) / grid.step_mm).astype(int)
     inside = ((at >= 1) & (at < np.array(grid.shape) - 1)).all(axis=1)

@@ -36,7 +36,8 @@ def part_of(head_world: Mesh, measured: Bool[np.ndarray, " v"]) -> Mesh:
 def drawn_to_skin(
     mesh_world: Mesh, skin: Float[np.ndarray, " v"], head_skin_world: Mesh, deviation_mm: Float[np.ndarray, " v"]
 ) -> Mesh:
-    """Returns the surface with its vertices moved to the mean of both.
+    """Returns the surface with its vertices of skin moved towards the closest place of the fitted head, to the weighted
+    mean or farther.
 
     Args:
         mesh_world: the surface, mm.
@@ -68,8 +69,8 @@ def drawn_to_skin(
 def mean_around(
     faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, " v"], weight: Float[np.ndarray, " v"]
 ) -> Float[np.ndarray, " v"]:
-    """Returns the weighted mean of the values over the surroundings of each vertex of a closed mesh; 0 where no weight
-    is near."""
+    """Returns, for each vertex of a closed mesh, the weighted mean of the values over its surroundings
+    (``SURROUNDINGS`` steps); about 0 where no weight is near."""
     starts, indices = neighbours(faces, len(values))
     beside = sparse.csr_array((np.ones(len(indices)), indices, starts), shape=(len(values), len(values)))
     count = np.maximum(np.diff(starts), 1)[:, None]

@@ -35,12 +35,13 @@ class ViewStack:
     pixels: Float32[np.ndarray, "p 8"]
 
     def packed(self) -> Pixels:
-        """Packs them for compiled loops."""
+        """Returns the same arrays as a named tuple that compiled loops accept."""
         return Pixels(self.cameras, self.sizes, self.starts, self.pixels)
 
 
 def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhouette], rig: Rig) -> ViewStack:
-    """Returns the views of the depth maps, in their order."""
+    """Packs the depth maps and silhouettes into flat arrays, one view after the other, in the order of the depth
+    maps."""
     sizes = np.array([depth_map.depth_mm.shape for depth_map in depth_maps], np.int64)
     starts = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))])
     pixels = np.zeros((starts[-1], 8), np.float32)

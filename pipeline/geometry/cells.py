@@ -7,8 +7,9 @@ from jaxtyping import Float, Int64
 
 
 class Cells(NamedTuple):
-    """Sorts points into cells: ``order`` sorts the points by ``keys`` (given sorted): the rank of their cell in a box
-    of ``spans`` cells, whose outermost cells are empty. The neighbours of a cell are at fixed steps of the key."""
+    """Holds points sorted by the cell of a grid that they lie in. ``order`` sorts the points; ``keys`` are their cells'
+    numbers, sorted; ``spans`` is the number of cells along each axis. Outermost cells are empty, so the neighbours of a
+    cell are at fixed differences in number."""
 
     order: Int64[np.ndarray, " n"]
     keys: Int64[np.ndarray, " n"]
@@ -16,7 +17,7 @@ class Cells(NamedTuple):
 
 
 def sorted_into_cells(points: Float[np.ndarray, "n 3"], wide: float) -> Cells:
-    """Returns the points in cells as ``wide`` as given, in the unit of the points."""
+    """Sorts points into cubic cells with edge ``wide``, in the unit of the points."""
     cell = np.floor((points - points.min(axis=0)) / wide).astype(np.int64) + 1
     spans = cell.max(axis=0) + 2
     keys = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]

@@ -14,11 +14,12 @@ def closest_candidates(
     facing: Float[np.ndarray, "n 3"] | None = None,
     facing_mm: float = 0.0,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Returns the closest of each point's candidate triangles, and the barycentric weights of the place on it.
+    """Finds, for each point, the closest of its candidate triangles, and the barycentric weights of the closest place
+    on it.
 
     Args:
-        points: asked for.
-        candidates: rows of ``corners``; the first of equally close ones is taken.
+        points: the query points.
+        candidates: rows of ``corners`` for each point; of equally close ones the first is taken.
         corners: of the triangles.
         facing: unit normals of the points; a triangle that faces the other way counts as ``facing_mm`` farther.
         facing_mm: that distance.
@@ -41,7 +42,7 @@ def closest_candidates_naive(
     facing: Float[np.ndarray, "n 3"] | None = None,
     facing_mm: float = 0.0,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Returns the same of all triangles, by a search through every pair."""
+    """Computes the same as ``closest_candidates`` with all triangles as candidates, by testing every pair."""
     triangle, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)

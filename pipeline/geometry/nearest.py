@@ -10,9 +10,11 @@ from pipeline.compute.threads import in_threads
 def nearest(
     tree: KDTree, points: Float[np.ndarray, "n d"], *, count: int = 1, within: float = np.inf
 ) -> tuple[Float[np.ndarray, "n ..."], Int[np.ndarray, "n ..."]]:
-    """Returns the distances and rows of the ``count`` nearest points of the tree, as ``tree.query`` does.
+    """Returns the distances and rows of the ``count`` points of the tree nearest to each query point, as ``tree.query``
+    does.
 
-    SciPy's own ``workers`` start threads anew at every call, and all helpers of a loop beside them.
+    Unlike the ``workers`` of SciPy it uses this program's own threads: those start anew at every call and add to the
+    running ones.
     """
     shape = (len(points),) if count == 1 else (len(points), count)
     distance, row = np.empty(shape), np.empty(shape, np.intp)

@@ -12,11 +12,11 @@ ITERATIONS = 20
 def procrustes(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> Similarity:
-    """Returns the full ordinary Procrustes: the similarity T that minimises eq. (3), ``sum_j w_j |target_j -
+    """Computes the full ordinary Procrustes alignment: the similarity T that minimises eq. (3), ``sum_j w_j |target_j -
     T(source_j)|^2``.
 
-    Dryden and Mardia, Statistical Shape Analysis, section 7.2; the determinant keeps a mirror image out. Raises
-    ValueError where the points determine no rotation (all on a line).
+    Dryden and Mardia, Statistical Shape Analysis, section 7.2; the determinant excludes mirror images. Raises
+    ValueError if the points lie on a line and determine no rotation.
     """
     share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
     source_mean, target_mean = share @ source, share @ target
@@ -39,8 +39,8 @@ def generalised_procrustes(
     start: Similarity,
     scale_spread: float = SCALE_SPREAD,
 ) -> Similarity:
-    """Returns the maximum likelihood of ``target = T(source + e) + f``: ``e`` (head frame) and ``f`` (world frame)
-    correlated.
+    """Computes the most likely similarity T for ``target = T(source + e) + f``, where the errors e (head frame) and f
+    (world frame) are correlated between points.
 
     Iterated generalised least squares from ``start``: the residual's covariance is ``s^2 R C R^T + F``, taken at the
     last estimate. log s has the prior N(0, ``scale_spread``^2).
@@ -64,7 +64,7 @@ def generalised_procrustes(
 
 
 def block_diagonal(blocks: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "p p"]:
-    """Returns the covariance of points that err independently of each other."""
+    """Returns the joint covariance of points whose errors are independent, from the covariance of each."""
     whole = np.zeros((len(blocks), 3, len(blocks), 3))
     whole[np.arange(len(blocks)), :, np.arange(len(blocks)), :] = blocks
     return whole.reshape(3 * len(blocks), -1)

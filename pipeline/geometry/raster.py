@@ -27,7 +27,8 @@ def camera_depths(camera: Camera, points_world: Float[np.ndarray, "v 3"]) -> Flo
 def depth_map(
     camera: Camera, vertices_world: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
-    """Returns ``rasterise`` for a camera and world vertices."""
+    """Returns the camera z (mm) and the visible face at each pixel, for a mesh in the world frame, as ``rasterise``
+    does."""
     k = camera.intrinsics
     return rasterise(
         project_points(camera, vertices_world), camera_depths(camera, vertices_world), faces, k.height, k.width
@@ -36,7 +37,7 @@ def depth_map(
 
 @traced
 def depth_maps(rig: Rig, mesh_world: Mesh) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Returns what every camera of a rig sees of a mesh: camera z (mm) at each pixel, inf beside it."""
+    """Returns the depth image of a mesh in every camera of a rig: camera z (mm) at each pixel, inf beside the mesh."""
     vertices, faces = mesh_world.vertices, mesh_world.faces
     found = map_in_threads(lambda k: depth_map(rig.cameras[k], vertices, faces)[0], len(rig))
     return dict(zip(rig.names, found, strict=True))
@@ -49,7 +50,7 @@ def picture(
     colours: UInt8[np.ndarray, "v 3"],
     background: tuple[int, int, int] = (255, 255, 255),
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the mesh in its vertex colours, unlit, as the camera sees it."""
+    """Draws the mesh in its vertex colours, without light, as the camera sees it."""
     pixels, depths = camera.project(vertices_world), camera_depths(camera, vertices_world)
     _, seen = rasterise(pixels, depths, faces, camera.intrinsics.height, camera.intrinsics.width)
     image = interpolate(seen, pixels, depths, faces, colours.astype(np.float32))

@@ -13,8 +13,8 @@ _CANDIDATES = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits:
-    """Holds for each query point: its closest point, the triangle that holds it, barycentric weights, and the
-    distance."""
+    """Holds, for each query point, its closest point on the surface, the triangle of that point, barycentric weights
+    there, and the distance."""
 
     points: Float[np.ndarray, "N 3"]
     triangles: Int[np.ndarray, " N"]  # row of ``faces``
@@ -40,8 +40,8 @@ class SurfaceIndex:
         facing: Float[np.ndarray, "N 3"] | None = None,
         facing_mm: float = 10.0,
     ) -> Hits:
-        """Returns the closest surface point of each query point. With unit normals ``facing`` of the points, a triangle
-        that faces the other way is chosen only where it is nearer by ``facing_mm``: lips that meet are told apart."""
+        """Finds the closest surface point of each query point. With unit normals ``facing`` of the points, a triangle
+        that faces the other way is chosen only if it is nearer by ``facing_mm``, which keeps lips that touch apart."""
         count = min(candidates, len(self._owner))
         nearest = self._tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)
         triangle, weights = closest_candidates(points, self._owner[nearest], self.corners, facing, facing_mm)
@@ -49,7 +49,7 @@ class SurfaceIndex:
         return Hits(found, triangle, weights, np.linalg.norm(points - found, axis=1), self.normals(triangle))
 
     def normals(self, triangles: Int[np.ndarray, " N"]) -> Float[np.ndarray, "N 3"]:
-        """Returns unit normals of the given triangles."""
+        """Returns the unit normals of the given triangles."""
         corners = self.corners[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)
@@ -58,7 +58,8 @@ class SurfaceIndex:
 def _samples(
     corners: Float[np.ndarray, "F 3 3"], spacing: float
 ) -> tuple[Float[np.ndarray, "S 3"], Int[np.ndarray, " S"]]:
-    """Points on the triangles and the triangle each lies on: the centroid, more where a triangle is large."""
+    """Returns sample points on the triangles and the triangle of each: the centroid, and more points in large
+    triangles."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max(1)
     parts = np.clip(np.ceil(longest / spacing / 1.5), 1, 12).astype(int)
     points, owner = [], []

@@ -18,8 +18,8 @@ from pipeline.geometry.surface_nets_kernels import linked, net_faces, net_vertic
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceNet:
-    """Holds a mesh in steps of its grid; ``of_cell`` is the vertex in the cell above each node, -1 where there is
-    none."""
+    """Holds a mesh in units of the grid's step. ``of_cell`` is the vertex in the cell whose lowest corner is the node,
+    -1 if the cell has none."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int32[np.ndarray, "f 3"]
@@ -27,7 +27,7 @@ class SurfaceNet:
 
 
 def node_keys(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> Int64[np.ndarray, " n"]:
-    """Returns the rank of each node in the full box."""
+    """Returns the number of each node in the full box, counted with the last index fastest."""
     wide = index.astype(np.int64)
     return (wide[:, 0] * shape[1] + wide[:, 1]) * shape[2] + wide[:, 2]
 
@@ -45,7 +45,7 @@ def link_nodes(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> 
 def surface_net(
     field: Float32[np.ndarray, " n"], index: Int32[np.ndarray, "n 3"], neighbours: Int32[np.ndarray, "n 6"]
 ) -> SurfaceNet:
-    """Returns the net of a sparse grid; each quadrilateral is split along its shorter diagonal.
+    """Builds the mesh of the zero level on a sparse grid; each quadrilateral is split along its shorter diagonal.
 
     Args:
         field: at the nodes; negative inside.
@@ -59,7 +59,7 @@ def surface_net(
 def volume_net(
     field: Float32[np.ndarray, "nx ny nz"],
 ) -> tuple[Float32[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
-    """Returns vertices and triangles of the net of a whole volume; all quadrilaterals are split alike."""
+    """Builds the mesh of the zero level in a whole volume; all quadrilaterals are split the same way."""
     nx, ny, nz = field.shape
     index = nodes_about_surface(field)
     neighbours = link_nodes(index, (nx, ny, nz))
@@ -71,7 +71,7 @@ def volume_net(
 def volume_net_naive(
     field: Float32[np.ndarray, "nx ny nz"],
 ) -> tuple[Float[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
-    """Returns what ``volume_net`` does, cell by cell and edge by edge in plain Python; the triangles' order differs."""
+    """Computes the same mesh as ``volume_net``, in plain Python; the order of the triangles differs."""
     shape, unit = np.array(field.shape), np.eye(3, dtype=int)
     crossings: dict[tuple[int, ...], list[np.ndarray]] = {}
     quads = []

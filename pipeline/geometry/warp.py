@@ -17,7 +17,7 @@ def landmark_warp(
     *,
     smoothing: float = 0.0,
 ) -> Float[np.ndarray, "N 3"]:
-    """Returns the points carried by the smooth map that takes each source landmark to its target.
+    """Moves points by the smooth map that takes each source landmark to its target.
 
     ``smoothing`` (mm) above 0 lets landmarks miss their targets in exchange for less bending. Needs 4 landmarks that
     are not on a plane; raises numpy.linalg.LinAlgError otherwise.

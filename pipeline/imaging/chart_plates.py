@@ -17,14 +17,14 @@ MIN_CELLS = 4  # a chart of 50 px in a thousand has 6
 
 
 def empty_plates(plates: tuple[Plate, ...]) -> tuple[Plate, ...]:
-    """Returns the plates that show no chart; all where each does."""
+    """Returns the plates that show no colour chart, or all plates if every one shows a chart."""
     if len(plates) < 2 or not _differ(plates):
         return plates
     return tuple(plate for plate in plates if find_chart(plate) is None) or plates
 
 
 def charts_in(plates: tuple[Plate, ...]) -> list[Chart]:
-    """Returns the charts of one camera's plates; of plates that are alike, of the first."""
+    """Finds the colour charts in one camera's plates; if the plates are alike, only the first is searched."""
     searched = plates if len(plates) > 1 and _differ(plates) else plates[:1]
     return [chart for chart in map(find_chart, searched) if chart is not None]
 

@@ -20,7 +20,8 @@ SAMPLE = 4_000  # vertices are enough
 def balance(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Returns gains and offsets, so that ``gains * colours + offsets`` agree; gains of each channel multiply to one."""
+    """Computes a gain and an offset for each camera and channel, so that ``gains * colours + offsets`` agree between
+    cameras; the gains of each channel multiply to one."""
     cameras = len(weights)
     shared = np.flatnonzero(np.count_nonzero(weights, axis=0) >= 2)
     shared = shared[:: max(1, len(shared) // SAMPLE)]
@@ -61,7 +62,8 @@ def _gauss_newton_step(
     gain: Float[np.ndarray, " k"],
     offset: Float[np.ndarray, " k"],
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Normal equations in (gain, offset) with every point's colour eliminated: ``P = W - w w^T / sum w``."""
+    """Returns the next gains and offsets, from normal equations in which the unknown colour of every point is
+    eliminated: ``P = W - w w^T / sum w``."""
     cameras, points = values.shape
     root = np.sqrt(np.maximum(weights.sum(axis=0), 1e-12))
     by_gain, by_offset = weights * values, weights

@@ -25,7 +25,8 @@ MAX_OFF = 0.06  # rms of what the correction leaves of the patches: its own colo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chart:
-    """Says where the patches' middles are (px), row by row from dark skin to black, and their mean linear colours."""
+    """Holds the middles (px) of the 24 patches, row by row from dark skin to black, and the mean linear colour of each
+    in the photograph."""
 
     centres: Float[np.ndarray, "24 2"]
     colours: Float[np.ndarray, "24 3"]
@@ -33,7 +34,7 @@ class Chart:
 
 @cache
 def true_colours() -> Float[np.ndarray, "24 3"]:
-    """Returns the linear sRGB of the patches, D65."""
+    """Returns the reference colours of the patches in linear sRGB, D65."""
     any_colours = np.linspace(0.1, 0.9, 24 * 3).reshape(24, 1, 3)
     model = cv2.ccm.ColorCorrectionModel(any_colours, cv2.ccm.COLORCHECKER_MACBETH)
     model.setLinearization(cv2.ccm.LINEARIZATION_IDENTITY)
@@ -44,7 +45,8 @@ def true_colours() -> Float[np.ndarray, "24 3"]:
 
 
 def find_chart(picture: UInt8[np.ndarray, "h w 3"]) -> Chart | None:
-    """Returns the chart in an sRGB picture; None where there is none, or what looks like one has not its colours."""
+    """Finds the colour chart in an sRGB picture; None if there is none, or if its colours differ too much from a
+    chart's."""
     height, width = picture.shape[:2]
     for wanted in WIDTHS_PX:
         scale = wanted / width
@@ -85,16 +87,16 @@ def _mean_colour(picture: UInt8[np.ndarray, "h w 3"], corners: Float[np.ndarray,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChartCorrection:
-    """Holds a correction. ``matrix``: linear sRGB = matrix @ linear colour of the camera; ``off``: rms of what it
-    leaves of the patches."""
+    """Holds a colour correction. ``matrix``: linear sRGB = matrix @ linear colour of the camera; ``off``: RMS error of
+    the patches after the correction."""
 
     matrix: Float[np.ndarray, "3 3"]
     off: float
 
 
 def chart_correction(charts: list[Chart]) -> ChartCorrection | None:
-    """Returns the matrix that brings the patches of one camera's charts to their true colours, by least squares; None
-    where too many are clipped, or their colours are not a chart's."""
+    """Computes the matrix that best maps the patches of one camera's charts to their true colours, by least squares.
+    Returns None if too many patches are clipped or the error stays too large."""
     seen = np.concatenate([chart.colours for chart in charts])
     true = np.concatenate([true_colours()] * len(charts))
     kept = (seen < CLIPPED).all(axis=1)
@@ -109,7 +111,7 @@ def chart_correction(charts: list[Chart]) -> ChartCorrection | None:
 
 
 def chart_normal(chart: Chart, camera: Camera) -> Float[np.ndarray, " 3"]:
-    """Returns the way that the chart faces, a unit vector in the world frame."""
+    """Returns the direction that the chart faces, as a unit vector in the world frame."""
     grid = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2).astype(float)
     flat = np.column_stack([grid, np.zeros(len(grid))])
     _, turn, _ = cv2.solvePnP(flat, camera.undistort(chart.centres), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)

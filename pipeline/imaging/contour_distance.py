@@ -16,9 +16,8 @@ BAND_PX = 12
 
 
 def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> Float32[np.ndarray, "h w"]:
-    """Returns the signed distance (px) to the contour ``field == level``; negative where the field is above.
-
-    Without one it is farther than any pixel (+-(h + w)), and finite: slopes are taken of it."""
+    """Computes the signed distance (px) to the contour ``field == level``, negative where the field is above it.
+    Without a contour every distance is +-(h + w), finite so that slopes can be taken."""
     above = field > level
     near = box_around(above, BAND_PX + 1)
     segments = segments_of_level(field[near], level)
@@ -31,7 +30,8 @@ def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> 
 
 
 def chamfer(above: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Returns the signed distance from a mask; a transform ends at pixel centres, half a pixel beyond the contour."""
+    """Computes the signed distance (px) to a mask's edge, negative inside; half a pixel is subtracted because the
+    distance transform ends at pixel centres."""
     distance = cv2.distanceTransform(1 - above, cv2.DIST_L2, cv2.DIST_MASK_5)
     distance -= np.float32(0.5)
     box = box_around(above.view(bool), 1)

@@ -11,15 +11,17 @@ QUIET_LEVELS = 1.2  # noise of a photograph that a comparison of windows need no
 
 
 def noise_level(grey: Float32[np.ndarray, "h w"]) -> float:
-    """Returns the standard deviation of an image's white noise (Immerkaer 1996,
-    https://doi.org/10.1006/cviu.1996.0060), by the median, which edges do not move. At least the rounding of 8 bits."""
+    """Estimates the standard deviation of an image's white noise (Immerkaer 1996,
+    https://doi.org/10.1006/cviu.1996.0060), by a median, which edges hardly affect. It is at least 0.3, the rounding to
+    8 bits."""
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     response = cv2.filter2D(grey[::2], -1, kernel)[2:-2, 2:-2]
     return max(float(np.median(np.abs(response))) * 1.4826 / 6.0, 0.3)
 
 
 def blur_growth(noise: float) -> float:
-    """Tells how many times wider a photograph is blurred before windows of it are compared: 1 where it is quiet.
+    """Returns the factor by which a photograph with this noise is blurred more before matching: 1 up to
+    ``QUIET_LEVELS``.
 
     Noise hides the finest relief of smooth skin first: ``python -m tests.benchmarks.captures --noise 6``.
     """
@@ -27,5 +29,5 @@ def blur_growth(noise: float) -> float:
 
 
 def noise_left(noise: float, sigma_px: float) -> float:
-    """Returns the standard deviation of white noise after a Gaussian blur."""
+    """Returns the standard deviation that white noise has after a Gaussian blur of ``sigma_px``."""
     return noise * float(np.square(cv2.getGaussianKernel(2 * math.ceil(3.0 * sigma_px) + 1, sigma_px)).sum())

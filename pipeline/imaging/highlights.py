@@ -54,8 +54,8 @@ MIN_GAIN_PLACES = 300  # that a camera shares with others, for its gain
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
-    """The head as one camera sees it: the part of the image that holds it, and there its vertices' pixels and depths
-    (mm), the triangle of each pixel, and the vertices' colours (linear; NaN where it sees none)."""
+    """Holds the head as one camera sees it: the part of the image with the head, and within it the pixels and depths
+    (mm) of the vertices, the triangle at each pixel, and the vertices' colours (linear; NaN where hidden)."""
 
     box: tuple[slice, slice]
     pixels: Float[np.ndarray, "v 2"]
@@ -66,7 +66,8 @@ class _Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excess:
-    """Holds what k views show above the skin's own light at v places, by light that is less coloured."""
+    """Holds how much brighter than the skin's own light each of k views shows each of v vertices, as far as the added
+    light is whiter than the skin."""
 
     levels: Float32[np.ndarray, "k v"]  # 0 to 255, as displayed
     sure: Bool[np.ndarray, "k v"]  # where nothing but a highlight explains it
@@ -80,7 +81,7 @@ def without_highlights(
     rig: Rig,
     head_world: Mesh,
 ) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
-    """Returns the images with highlights on the head lowered to the skin's own light.
+    """Returns the images with the highlights on the head darkened to the skin's own light.
 
     Args:
         images: sRGB, by camera.
@@ -107,11 +108,12 @@ def without_highlights(
 
 
 def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarray, "f 3"]) -> Excess:
-    """Returns what each view shows of a highlight at each place.
+    """Computes how much each view's light exceeds the skin's own light at each vertex, as far as a highlight explains
+    it.
 
     Args:
         colours: linear light of each view at each vertex of the head; NaN where the view does not see it.
-        faces: the head's, which say what is beside what.
+        faces: the head's, which define the neighbours of a vertex.
     """
     light = colours @ LIGHT
     seen = np.isfinite(light)
@@ -147,7 +149,8 @@ def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarra
 
 
 def local_range(values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " v"]:
-    """Returns by how much values differ among each vertex and those beside it, 1 mm away in the face."""
+    """Returns the difference between the highest and lowest value among each vertex and its neighbours, which are 1 mm
+    away in the face."""
     high, low = values.copy(), values.copy()
     highest, lowest = values[faces].max(axis=1), values[faces].min(axis=1)
     for corner in faces.T:
@@ -186,7 +189,7 @@ def _seen(
 
 
 def _box(pixels: Float[np.ndarray, "v 2"], margin: float, height: int, width: int) -> tuple[slice, slice]:
-    """Rows and columns of the image that hold the pixels; two of each at least."""
+    """Returns the rows and columns of the image that hold the pixels and a margin, at least two of each."""
     with np.errstate(invalid="ignore"):
         seen = pixels[((pixels > -margin) & (pixels < (width + margin, height + margin))).all(axis=1)]
     low, high = (seen.min(axis=0), seen.max(axis=0)) if len(seen) else (np.zeros(2), np.zeros(2))
@@ -198,8 +201,8 @@ def _box(pixels: Float[np.ndarray, "v 2"], margin: float, height: int, width: in
 def _lowered(
     image: UInt8[np.ndarray, "h w 3"], camera: Camera, sight: _Sight, head_world: Mesh, excess: Excess, view: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The image less the view's excess about what is sure to be a highlight, smoothed along the surface; beyond where
-    it is known it goes on."""
+    """Returns the image less the view's excess near sure highlights. The excess is smoothed in the image, which also
+    extends it beyond where it is known."""
     if not excess.sure[view].any():
         return image
     values = np.stack([excess.levels[view], excess.sure[view], excess.known[view]], axis=1).astype(np.float32)

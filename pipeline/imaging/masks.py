@@ -8,7 +8,7 @@ FAR = 0.01  # weight of a window four times as wide, which speaks where the near
 
 
 def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """Returns rows and columns of what is in the mask and a margin; of nothing where it is empty."""
+    """Returns the rows and columns of the box around a mask, with a margin; empty slices if the mask is empty."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     if not width:
         return slice(0, 0), slice(0, 0)
@@ -17,7 +17,7 @@ def box_around(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice
 
 
 def eroded(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"]:
-    """Returns where the subject is left by a border of ``steps`` pixels; the image's own border is none."""
+    """Returns the mask shrunk by a disc of ``steps`` pixels; it does not shrink from the image's border."""
     return cv2.erode(mask.view(np.uint8), _disc(steps), borderValue=1).view(bool)
 
 
@@ -27,7 +27,7 @@ def dilated(mask: Bool[np.ndarray, "h w"], steps: int) -> Bool[np.ndarray, "h w"
 
 
 def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Returns the mask and what it encloses: background that does not reach the image's border."""
+    """Returns the mask with its holes filled: background that is not connected to the image's border."""
     _, labels = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
     reaching = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     return mask | ~np.isin(labels, reaching)
@@ -36,8 +36,8 @@ def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def spread(
     values: Float32[np.ndarray, "h w c"], weight: Float32[np.ndarray, "h w"], sigma: float
 ) -> Float32[np.ndarray, "h w c"]:
-    """Returns values carried to every pixel from where there is weight: a mean in a Gaussian window, and in a wider one
-    where that is empty."""
+    """Spreads values from pixels with weight to all pixels: the weighted mean in a Gaussian window or, where that is
+    empty, in a wider one."""
     whole = _carried(weight, sigma)
     return cv2.merge([_carried(plane * weight, sigma) / whole for plane in cv2.split(values)])
 

@@ -15,8 +15,8 @@ CONTOUR_BLUR_PX = 1.0  # noise of a digital edge falls from 0.29 to 0.1 px; a be
 
 @dataclass(frozen=True, slots=True)
 class ViewQuality:
-    """Says how far a view's silhouette is to be trusted: ``usable`` or not, and every reason against it; ``doubts`` are
-    those that a clean plate or a mask would settle, where there was neither."""
+    """Holds whether a view's silhouette is ``usable``, and the warnings against it. ``doubts`` are those that a clean
+    plate or a mask would settle, for views that had neither."""
 
     usable: bool = True
     contrast: float = float("inf")  # subject against background, in standard deviations of the noise
@@ -30,7 +30,7 @@ class ViewQuality:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Silhouette:
-    """Holds what one camera saw: the mask (True = subject) and the sub-pixel signed distance to its contour (px,
+    """Holds one camera's silhouette: the mask (True = subject) and the sub-pixel signed distance to its contour (px,
     negative inside)."""
 
     mask: Bool[np.ndarray, "h w"]
@@ -39,7 +39,7 @@ class Silhouette:
 
 
 def silhouette_from_mask(mask: Bool[np.ndarray, "h w"]) -> Silhouette:
-    """Returns a silhouette of a ready binary mask."""
+    """Builds the silhouette of a ready binary mask."""
     return Silhouette(mask, signed_distance(mask))
 
 
@@ -66,14 +66,14 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]
 def _distance_transforms(
     mask: Bool[np.ndarray, "h w"],
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """``D(S)`` and ``D(~S)``: each zero outside its own set."""
+    """Returns the distance transforms ``D(S)`` and ``D(~S)`` of a mask S (px); each is zero outside its set."""
     return _distance_transform(mask), _distance_transform(~mask)
 
 
 def _distance_transform(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """``D(S)`` to the last bit. OpenCV's own differs by a unit in the last place from call to call, by where its
-    buffers lie, in pictures of less than 16384 pixels and on one core (it then calls IPP). Squares of distances between
-    pixels are integers, which the nearest one gives back up to 1400 px."""
+    """Computes ``D(S)`` exactly, the same in every call. OpenCV's result can differ in the last bit between calls, in
+    pictures of less than 16384 pixels and on one core (it then calls IPP). Squared distances between pixels are
+    integers, so rounding the squares recovers them, up to 1400 px."""
     distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     squares = np.square(distance, dtype=np.float64)
     return np.sqrt(np.rint(squares, out=squares), out=squares).astype(np.float32)
@@ -85,8 +85,8 @@ def xor_cost(observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) 
 
 
 def boundary_weights(observed: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Returns ``1 / d(i, j)^2`` of eq. (5), with ``d = D(S) + D(~S)`` the distance map from the contour of the
-    input."""
+    """Returns the weights ``1 / d(i, j)^2`` of eq. (5), where ``d = D(S) + D(~S)`` is the distance (px) from the
+    observed contour."""
     inside, outside = _distance_transforms(observed)
     # One of the two is zero at every pixel, the other at least one; a mask without a contour has no boundary at all.
     return (1.0 / np.maximum(inside + outside, 1.0) ** 2).astype(np.float32)

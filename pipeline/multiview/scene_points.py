@@ -24,8 +24,8 @@ MAX_MISS_PX = 1.5  # of the reduced picture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenePoints:
-    """Holds the points. ``points``: world, mm; ``pixels``: by view, where the points whose ``rows`` these are were
-    seen."""
+    """Holds points of the scene (world, mm) with their pixels. For each view, ``pixels`` lists where it sees points,
+    and ``rows`` which points these are."""
 
     points: Float[np.ndarray, "n 3"]
     pixels: Mapping[str, Float[np.ndarray, "_ 2"]]
@@ -35,7 +35,7 @@ class ScenePoints:
 def find_scene_points(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], rig: Rig, *, report: Callable[[float], None] = lambda share: None
 ) -> ScenePoints:
-    """Returns all points that any two neighbouring views agree upon."""
+    """Finds points of the scene by matching keypoints between every two neighbouring views."""
     seen = {}
     for count, camera in enumerate(rig):
         report(0.5 * count / len(rig))
@@ -63,7 +63,7 @@ def find_scene_points(
 
 
 def neighbouring_pairs(rig: Rig) -> list[tuple[str, str]]:
-    """Returns each camera with those that look at the subject from nearly the same side."""
+    """Returns the pairs of cameras that see the subject from nearly the same side."""
     away = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip(away @ away.T, -1, 1)))
@@ -78,7 +78,7 @@ def neighbouring_pairs(rig: Rig) -> list[tuple[str, str]]:
 
 
 def _keypoints(image: UInt8[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of the full image, and descriptors."""
+    """Returns the pixels of keypoints in the full image, and their descriptors."""
     scale = min(1.0, MAX_WIDTH / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
     found, descriptors = cv2.SIFT.create(nfeatures=MAX_KEYPOINTS).detectAndCompute(
@@ -92,7 +92,7 @@ def _keypoints(image: UInt8[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarra
 def _matches(
     first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of mutual matches that pass the ratio test."""
+    """Returns the pixels in both images of keypoints that match mutually and pass the ratio test."""
     if min(len(first[0]), len(second[0])) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     likeness = first[1] @ second[1].T
@@ -109,7 +109,7 @@ def _matches(
 def _where_rays_pass(
     a: Camera, first: Float[np.ndarray, "n 2"], b: Camera, second: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
-    """The points halfway between two rays, and which of them both pixels confirm."""
+    """Returns the points halfway between the rays of two matched pixels, and which of them project near both pixels."""
     if not len(first):
         return np.zeros((0, 3)), np.zeros(0, bool)
     u, v = a.rays_world(first), b.rays_world(second)

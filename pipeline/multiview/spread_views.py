@@ -6,9 +6,9 @@ from rig.rig import Rig
 
 
 def spread_views(rig: Rig, count: int) -> list[str]:
-    """Returns names of ``count`` cameras, the front one first and then, one by one, the one whose direction from the
-    subject is farthest from all that are chosen (Gonzalez, *Clustering to minimize the maximum intercluster distance*,
-    1985)."""
+    """Returns the names of at most ``count`` cameras that stand well apart: the front one first, then always the one
+    whose direction from the subject is farthest from all chosen (Gonzalez, *Clustering to minimize the maximum
+    intercluster distance*, 1985)."""
     away = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     chosen = [rig.names.index(rig.front_camera())]

@@ -22,9 +22,9 @@ MIN_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tangency:
-    """Holds one tangent plane of two cameras: in each camera the pixel where it touches, the unit normal of the
-    epipolar line (px), the plane's change of angle per pixel (rad), and by how many pixels its silhouette reaches along
-    the normal beyond the plane that touches the other's. ``outward``: 1.0 where normals point out of the subject, else
+    """Holds one tangent plane of two cameras. For each camera: the pixel where the plane touches the outline, the unit
+    normal of the epipolar line (px), the plane's change of angle per pixel (rad), and how far (px) the outline reaches
+    along the normal beyond the other camera's plane. ``outward``: 1.0 if the normals point out of the subject, else
     -1.0."""
 
     cameras: tuple[str, str]
@@ -36,8 +36,8 @@ class Tangency:
 
 
 def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: float = 0.0) -> list[Tangency]:
-    """Returns every pair's outer tangent planes that both images hold whole; or of the lines ``inset_mm`` inside the
-    outlines, as long in space for every camera."""
+    """Finds the outer tangent planes of every two cameras that both images show whole. With ``inset_mm``, the planes
+    touch lines that far inside the outlines, measured at the subject."""
     middle = rig.centre_world()
     insets_px = {camera.name: inset_mm / pixel_mm(camera, middle) if inset_mm else 0.0 for camera in rig}
     outlines = {camera.name: _Outline.of(camera, silhouettes[camera.name], insets_px[camera.name]) for camera in rig}
@@ -49,13 +49,13 @@ def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: f
 
 
 def pixel_mm(camera: Camera, place_world: Float[np.ndarray, " 3"]) -> float:
-    """Returns the width (mm) of what a pixel shows at a place's distance."""
+    """Returns the width (mm) that a pixel covers at the distance of a place."""
     return float(np.linalg.norm(place_world - camera.centre_world)) / camera.intrinsics.fx
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Outline:
-    """The convex hull of a mask: outer tangents touch nothing else."""
+    """Holds the convex hull of a mask, which is all that outer tangents touch."""
 
     pixels: Float[np.ndarray, "n 2"]
     rays: Float[np.ndarray, "n 3"]
@@ -72,8 +72,9 @@ class _Outline:
 
 
 def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarray, "n 2"]:
-    """Returns corners of the convex hull of a mask, on the sub-pixel contour (px); or of the line ``inset_px`` inside
-    it, which strands and specks thinner than twice that do not reach. Empty where nothing is."""
+    """Returns the corners (px) of the convex hull of a mask, on its sub-pixel contour; empty for an empty mask. With
+    ``inset_px``, returns the hull of the line that far inside, which excludes strands and specks thinner than twice
+    that."""
     inside = silhouette.distance < -inset_px if inset_px else silhouette.mask
     contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -83,7 +84,7 @@ def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarra
 
 
 def on_contour(pixels: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
-    """Returns outermost pixel centres moved along the gradient of the signed distance onto the contour itself."""
+    """Returns pixel centres at the mask's edge, moved along the gradient of the signed distance onto the contour."""
     height, width = distance.shape
     x, y = pixels.astype(int).T
     left, right = np.maximum(x - 1, 0), np.minimum(x + 1, width - 1)
@@ -116,8 +117,8 @@ def _pair(first: _Outline, second: _Outline, one: Camera, two: Camera) -> list[T
 def epipolar_plane_axes(
     one: Camera, two: Camera, towards: Float[np.ndarray, " 3"]
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Returns two unit vectors (world) across the line through both centres: its planes are told apart by their angle
-    ``arctan2(ray @ v, ray @ u)``, counted from the direction ``towards``."""
+    """Returns two unit vectors u, v (world) perpendicular to the line through both camera centres. The plane through
+    this line and a ray has the angle ``arctan2(ray @ v, ray @ u)``, counted from the direction ``towards``."""
     axis = two.centre_world - one.centre_world
     axis = axis / max(float(np.linalg.norm(axis)), 1e-9)
     u = towards - axis * (towards @ axis)
@@ -126,7 +127,7 @@ def epipolar_plane_axes(
 
 
 def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 4 3"]:
-    """Returns unit rays (world) a pixel to the right, left, below and above of each pixel."""
+    """Returns unit rays (world) through the pixels one to the right, left, below and above of each given pixel."""
     around = pixels[..., None, :] + np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     return camera.rays_world(around.reshape(-1, 2)).reshape(*around.shape[:-1], 3)
 
@@ -134,8 +135,8 @@ def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.nd
 def angle_slopes(
     around: Float[np.ndarray, "*n 4 3"], u: Float[np.ndarray, " 3"], v: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "*n 2"]:
-    """Returns the change of a ray's angle in a pencil of epipolar planes per pixel (rad), by x and by y; ``around``: of
-    ``rays_about``."""
+    """Returns how much the angle of the epipolar plane through a pixel changes per pixel (rad), by x and by y.
+    ``around`` is the result of ``rays_about``."""
     angle = np.arctan2(around @ v, around @ u)
     return np.stack([angle[..., 0] - angle[..., 1], angle[..., 2] - angle[..., 3]], axis=-1) / 2.0
 
@@ -147,8 +148,9 @@ def tangency(
     difference: float,
     outward: float,
 ) -> Tangency:
-    """Returns two contour points that one plane should touch, by ``angle_slopes`` there and the difference (rad) of
-    their planes' angles, first less second; ``outward``: 1.0 where the angle grows out of the subject, else -1.0."""
+    """Builds the tangency of two contour points that one plane should touch. ``slopes``: ``angle_slopes`` at both
+    points; ``difference``: angle (rad) of the first plane less that of the second; ``outward``: 1.0 if the angle grows
+    out of the subject, else -1.0."""
     steepness = float(np.linalg.norm(slopes[0])), float(np.linalg.norm(slopes[1]))
     normals = slopes[0] / steepness[0], slopes[1] / steepness[1]
     excess_px = difference / steepness[0], -difference / steepness[1]

@@ -24,7 +24,7 @@ MIN_RAYS_APART = 1e-4  # rad; between rays closer to parallel, 0.1 px at f = 150
 
 
 class NoPoint(EigenheadError):
-    """Reports pixels that determine no point."""
+    """Reports pixels from which no point can be triangulated."""
 
     def __init__(self, why: Message) -> None:
         super().__init__(compose("point-refused", reason=why))
@@ -32,22 +32,23 @@ class NoPoint(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangulatedPoint:
-    """Holds a world point (mm), its covariance (mm^2), and what each view says against it (measured minus projected,
-    px)."""
+    """Holds a triangulated point (world, mm), its covariance (mm^2), and the residual of each view (measured minus
+    projected, px)."""
 
     position_world: Float[np.ndarray, " 3"]
     covariance: Float[np.ndarray, "3 3"]
     residuals_px: Mapping[str, Float[np.ndarray, " 2"]]
 
     def misfit(self, noise_px: float) -> float:
-        """Returns the sum of squared residuals in units of the noise: chi-square with ``2 * views - 3`` degrees of
-        freedom."""
+        """Returns the sum of squared residuals divided by the squared noise: chi-square with ``2 * views - 3`` degrees
+        of freedom."""
         return sum(float(r @ r) for r in self.residuals_px.values()) / noise_px**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReprojectionTerm:
-    """Holds ``(projected - picked) / noise`` of a world point (mm), by view; NaN behind a camera."""
+    """Computes the residuals ``(projected - picked) / noise`` of a world point (mm), one for each view; NaN behind a
+    camera."""
 
     pixels: Float[np.ndarray, "n 2"]
     cameras: CameraStack
@@ -65,7 +66,7 @@ def triangulate(
     noise_px: float,
     rays_world: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
 ) -> TriangulatedPoint:
-    """Returns the point that minimises the sum of squared reprojection errors over the cameras in ``pixels``.
+    """Computes the point that minimises the sum of squared reprojection errors over the cameras in ``pixels``.
 
     Args:
         pixels: the picked pixel by camera.
@@ -90,15 +91,15 @@ def triangulate(
 
 
 def rays_of(pixels: Mapping[str, Float[np.ndarray, " 2"]], rig: Rig) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the unit direction in the world of each view's ray; taking the lens off it costs most of a
-    triangulation."""
+    """Returns the unit direction (world) of the ray through each view's pixel. Undoing the lens distortion here takes
+    most of a triangulation's time."""
     return {name: rig[name].rays_world(np.asarray(pixel, float)[None])[0] for name, pixel in pixels.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangulatedPoints:
-    """Holds the world points (mm), their covariances (mm^2), and what each view says against them (measured minus
-    projected)."""
+    """Holds n triangulated points (world, mm), their covariances (mm^2), and the residuals of each view (measured minus
+    projected, px)."""
 
     positions_world: Float[np.ndarray, "n 3"]
     covariances: Float[np.ndarray, "n 3 3"]
@@ -151,7 +152,8 @@ def triangulate_many(
 def _nearest_to_rays(
     pixels: Float[np.ndarray, "v n 2"], cameras: Sequence[Camera], noise: Float[np.ndarray, "v n"]
 ) -> Float[np.ndarray, "n 3"]:
-    """For each point the one with the least weighted sum of squared distances to its rays."""
+    """Returns, for each point, the place with the least weighted sum of squared distances to its rays. Raises
+    NoPoint."""
     rays_world = np.stack([camera.rays_world(seen) for camera, seen in zip(cameras, pixels, strict=True)])
     centres_world = np.stack([camera.centre_world for camera in cameras])
     if not np.isfinite(rays_world).all():
@@ -172,7 +174,8 @@ def _whitened(
     cameras: Sequence[Camera],
     weights: Float[np.ndarray, "v n 1"],
 ) -> tuple[Float[np.ndarray, "v n 2"], Float[np.ndarray, "v n 2 3"]]:
-    """``(projected - measured) / noise`` and its slopes; infinite for points behind a camera, 0 without a weight."""
+    """Returns the residuals ``(projected - measured) / noise`` and their derivatives; infinite for points behind a
+    camera, 0 where the weight is 0."""
     projected, slopes = zip(*(camera.project_with_jacobian(points) for camera in cameras), strict=True)
     counts = weights > 0.0
     residual = np.where(counts, weights * (np.stack(projected) - pixels), 0.0)
@@ -181,7 +184,7 @@ def _whitened(
 
 
 def _start(rays_world: Mapping[str, Float[np.ndarray, " 3"]], rig: Rig) -> Float[np.ndarray, " 3"]:
-    """The point with the least sum of squared distances to the rays."""
+    """Returns the point with the least sum of squared distances to the rays. Raises NoPoint."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for name, ray in rays_world.items():
         off_ray = np.eye(3) - np.outer(ray, ray)

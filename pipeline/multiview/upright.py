@@ -11,25 +11,25 @@ from rig.rig import Rig
 
 
 def quarter_turns(rig: Rig) -> Int[np.ndarray, " c"]:
-    """Returns by how many quarter turns each camera's frame must be turned for up to be up in its image."""
+    """Returns the number of quarter turns that bring each camera's image upright."""
     axes = _image_axes(rig)
     return np.argmin(_downs(axes) @ _nearest_up(rig, axes), axis=1)
 
 
 def guessed_up(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the world's direction that is up in the photographs, as they would be had all been held upright."""
+    """Returns the upward direction (unit, world), as the mean over the photographs after each is turned upright."""
     downs = _downs(_image_axes(rig))[np.arange(len(rig)), quarter_turns(rig)]
     up = -downs.mean(axis=0)
     return up / max(float(np.linalg.norm(up)), 1e-9)
 
 
 def _image_axes(rig: Rig) -> Float[np.ndarray, "c 2 3"]:
-    """x and y of each image, in the world."""
+    """Returns the x and y axes of each image as directions in the world."""
     return np.stack([camera.camera_from_world.rotation[:2] for camera in rig])
 
 
 def _downs(axes: Float[np.ndarray, "c 2 3"]) -> Float[np.ndarray, "c 4 3"]:
-    """The image's y axis after 0, 1, 2 and 3 quarter turns."""
+    """Returns the downward axis of each image (world) after 0, 1, 2 and 3 quarter turns."""
     return np.stack([axes[:, 1], axes[:, 0], -axes[:, 1], -axes[:, 0]], axis=1)
 
 

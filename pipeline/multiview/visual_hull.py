@@ -27,23 +27,24 @@ MIN_SHARE = 0.5  # of the views must see a point of the hull; where fewer look, 
 
 
 class NoHull(EigenheadError):
-    """Reports that the silhouettes have no common body."""
+    """Reports silhouettes that have no common volume."""
 
     def __init__(self) -> None:
         super().__init__(compose("no-common-hull"))
 
 
 def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns ``mask_extent`` of the usable silhouettes."""
+    """Returns centre (world, mm) and edge (mm) of a cube that holds the subject, by ``mask_extent`` of the usable
+    silhouettes."""
     return mask_extent({camera.name: silhouettes[camera.name].mask for camera in _believed(silhouettes, rig)}, rig)
 
 
 def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns the centre (world, mm) and edge (mm) of a cube that holds what the masks show; they may be smaller than
+    """Returns the centre (world, mm) and edge (mm) of a cube that holds what the masks show. Masks may be smaller than
     the images.
 
-    The centre is where the rays through the masks' middles cross, the edge the largest mask's diagonal at that depth.
-    Without a mask it is the place that the cameras look at, and 400 mm.
+    The centre is the point nearest to the rays through the masks' middles; the edge is the largest diagonal of a mask
+    at that depth. Without a mask it is the place that the cameras look at, and 400 mm.
     """
     normal, right, views = 1e-9 * np.eye(3), np.zeros(3), []
     for name, mask in masks.items():
@@ -70,9 +71,9 @@ def depth_of(camera: Camera, point: Float[np.ndarray, " 3"]) -> float:
 def visual_hull(
     silhouettes: Mapping[str, Silhouette], rig: Rig, *, spacing_mm: float = SPACING_MM, cells: int = 192
 ) -> Mesh:
-    """Returns the hull of the usable silhouettes, closed, world frame, mm. Raises NoHull.
+    """Computes the visual hull of the usable silhouettes as a closed mesh (world, mm). Raises NoHull.
 
-    ``cells`` a side at most: a larger subject gets a coarser grid.
+    The grid has about ``spacing_mm`` between nodes, more if that needs over ``cells`` cells along a side.
     """
     centre, edge = hull_extent(silhouettes, rig)
     views = _believed(silhouettes, rig)
@@ -86,7 +87,7 @@ def visual_hull(
 
 
 def _believed(silhouettes: Mapping[str, Silhouette], rig: Rig) -> list[Camera]:
-    """The cameras whose silhouettes are usable and not empty."""
+    """Returns the cameras whose silhouettes are usable and not empty."""
     return [
         c
         for c in rig
@@ -101,7 +102,8 @@ def _field(
     edge: float,
     blocks: int,
 ) -> tuple[Float32[np.ndarray, "n n n"], float]:
-    """Signed distance (mm) on a grid of ``COARSE * blocks + 1`` points a side, exact only near the surface."""
+    """Computes the signed distance (mm) on a grid with ``COARSE * blocks + 1`` points along each side, exact only near
+    the surface. Also returns the grid's step (mm)."""
     corner, wide = centre - edge / 2, edge / blocks
     coarse = np.full((blocks + 1,) * 3, -np.inf, np.float32)
     votes = np.zeros(coarse.shape, np.int32)
@@ -131,11 +133,11 @@ def _field(
 
 
 def _nearest_coarse(coarse: Float32[np.ndarray, "b b b"]) -> Float32[np.ndarray, "n n n"]:
-    """The nearest coarse value at every fine point: only its sign is used."""
+    """Returns, at every fine point, the value of a coarse point beside it, of which only the sign is used."""
     index = np.arange(COARSE * (coarse.shape[0] - 1) + 1) // COARSE
     return coarse[np.ix_(index, index, index)]
 
 
 def _settle(field: np.ndarray, votes: np.ndarray, least: float) -> None:
-    """Points that too few views see are outside."""
+    """Marks, in place, points that too few views see as outside."""
     field[votes < max(2.0, least)] = np.float32(1e3)

@@ -32,8 +32,8 @@ DETAIL_BLUR_CELLS = 1.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadGuide:
-    """Says where on a fitted head a place is, by vertex: signed distance (mm) from the border of the face region,
-    positive within, and height (mm) above the chin along the head's own axis; and that axis."""
+    """Holds where each vertex of a fitted head lies: its signed distance (mm) from the border of the face region,
+    positive within, its height (mm) above the chin along the head's upward axis, and that axis."""
 
     mesh: Mesh  # world frame
     into_face_mm: Float[np.ndarray, " v"]
@@ -48,8 +48,8 @@ class HeadGuide:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """Holds one view's cells. Places are those of the fitted head where it covers the cell; beside it, of the plane
-    through its middle that faces the camera."""
+    """Holds one view's coarse grid of cells. Positions belong to the fitted head where it covers a cell; beside the
+    head, to the plane through its middle that faces the camera."""
 
     camera: Camera
     size_px: int
@@ -69,8 +69,8 @@ class Cells:
 def head_guide(
     mesh: Mesh, face_region: Bool[np.ndarray, " v"], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> HeadGuide:
-    """Returns the guide of a fitted head; ``landmarks`` (world) need the corners of eyes and mouth, glabella and
-    gnathion."""
+    """Computes the guide of a fitted head. ``landmarks`` (world) must hold the corners of eyes and mouth, glabella,
+    subnasale, stomion and gnathion."""
     vertices, chin = mesh.vertices, landmarks["gnathion"]
     eyes = (landmarks["exocanthion_right"] + landmarks["exocanthion_left"]) / 2
     left = landmarks["exocanthion_left"] - landmarks["exocanthion_right"]
@@ -127,7 +127,7 @@ def make_cells(
     head: HeadGuide,
     cell_mm: float,
 ) -> list[Cells]:
-    """Returns the cells of every view that has a photograph, colours of all cameras made alike."""
+    """Computes the cells of every view that has a photograph, with the colours of all cameras balanced."""
     cameras = [camera for camera in rig if camera.name in images]
     sizes = [_cell_px(camera, head.middle, cell_mm) for camera in cameras]
     shots = [images[camera.name] for camera in cameras]
@@ -153,13 +153,13 @@ def _cell_px(camera: Camera, at_world: Float[np.ndarray, " 3"], cell_mm: float) 
 
 
 def _linear(image: UInt8[np.ndarray, "h w 3"], size: int) -> Float32[np.ndarray, "r c 3"]:
-    """Linear mean colour of every whole cell."""
+    """Returns the mean linear colour of every whole cell."""
     table = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
     return _means(cv2.LUT(image, table), size)
 
 
 def _grid(values: np.ndarray, size: int) -> tuple[int, int]:
-    """Rows and columns of whole cells."""
+    """Returns the number of rows and columns of whole cells."""
     return values.shape[0] // size, values.shape[1] // size
 
 
@@ -172,7 +172,7 @@ def _means(values: np.ndarray, size: int) -> np.ndarray:
 def _seen(
     camera: Camera, size: int, head: HeadGuide, shape: tuple[int, int]
 ) -> tuple[Float32[np.ndarray, "r c"], Float32[np.ndarray, "r c 5"]]:
-    """Depth of the head at every cell's centre, inf beside it, and the guide's values there."""
+    """Returns the depth of the head (mm) at every cell's centre, inf beside the head, and the guide's values there."""
     pixels = (camera.project(head.mesh.vertices) - (size - 1) / 2) / size
     depths = camera_depths(camera, head.mesh.vertices)
     depth, face = rasterise(pixels, depths, head.mesh.faces, *shape)
@@ -187,7 +187,7 @@ def _gains(
     depths: list[Float32[np.ndarray, "_ _"]],
     head: HeadGuide,
 ) -> Float32[np.ndarray, "k 3"]:
-    """Linear gain of every camera by what several of them see of the face."""
+    """Returns the linear gain of every camera's colours, estimated from parts of the face that several cameras see."""
     rows = np.flatnonzero(head.into_face_mm > 0)
     rows = rows[:: max(1, len(rows) // BALANCE_VERTICES)]
     points, normals = head.mesh.vertices[rows], head.mesh.normals()[rows]
@@ -244,8 +244,8 @@ def _cells(
 
 
 def _height_beside(camera: Camera, size: int, shape: tuple[int, int], head: HeadGuide) -> Float[np.ndarray, "r c"]:
-    """Height above the chin of each cell's ray where it meets the plane through the head's middle that faces the
-    camera; affine in the image but for the lens, so that a 3 x 3 grid of rays tells all."""
+    """Returns the height (mm) above the chin at which each cell's ray meets the plane through the head's middle that
+    faces the camera. It is nearly affine in the image, so it is fitted to a 3 x 3 grid of rays."""
     row, column = np.meshgrid(np.linspace(0, shape[0] - 1, 3), np.linspace(0, shape[1] - 1, 3), indexing="ij")
     pixels = np.stack([column.ravel(), row.ravel()], axis=1) * size + (size - 1) / 2
     rays = camera.rays_world(pixels)
@@ -264,7 +264,8 @@ def grey_of(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
 
 
 def _detail(image: UInt8[np.ndarray, "h w 3"], size: int) -> Float32[np.ndarray, "r c"]:
-    """Log of the fine structure's standard deviation within and around each cell, against its mean."""
+    """Returns the log of the standard deviation of fine structure within and around each cell, divided by the mean
+    grey."""
     grey = 255.0 * grey_of(image)
     fine = cv2.GaussianBlur(grey, (0, 0), 0.8) - cv2.GaussianBlur(grey, (0, 0), 0.6 * size)
     square, mean = _means(fine * fine, size), _means(grey, size)

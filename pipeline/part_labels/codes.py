@@ -20,7 +20,7 @@ class Part(IntEnum):
 
     @property
     def channel(self) -> int:
-        """Returns the part's place along the last axis of probabilities; raises ValueError for UNSEEN."""
+        """Returns the part's index along the last axis of probabilities. Raises ValueError for UNSEEN."""
         return CHANNELS.index(self)
 
 
@@ -29,5 +29,5 @@ CHANNELS = (Part.SKIN, Part.HAIR, Part.CLOTHES)
 
 
 def codes_from_channels(channels: Int[np.ndarray, " n"]) -> UInt8[np.ndarray, " n"]:
-    """Returns the code of each channel's part."""
+    """Returns the code of the part that belongs to each channel."""
     return np.array(CHANNELS, np.uint8)[channels]

@@ -47,8 +47,8 @@ FLOOR = 0.02  # of a part's looks that its histogram has not shown
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartMap:
-    """Holds one view. ``probability`` of skin, hair and clothes on the photograph's own grid; what is missing to one is
-    unknown, all of it outside the subject."""
+    """Holds one view's probabilities of skin, hair and clothes at each pixel of the photograph. Where they sum to less
+    than one, the rest is unknown; outside the subject all of it is."""
 
     camera: str
     probability: Float32[np.ndarray, "h w 3"]
@@ -65,7 +65,7 @@ def classify_parts(
     settings: PartSettings,
     report: Progress,
 ) -> dict[str, PartMap]:
-    """Returns what the pixels of every usable view with a photograph show.
+    """Computes, for every usable view with a photograph, the probability that each pixel shows skin, hair or clothes.
 
     Args:
         images: sRGB photographs by camera.
@@ -113,7 +113,7 @@ def classify_parts(
 
 
 def bins(view: Cells) -> Int[np.ndarray, "r c 2"]:
-    """Returns the bin of colour and of fine structure of every cell."""
+    """Returns the histogram bins of every cell: that of its colour and that of its fine structure."""
     red, blue, light = np.moveaxis(view.colour, 2, 0)
     a, b = _bin(red, RED_RANGE, RED_BINS), _bin(blue, BLUE_RANGE, BLUE_BINS)
     colour = (a * BLUE_BINS + b) * LIGHT_BINS + _bin(light, LIGHT_RANGE, LIGHT_BINS)
@@ -125,11 +125,11 @@ def _bin(values: Float32[np.ndarray, "r c"], span: tuple[float, float], count: i
 
 
 def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
-    """Returns cells that by their place can hardly be anything but skin, hair or clothes (1, else 0).
+    """Marks cells (1, else 0) that by their position can hardly be anything but skin, hair or clothes, one channel
+    each.
 
-    Skin: cheeks and nose. Hair:
-    the cranium far from the face, and what lies beside the head above the ears. Clothes: what lies well below the chin
-    and beside the neck.
+    Skin: cheeks and nose. Hair: the cranium far from the face, and what lies beside the head above the ears. Clothes:
+    what lies well below the chin and beside the neck.
     """
     skin = view.cheek > 0.5
     beside = ~view.on_head & (view.outside_mm > 3.0)
@@ -139,33 +139,33 @@ def starts(view: Cells) -> Float32[np.ndarray, "r c 3"]:
 
 
 def beard_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Returns jaw, chin and upper lip."""
+    """Marks the cells of jaw, chin and upper lip."""
     low = (view.above_chin_mm > -20.0) & (view.above_chin_mm < 50.0)
     return view.on_head & low & (view.into_face_mm > -15.0)
 
 
 def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Marks the zone above it, between cheeks and ears, where only a beard reaches."""
+    """Marks the cells above the beard zone, between cheeks and ears, where of all hair only a beard reaches."""
     above = (view.above_chin_mm >= 50.0) & (view.above_chin_mm < 80.0)
     return view.on_head & above & (view.into_face_mm > -15.0) & (view.cheek < 0.5)
 
 
 def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Returns where a beard grows and light falls on skin, too: the zone without lips and without the underside of jaw
-    and chin, which is dark with a beard and without."""
+    """Marks the cells of the beard zone whose skin would be plain and lit: not lips, and not the underside of jaw and
+    chin, which is dark with and without a beard."""
     return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
 
 
 def beard_evidence(unlikeness: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
-    """Returns 0 for a bare lower face, 1 for a beard, by the share of it that looks otherwise than cheeks and nose: of
-    heads without a beard it is below 0.12, of beards above 0.9."""
+    """Returns 0 for a bare lower face and 1 for a beard, from the mean unlikeness of the lower face to cheeks and nose:
+    below 0.12 without a beard, above 0.9 with one."""
     share = float(unlikeness[lower].mean()) if lower.any() else 0.0
     return float(_ramp(np.full((1, 1), share, np.float32), *BEARD_SHARE)[0, 0])
 
 
 def place_prior(view: Cells, bearded: float = 0.0) -> Float32[np.ndarray, "r c 4"]:
-    """Returns the probability of each part, and of none, by place alone, and by whether there is a beard
-    (``beard_evidence``)."""
+    """Returns the probability of skin, hair, clothes and none of them in each cell, from its position and from
+    ``beard_evidence`` alone."""
     face = _ramp(view.into_face_mm, -25.0, 15.0)
     upper = np.where(view.on_head, _ramp(view.above_chin_mm, -15.0, 45.0), _ramp(view.above_chin_mm, -45.0, 25.0))
     skin_above = np.where(view.on_head, 0.15 + 0.8 * face, 0.12)
@@ -196,8 +196,8 @@ def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float3
 def unlike_cheeks(
     appearance: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Tells how far every cell does not look like those that are skin for certain, 0 to 1: by colour, and by colour and
-    fine structure, which tells a blond beard from skin (but shadows' borders from skin, too)."""
+    """Returns how much every cell differs from cells that are surely skin, 0 to 1: by colour alone, and by colour and
+    fine structure. Fine structure separates a blond beard from skin, but also the borders of shadows."""
     everything = np.ones(len(appearance), np.float32)
     colour, detail = (
         (of(which, cheeks) / of(which, everything))[which]
@@ -215,10 +215,11 @@ def fit_appearance(
     unlikeness: Float[np.ndarray, " n"],
     settings: PartSettings,
 ) -> Float32[np.ndarray, "n 4"]:
-    """Returns the log likelihood of every cell's looks under skin, hair, clothes and the outlier, and of there being
-    such a part.
+    """Learns the appearance of the parts. Returns the log likelihood of every cell under skin, hair, clothes and the
+    outlier, with the evidence that the subject shows the part at all.
 
-    Starts from the cells of each part that are sure by their place, less those of hair and clothes that look like skin.
+    Starts from the cells that are sure by their position; those of hair and clothes count less the more they look like
+    skin.
     """
     colour, detail = appearance.T
     share = start.copy()
@@ -240,14 +241,14 @@ def fit_appearance(
 def _presence(
     unlikeness: Float[np.ndarray, " n"], start: Float32[np.ndarray, "n 3"], lower: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, " 3"]:
-    """Is there hair, are there clothes? The share of their sure places that look otherwise than skin; a beard is hair,
-    too."""
+    """Returns how likely the subject shows each part at all: for hair and clothes, the mean unlikeness to skin of their
+    sure cells. A beard counts as hair."""
     shares = [float(unlikeness[place > 0].mean()) if place.any() else 0.0 for place in (*start.T, lower)]
     return np.maximum([1.0, max(shares[HAIR_CHANNEL], shares[3]), shares[CLOTHES_CHANNEL]], MIN_PRESENT)
 
 
 def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the probability of each part; what is missing to one is the outlier's."""
+    """Returns the probability of skin, hair and clothes in each cell; what they lack to one belongs to the outlier."""
     share = prior * np.exp(logs - logs.max(axis=1, keepdims=True))
     return share[:, :3] / share.sum(axis=1, keepdims=True)
 
@@ -284,7 +285,7 @@ def upsample_guided(
     mask: Bool[np.ndarray, "h w"],
     settings: PartSettings,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the cells' probabilities made smooth up to edges of the photograph, on its own grid."""
+    """Returns the cells' probabilities at each pixel of the photograph, smoothed up to its edges."""
     grid = np.zeros((*inside.shape, 3), np.float32)
     grid[inside] = share
     radius = max(1, round(0.5 * settings.smooth_mm / settings.cell_mm))
@@ -304,7 +305,8 @@ def guided(
     """Returns slope and offset of the guided filter: ``slope guide + offset`` are the smooth values (eqs. 5, 6 and 8
     there).
 
-    ``weight`` is 0 where values are unknown; ``edge`` the contrast of the guide that ends a neighbourhood.
+    ``weight`` is 0 where values are unknown; ``edge`` is the contrast of the guide across which values are not
+    smoothed.
     """
 
     def mean(field: np.ndarray) -> np.ndarray:

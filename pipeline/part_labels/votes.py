@@ -26,8 +26,8 @@ CELL_MM = 4.0  # edge of a cell
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartVotes:
-    """Holds cells of the visible surface: their mean places (world, mm) and the mean probability of skin, hair,
-    clothes."""
+    """Holds small cells of the visible surface, each with its mean point (world, mm) and the mean probabilities of
+    skin, hair and clothes."""
 
     corner: Float[np.ndarray, " 3"]
     size: Int[np.ndarray, " 3"]  # cells along each axis
@@ -85,12 +85,14 @@ def _keys(cell: Int[np.ndarray, "n 3"], size: Int[np.ndarray, " 3"]) -> Int[np.n
 
 
 def part_codes(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
-    """Returns the part (``Part``) that each point's own cell (or, without one, the nearest) shows most."""
+    """Returns the most probable part (a code of ``Part``) at each point, from the cell that holds the point or else the
+    nearest one."""
     return codes_from_channels(part_shares(votes, points).argmax(axis=1))
 
 
 def part_shares(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the probability of skin, hair and clothes at each point, of its own cell or, without one, the nearest."""
+    """Returns the probabilities of skin, hair and clothes at each point, from the cell that holds the point or else the
+    nearest one."""
     cell = np.floor((points - votes.corner) / CELL_MM).astype(np.int64)
     inside = ((cell >= 0) & (cell < votes.size)).all(axis=1)
     keys = np.where(inside, _keys(cell, votes.size), -1)

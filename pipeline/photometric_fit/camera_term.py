@@ -26,8 +26,8 @@ from rig.camera import Camera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSensitivity:
-    """Holds, of n patches: the derivative of depth with respect to camera pose, and what they say of the cameras
-    alone."""
+    """Holds, for n patches, how the depth of each depends on the cameras' poses, and what the shifts between its images
+    say of the cameras alone."""
 
     by_camera: Float[np.ndarray, "n c"]  # d(place, mm along the normal) / d(cameras), c = 6 K
     view: Int[np.ndarray, "n v"]
@@ -36,7 +36,8 @@ class CameraSensitivity:
     slides: Float[np.ndarray, "n a 6"]  # d(image shifts of a view) / d(its camera)
 
     def cameras(self, information: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
-        """Returns the matrix and gradient (towards the minimum) in the cameras."""
+        """Returns the patches' matrix and gradient (towards the minimum) in the cameras' unknowns, each patch weighted
+        by its ``information``."""
         size = self.by_camera.shape[1]
         matrix, gradient = np.zeros((size, size)), np.zeros(size)
         add_cameras(self.view, self.stiff, self.slope, self.slides, information, matrix, gradient)
@@ -51,8 +52,8 @@ def camera_sensitivity(
     axes: Float[np.ndarray, "n 3"],
     cameras: tuple[Camera, ...],
 ) -> CameraSensitivity:
-    """Computes it of patches whose surface lies at ``places`` and moves along ``axes``; ``grams``: of
-    ``gram_matrices``."""
+    """Computes the sensitivity of patches whose surface lies at ``places`` (world, mm) and moves along ``axes``.
+    ``grams`` is the result of ``gram_matrices``."""
     slopes, mixed = grams
     axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes
     total = np.maximum(value.sum(axis=1), 1e-12)[:, None]
@@ -89,8 +90,9 @@ def gram_matrices(
     samples: Samples,
     pictures: Pictures,
 ) -> tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]]:
-    """Returns <g, g> of the slopes of a patch's views, two axes each, and <g, f> of slopes and grey values, with the
-    surface moved by ``shifts`` (mm along the normals)."""
+    """Computes two sets of inner products for each patch, with the surface moved by ``shifts`` (mm along the normals):
+    of the image slopes of its views with each other (two axes for each view), and of the slopes with the grey values.
+    """
     count, views = view.shape
     slopes, mixed = np.zeros((count, 2 * views, 2 * views)), np.zeros((count, 2 * views, views))
     members = Members(patches.start, patches.member, weights)

@@ -13,8 +13,8 @@ MIN_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
 def choose_views(
     patches: Patches, weights: Float[np.ndarray, " e"], facing: Float32[np.ndarray, "k s"], least_seen: float, most: int
 ) -> tuple[Int[np.ndarray, "c n"], Float[np.ndarray, "c n"]]:
-    """Returns the views that see a patch whole and most frontally, at most ``most``, and the squared cosine of each; -1
-    and 0 where there are fewer."""
+    """Returns, for each patch, at most ``most`` views that see it most frontally and nearly whole, and the squared
+    cosine in each; -1 and 0 fill the rest."""
     total = patches.sums(weights, np.ones((facing.shape[1], 1)))
     seen = patches.sums(weights, (facing > 0).T.astype(float))
     cosine = patches.sums(weights, facing.T.astype(float)) / np.maximum(seen, 1e-9)
@@ -26,7 +26,8 @@ def choose_views(
 
 
 def sweep(samples: Samples, pictures: Pictures, steps: Float[np.ndarray, " d"]) -> Float32[np.ndarray, "s k d"]:
-    """Returns grey values of every sample moved along its normal by ``steps`` (mm), as each camera shows it."""
+    """Returns the grey value that each camera shows of every sample moved along its normal by each of ``steps``
+    (mm)."""
     cameras, count = samples.seen.shape
     out = np.zeros((count, cameras, len(steps)), np.float32)
     in_threads(count, lambda a, b: sweep_pictures(a, b, samples, pictures, steps, out))
@@ -43,11 +44,11 @@ def correlate(
     grey: Float32[np.ndarray, "s k d"],
     noise: Float[np.ndarray, " k"],
 ) -> Float32[np.ndarray, "c d"]:
-    """Returns the mean normalised cross-correlation over the pairs of the chosen views of each patch; 0 where there is
-    no pair.
+    """Returns the mean normalised cross-correlation over the pairs of each patch's chosen views, for every step; 0 if
+    there is no pair.
 
-    Gain and offset of a view drop out of it. ``noise`` is the standard deviation of grey values: it stands in the norm,
-    so that a patch without texture is like nothing, however alike its noise may look.
+    Gain and offset of a view have no effect. ``noise`` is the standard deviation of each camera's grey values. It is
+    part of the norm, so that patches without texture correlate with nothing.
     """
     score = np.zeros((len(patches.centre), grey.shape[2]), np.float32)
     members = Members(patches.start, patches.member, weights)

@@ -41,7 +41,7 @@ SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds one pass over all patches."""
+    """Holds the lengths of one search over all patches."""
 
     window_mm: float  # standard deviation of the patch's window
     blur_mm: float  # of the images, on the head
@@ -51,7 +51,8 @@ class Round:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampleVisibility:
-    """Holds the head as it stands, and who sees what of it."""
+    """Holds the head at the current state and, for each camera, which samples of its surface are visible, where and how
+    frontally."""
 
     cameras: tuple[Camera, ...]  # where the state has them
     vertices: Float[np.ndarray, "v 3"]  # full level, world
@@ -65,7 +66,7 @@ class SampleVisibility:
 def sample_visibility(
     problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"], settings: PhotoSettings
 ) -> SampleVisibility:
-    """Draws the depth of the head in every view, and asks for every sample."""
+    """Finds which samples each camera sees on the head of a state, by drawing the head's depth in every view."""
     model, pose = problem.model, state.world_from_head
     cage = model.cage(state.coefficients)
     head = Mesh(pose.apply(model.levels["full"].operator @ cage), model.levels["full"].faces)
@@ -83,7 +84,8 @@ def visibility_of(
     *,
     settings: PhotoSettings,
 ) -> SampleVisibility:
-    """Returns who sees what of a head; a mesh that is ``coarse`` is drawn for what hides it.
+    """Finds which samples of a head each camera sees. The mesh ``coarse_world`` stands for the head where it hides
+    samples.
 
     Args:
         head_world: the patches' mesh, mm.
@@ -117,7 +119,7 @@ def visibility_of(
 
 
 def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
-    """Returns the cameras where the state has them."""
+    """Returns the cameras with the state's corrections applied."""
     views = moved_views(problem, state)
     return tuple(
         replace(camera, camera_from_world=RigidTransform(rotation, translation))
@@ -133,7 +135,8 @@ def facing_of(
     distance: Float32[np.ndarray, "h w"],
     settings: PhotoSettings,
 ) -> Float32[np.ndarray, " s"]:
-    """Returns the cosine between normal and line of sight for every sample that the camera sees; 0 where it does not.
+    """Returns, for every sample that the camera sees, the cosine between its normal and the line of sight; 0 for hidden
+    samples.
 
     ``depth`` is the z-buffer of the head, ``distance`` the silhouette's signed distance.
     """
@@ -168,9 +171,9 @@ def observe(
     each: Round,
     settings: PhotoSettings,
 ) -> tuple[SurfaceObservations, Int[np.ndarray, " u"]]:
-    """Returns where the photographs see the surface, by the vertices at the patches' centres, and the vertices that
-    they see without knowing where they are; a patch of ``hair`` says only that the head is no farther out than that.
-    ``basis``: the model's modes at the centres."""
+    """Measures the surface at the patches' centres. Returns the observations, and the vertices that several cameras see
+    but that have no clear match. A patch of ``hair`` gives only an outer bound of the head. ``basis`` holds the model's
+    modes at the centres."""
     scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
     found = find_places(photographs, patches, visibility, problem.views, scale, each=each, settings=settings)
     several, clear, view, value = found.several, found.clear, found.view, found.value
@@ -231,8 +234,8 @@ def find_places(
     each: Round,
     settings: PhotoSettings,
 ) -> Places:
-    """Returns every patch moved along its normal through the photographs of the views that see it; ``scale``: px a
-    mm."""
+    """Searches every patch along its normal for the place where its views correlate best. ``scale``: pixels per mm of
+    each camera."""
     steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
     image, noise = blurred(photographs, each.blur_mm * scale)
     weights, seen = patches.weights(each.window_mm), visibility.facing > 0
@@ -250,9 +253,9 @@ def find_places(
 def metric_rig(
     cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"], spread: float
 ) -> Float[np.ndarray, "c c"]:
-    """Returns information that cameras do not all err towards the head alike: their distances come from one board,
-    whose size is known. Images alone cannot tell; a contour that lies a tenth of a pixel too far out would otherwise
-    move every camera closer, and the surface with them."""
+    """Returns information against an error that moves all cameras towards the head alike: their distances come from one
+    board of known size. Images alone cannot exclude it; a contour a tenth of a pixel too far out would otherwise move
+    every camera closer, and the surface with them."""
     depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
     nearer = np.zeros((len(depth), 6))
     nearer[:, 5] = 1.0 / (len(depth) * depth)
@@ -260,13 +263,13 @@ def metric_rig(
 
 
 def pixels_per_mm(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
-    """Tells how large each camera sees a mm at the head's place."""
+    """Returns how many pixels a mm at ``at_world`` covers in each camera."""
     return np.array([c.intrinsics.fx / c.camera_from_world.apply(at_world)[2] for c in cameras])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peaks:
-    """Holds the highest point of each patch's correlation."""
+    """Holds the peak of each patch's correlation along its normal."""
 
     place: Float[np.ndarray, " c"]  # mm along the normal
     height: Float[np.ndarray, " c"]
@@ -275,7 +278,7 @@ class Peaks:
 
 
 def find_peaks(score: Float32[np.ndarray, "c d"], steps: Float[np.ndarray, " d"]) -> Peaks:
-    """Finds each patch's peak by the highest step and its neighbours."""
+    """Finds the peak of each patch's correlation, from a parabola through the highest step and the steps beside it."""
     best = score.argmax(axis=1)
     middle = np.clip(best, 1, len(steps) - 2)
     rows, step = np.arange(len(score)), steps[1] - steps[0]

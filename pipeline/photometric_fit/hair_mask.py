@@ -26,11 +26,11 @@ def under_hair(
     seen: Bool[np.ndarray, "k s"],
     centres: Float[np.ndarray, "c 3"],
 ) -> Bool[np.ndarray, " c"]:
-    """Returns the patches that show hair, or are about to.
+    """Tells which patches show hair or lie within ``REACH_MM`` of one that does.
 
     Args:
         patches: samples of the face and patches of them.
-        hair: probability that a pixel shows hair; cameras without a map say nothing.
+        hair: probability that a pixel shows hair; cameras without a map are ignored.
         names: of the k cameras.
         pixel: where each camera sees each sample.
         seen: whether it does.

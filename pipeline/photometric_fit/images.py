@@ -17,8 +17,8 @@ INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographs:
-    """Holds of the solver's views pictures in grey, the noise (grey levels) of each, and whether it shows anything at
-    all. A view without a photograph is black."""
+    """Holds, for each view of the solver, the grey photograph, its noise (grey levels) and whether it shows any
+    texture. A view without a photograph is black."""
 
     grey: tuple[Float32[np.ndarray, "_ _"], ...]
     noise: Float[np.ndarray, " k"]
@@ -26,7 +26,8 @@ class Photographs:
 
 
 def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Views) -> Photographs:
-    """Loads those of the views; a view without a photograph, or with nothing to see in it, does not speak."""
+    """Loads the photographs of the views in grey. A view without a photograph, or without texture inside its
+    silhouette, is marked as one that does not speak."""
 
     def load(k: int) -> tuple[Float32[np.ndarray, "h w"], float, bool]:
         width, height = views.size[k]
@@ -40,14 +41,14 @@ def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Vi
 
 
 def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:
-    """Returns the signed distance of one view."""
+    """Returns the signed distances (px) of view k as an image."""
     width, height = views.size[k]
     return views.distance[views.offset[k] : views.offset[k] + width * height].reshape(height, width)
 
 
 def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], noise: float) -> bool:
-    """Tells whether there is more than noise inside the silhouette, and not half of it burnt out or black. A mask that
-    stands in for a photograph is one even value there."""
+    """Tells whether the pixels inside the silhouette show more than noise, and more than half of them are neither burnt
+    out nor black. A mask in place of a photograph is one even value there."""
     if not inside.any():
         return False
     smooth = cv2.GaussianBlur(grey, (0, 0), TEXTURE_BLUR_PX)[inside]
@@ -60,7 +61,8 @@ def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h 
 def blurred(
     photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
-    """Returns all images, blurred, in one row, and the noise that is left: white noise falls by 2 sqrt(pi) sigma."""
+    """Returns all images, each blurred with its ``sigma_px``, as one flat array, and the noise that is left in each: a
+    blur divides white noise by 2 sqrt(pi) sigma."""
     sigma = np.maximum(sigma_px, MIN_BLUR_PX)
     grey = photographs.grey
     smooth = map_in_threads(lambda k: cv2.GaussianBlur(grey[k], (0, 0), float(sigma[k])).ravel(), len(grey))

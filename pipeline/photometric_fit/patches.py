@@ -18,7 +18,8 @@ from rig.mesh import vertex_normals
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Holds s samples of the full level's triangles, and C patches of them (start, member: compressed rows)."""
+    """Holds s samples on the full level's triangles, and C patches, each a set of samples about a vertex. ``start`` and
+    ``member`` list the samples of each patch in compressed rows."""
 
     corners: Int32[np.ndarray, "s 3"]
     shares: Float[np.ndarray, "s 3"]
@@ -32,7 +33,7 @@ class Patches:
         return _mixed(vertices, self.corners, self.shares)
 
     def mixed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " s"]:
-        """Returns what the vertices have, at the samples."""
+        """Interpolates values at the vertices to the samples."""
         return np.einsum("sk,sk->s", self.shares, values[self.corners])
 
     def normals(self, vertex_normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "s 3"]:
@@ -40,17 +41,19 @@ class Patches:
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
     def sums(self, weights: Float[np.ndarray, " e"], values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "c n"]:
-        """Returns weighted sums over the samples of each patch."""
+        """Returns, for each patch, the weighted sum of the values at its samples."""
         shape = (len(self.centre), len(self.corners))
         return sparse.csr_array((weights, self.member, self.start), shape=shape) @ values
 
     def weights(self, size_mm: float) -> Float[np.ndarray, " e"]:
-        """Returns a Gaussian window of that standard deviation."""
+        """Returns the weight of each sample in its patch: a Gaussian with standard deviation ``size_mm`` times the
+        agreement of the normals."""
         return np.exp(-0.5 * self.square_mm2 / size_mm**2) * self.agreement
 
 
 def make_patches(model: HeadModel, *, sample_mm: float, centre_mm: float, radius_mm: float) -> Patches:
-    """Returns samples about ``sample_mm`` and patches about ``centre_mm`` apart, each patch a ball of ``radius_mm``."""
+    """Spreads samples about ``sample_mm`` apart over the face region, and patches about ``centre_mm`` apart; a patch
+    holds all samples within ``radius_mm`` of its centre."""
     level = model.levels["full"]
     vertices = model.vertices(np.zeros(0))
     normals = vertex_normals(vertices, level.faces)
@@ -67,14 +70,15 @@ def make_patches(model: HeadModel, *, sample_mm: float, centre_mm: float, radius
 
 
 def arrays_of(patches: Patches) -> dict[str, np.ndarray]:
-    """Returns them by the names of the fields."""
+    """Returns the arrays of the patches by the names of their fields."""
     return {field.name: getattr(patches, field.name) for field in fields(patches)}
 
 
 def spread_samples(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], spacing_mm: float
 ) -> tuple[Int32[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    """Returns about one sample in ``spacing_mm`` squared: large triangles are split, some of the small ones skipped."""
+    """Returns samples as corners and barycentric weights, about one for each square of edge ``spacing_mm``. Large
+    triangles get several; of small triangles only some get one."""
     a, b, c = (vertices[faces[:, j]] for j in range(3))
     wanted = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) / spacing_mm**2
     splits = np.maximum(np.round(np.sqrt(wanted)), 1).astype(int)
@@ -90,7 +94,7 @@ def spread_samples(
 
 
 def _centroids(k: int) -> Float[np.ndarray, "n 3"]:
-    """Barycentric centres of the k^2 triangles that a triangle splits into."""
+    """Returns the barycentric centres of the k^2 equal triangles that a triangle splits into."""
     upward = [(i + 1 / 3, j + 1 / 3) for i in range(k) for j in range(k - i)]
     downward = [(i + 2 / 3, j + 2 / 3) for i in range(k) for j in range(k - 1 - i)]
     found = np.array(upward + downward) / k
@@ -100,7 +104,8 @@ def _centroids(k: int) -> Float[np.ndarray, "n 3"]:
 def thinned(
     vertices: Float[np.ndarray, "v 3"], rows: Int[np.ndarray, " n"], spacing_mm: float
 ) -> Int[np.ndarray, " c"]:
-    """Returns one of ``rows`` in every cube of that edge: the one nearest to its middle."""
+    """Returns at most one of the vertices ``rows`` for each cube with edge ``spacing_mm``: the one nearest to the
+    cube's middle."""
     scaled = vertices[rows] / spacing_mm
     cell = np.floor(scaled).astype(np.int64)
     _, cube = np.unique(cell, axis=0, return_inverse=True)

@@ -52,7 +52,7 @@ def refine_with_photographs(
     *,
     hair: HairProbability | None = None,
 ) -> tuple[ContourSolution, Detail]:
-    """Goes on from the contours' solution with what the photographs show inside the outline, in a finer basis.
+    """Continues the contours' solution with observations of the photographs inside the outline, and with finer modes.
 
     Args:
         solved: the contours' solution.
@@ -61,7 +61,7 @@ def refine_with_photographs(
         hair: how probably each pixel shows hair, by camera; without it everything inside the outline is skin.
 
     Returns:
-        The solution; where the photographs show too little, as it was. And which of the two, and why.
+        The refined solution, or ``solved`` if the photographs show too little; and the level of detail with the reason.
     """
     problem = solved.problem
     photographs = load_photographs(images, problem.views)
@@ -99,8 +99,8 @@ def refine_with_photographs(
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
 def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
-    """Returns the model with the fine kernel, its patches, and its modes at their centres: what the model alone
-    decides."""
+    """Returns the model with the fine kernel's modes added, its patches, and its modes at their centres. All three
+    depend only on model and settings."""
     length, amplitude = settings.fine_length_mm, settings.fine_amplitude_mm
     sizes = {
         "sample_mm": settings.sample_mm,
@@ -129,8 +129,8 @@ def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches
 
 
 def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
-    """Returns the vertices of the rim's level about vertices of the full level that lie under hair: their outline is
-    hair's. A fit to contours alone has bulged into it wherever its edge hung together with the face's."""
+    """Tells which vertices of the rim's level lie near vertices of the full level that are under hair, so that their
+    outline is that of hair. A fit to contours alone has bulged into the hair where its edge joined the face's."""
     mean = model.vertices(np.zeros(0))
     if not len(hair):
         return np.zeros(model.levels[LEVEL].count, bool)
@@ -140,11 +140,12 @@ def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray,
 def local_misfit_mm(
     model: HeadModel, seen: SurfaceObservations, state: State, lost: Int[np.ndarray, " u"]
 ) -> Float[np.ndarray, " v0"]:
-    """Tells how far the surface that photographs see lies off the fitted one around each cage vertex, in mm (RMS).
+    """Returns, around each cage vertex, the RMS distance (mm) between the surface that photographs show and the fitted
+    one.
 
-    Where several cameras see a place (vertex ``lost``) and find no match within reach, it is off by more than they can
-    tell: eyes that the model has open and the subject closed. That counts where it is, and not for the whole head.
-    Nothing is said beyond the patches.
+    At the vertices ``lost``, which several cameras see without a match within reach, it is taken as ``LOST_MM``: eyes
+    that are open in the model and closed in the photographs, for example. Those count around themselves only, not for
+    the whole head. Away from the patches the misfit fades to 0.
     """
     skin = ~seen.bound
     off = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)[0][skin]

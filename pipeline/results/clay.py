@@ -28,9 +28,8 @@ def clay(
     paper: tuple[int, int, int] = PAPER,
     darkest: float = DARKEST,
 ) -> Resized:
-    """Returns a mesh (head frame, mm) seen from ``azimuth_deg`` towards its left, twice supersampled; ``panel`` is
-    width and height in pixels. ``box``: the corners of what fills the panel, so that several meshes are shown at one
-    scale."""
+    """Draws a mesh (head frame, mm) seen from ``azimuth_deg`` towards its left, twice supersampled; ``panel`` is width
+    and height in pixels. ``box``: two corners of what fills the panel, so that several meshes can share a scale."""
     low, high = (mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) if box is None else box
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     width, height = 2 * panel[0], 2 * panel[1]
@@ -46,7 +45,7 @@ def clay(
 def lit(
     mesh: Mesh, colours: UInt8[np.ndarray, "v 3"] | None = None, darkest: float = DARKEST
 ) -> UInt8[np.ndarray, "v 3"]:
-    """Returns colours (clay by default) as the lamp shows them."""
+    """Returns the vertex colours (clay if None) shaded by the lamp."""
     cosine: Float[np.ndarray, " v"] = np.clip(mesh.normals() @ (LAMP / np.linalg.norm(LAMP)), 0.0, 1.0)
     base = SKIN if colours is None else colours.astype(float)
     return np.clip(base * (darkest + (1.0 - darkest) * cosine[:, None]), 0, 255).astype(np.uint8)

@@ -37,12 +37,12 @@ ENCODINGS = {
 
 
 def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
-    """Writes head.ply, and what ``settings.outputs`` names beside it. Raises NoUsd, OSError.
+    """Writes head.ply and the other head files that ``settings.outputs`` names. Raises NoUsd, OSError.
 
     Args:
         folder: of the result.
         result: what is written.
-        head: its mesh in the head frame, mm.
+        head: the head's mesh in the head frame, mm.
     """
     outputs, formats, atlas = result.settings.outputs, result.settings.outputs.written, result.texturing.atlas
     named = atlas is not None and outputs.ply_texture
@@ -113,7 +113,7 @@ def _write_obj(folder: Path, result: Reconstruction) -> None:
 
 
 def encoded(atlas: Atlas, kind: str) -> bytes:
-    """Returns the texture as a file: ``kind`` of ``ENCODINGS``."""
+    """Returns the texture as the bytes of an image file; ``kind`` is a key of ``ENCODINGS``."""
     suffix, _, options = ENCODINGS[kind]
     stored: UInt8[np.ndarray, "s s 3"] = np.ascontiguousarray(atlas.image[:, :, ::-1])  # it is kept blue first
     _, data = cv2.imencode(suffix, stored, list(options))

@@ -10,7 +10,7 @@ from rig.digest import document_sha256
 
 
 def ply_comments(result: Reconstruction) -> list[str]:
-    """Returns comment lines of head.ply and bust.ply."""
+    """Returns the comment lines for the headers of head.ply and bust.ply."""
     return [
         "unit mm",
         "frame world",
@@ -35,5 +35,5 @@ def asset_extras(result: Reconstruction) -> dict[str, Any]:
 
 
 def _ascii(text: str) -> str:
-    """A PLY header is lines of ASCII."""
+    """Returns the text with every character that a PLY header cannot hold replaced by a question mark."""
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)

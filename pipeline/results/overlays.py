@@ -41,8 +41,8 @@ def overlay(
     label: str = "",
     parts: Float32[np.ndarray, "h w 3"] | None = None,
 ) -> ImageRgb:
-    """Returns the image with the input contour (sky blue) and the fitted head's contour (vermilion), and tinted by the
-    probability of skin, hair and clothes where that is known: what is unknown keeps its colour."""
+    """Draws the input contour (sky blue) and the fitted head's contour (vermilion) on the image. With ``parts``, also
+    tints each pixel by its probabilities of skin, hair and clothes."""
     line = max(1.0, 1.5 * image.shape[1] / 1024)
     painted = image.copy() if parts is None else tinted(image, parts)
     contours = [_near(input_distance, line), _near(_smooth_distance(fitted_mask), line)]
@@ -56,15 +56,15 @@ def overlay(
 
 
 def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
-    """Returns each pixel moved towards the parts' colours by their probabilities."""
+    """Returns the image with each pixel moved towards the parts' colours, in proportion to their probabilities."""
     colours, out = np.array(list(PART_COLOURS.values()), np.float32), np.empty_like(image)
     tint(np.ascontiguousarray(image), parts, colours, np.float32(TINT), out)
     return out
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:
-    """Draws eq. (4) at a panel's size, over a pale image: sky blue where only the input is, vermilion only the
-    model."""
+    """Draws the difference of eq. (4) over a pale image of a panel's size: sky blue where only the input mask is,
+    vermilion where only the model is."""
     size = _fitted_size(image)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     observed, model = (
@@ -80,7 +80,7 @@ def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[n
 
 
 def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> ImageRgb:
-    """Returns lines of text in the top left corner, each in its colour on a darkened ground."""
+    """Returns the image with lines of text in its top left corner, each in its colour on darkened ground."""
     if not entries:
         return image
     scale = max(0.5, image.shape[1] / 1280)
@@ -98,7 +98,7 @@ def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]])
 def turntable(
     mesh_head: Mesh, colours: UInt8[np.ndarray, "v 3"], panel: tuple[int, int] = (280, 360)
 ) -> list[ImageRgb]:
-    """Returns the head from ``AZIMUTHS_DEG`` around its own y axis, as drawn panels (width, height); twice
+    """Draws the head from each of ``AZIMUTHS_DEG`` around its y axis, as panels of the given width and height, twice
     supersampled."""
     low, high = mesh_head.vertices.min(axis=0), mesh_head.vertices.max(axis=0)
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
@@ -117,7 +117,7 @@ def turntable(
 
 
 def contact_sheet(rows: Sequence[Sequence[tuple[str, Resized]]]) -> Resized:
-    """Returns rows of labelled pictures, each fitted into a panel of ``PANEL``."""
+    """Returns one picture of rows of labelled pictures, each fitted into a panel of ``PANEL``."""
     width = max(len(row) for row in rows)
     blank = np.full((PANEL[1], PANEL[0], 3), PAPER, np.uint8)
     drawn = [[legend(_panel(image), [(text, (255, 255, 255))] if text else []) for text, image in row] for row in rows]
@@ -134,14 +134,14 @@ def _panel(image: ImageRgb) -> Resized:
 
 
 def _fitted_size(image: ImageRgb) -> tuple[int, int]:
-    """Width and height of an image that fills a panel."""
+    """Returns the width and height (px) of an image scaled to fill a panel."""
     scale = min(PANEL[0] / image.shape[1], PANEL[1] / image.shape[0])
     return max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
 
 
 def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """The distance to a binary mask's contour without its stairs, which would make a thin line look broken; taken in
-    the mask's own frame and a margin, infinite outside."""
+    """Returns the distance (px) to a mask's contour, blurred so that a thin line along it has no steps; infinite
+    farther than a margin from the mask."""
     distance = np.full(mask.shape, np.inf, np.float32)
     window = box_around(mask, MARGIN_PX)
     if mask[window].size:
@@ -150,7 +150,8 @@ def _smooth_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"
 
 
 def _near(distance: Float32[np.ndarray, "h w"], line: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (flat) that a line and its dark rim may touch, and how far they are from its middle."""
+    """Returns the flat indices of pixels that a contour line and its dark rim may touch, and their distance (px) from
+    the line's middle."""
     flat = distance.ravel()
     index = np.flatnonzero((flat < line / 2 + 1) & (flat > -line / 2 - 1))
     return index, np.abs(flat[index])

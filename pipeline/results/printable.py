@@ -9,10 +9,10 @@ FAN_MM = 15.0  # a border that reaches so far to all sides is the neck's: it is 
 
 
 def printable(head: Mesh) -> Mesh:
-    """Returns the head (head frame, mm) with its openings closed, z up as printers have it, standing on z = 0.
+    """Returns the head (head frame, mm) as a closed mesh for printing: z up, standing on z = 0.
 
-    The neck is closed by a fan about the middle of its border, lids and lips, where a model leaves them open, by a
-    strip from corner to corner. Raises NotAManifold where a border touches itself.
+    The neck is closed by a fan about the middle of its border; open lids and lips are closed by a strip from corner to
+    corner. Raises NotAManifold if a border touches itself.
     """
     vertices, added = [head.vertices], [head.faces]
     count = len(head.vertices)

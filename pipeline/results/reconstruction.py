@@ -24,7 +24,8 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """Holds a textured head in the world frame with its evidence, by the stages that made it."""
+    """Holds everything that a reconstruction produced: the textured head in the world frame, the results of all stages,
+    and the evidence."""
 
     model_name: str
     model_sha256: str
@@ -45,5 +46,5 @@ class Reconstruction:
 
     @property
     def mesh_world(self) -> Mesh:
-        """Returns the head as delivered, full level, mm."""
+        """Returns the delivered head, full level, world frame, mm."""
         return self.refined.mesh_world

@@ -45,10 +45,8 @@ ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 
 
 
 def report_document(result: Reconstruction, template: TemplateHeader | None = None) -> Report:
-    """Returns the decoded report: JSON types only, every number finite (what is not known is null).
-
-    ``template``: the one in whose order the head was written, too.
-    """
+    """Returns the report as JSON types; every number is finite, and unknown ones are None. ``template``: the template
+    in whose vertex order the head was also written."""
     head, evidence, refined = result.head, result.evidence, result.refined
     return {
         "format": FORMAT,
@@ -172,7 +170,8 @@ def _template(template: TemplateHeader) -> TemplateReport:
 
 
 def similarity_document(transform: Similarity) -> SimilarityReport:
-    """Returns the paper's form ``x_world = s (R x_head + t)``: its translation is ours divided by the scale."""
+    """Returns the similarity in the paper's form ``x_world = s (R x_head + t)``; its translation is that of
+    ``transform`` divided by the scale."""
     translation = transform.translation / transform.scale
     return {
         "scale": transform.scale,
@@ -228,7 +227,7 @@ def _bust(bust: Bust) -> BustReport:
 
 
 def _finite(value: float | np.floating | None) -> float | None:
-    """Returns None for what is not finite, because JSON has no word for it."""
+    """Returns the value, or None if it is not finite, because JSON cannot express that."""
     return float(value) if value is not None and math.isfinite(value) else None
 
 
@@ -241,7 +240,7 @@ def _optional_numbers(values: Float[np.ndarray, " n"] | None) -> list[float] | N
 
 
 def _plain(value: Any) -> Any:
-    """Returns JSON types for a document of free form."""
+    """Returns a nested document converted to JSON types."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

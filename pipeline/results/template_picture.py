@@ -15,8 +15,9 @@ AZIMUTHS_DEG = (0.0, 55.0)
 
 
 def template_picture(template: Template, found: Registration, model: HeadModel) -> ImageRgb:
-    """Draws, from the front and the side: the mesh as it came, the model made like it, the mesh drawn onto that (blue:
-    follows the skin about it; green: moves as a whole), the mesh on the model's mean head, and that head."""
+    """Draws a template from the front and the side, in five panels: the mesh as it came; the model fitted to it; the
+    mesh registered to the model (blue: follows the skin; green: moves as a whole); the mesh on the model's mean head;
+    and that mean head."""
     faces, triangles = model.levels["full"].faces, template.mesh.triangles()
     mean = model.vertices(np.zeros(0))
     kinds = np.tile(np.array(DEEP), (len(found.surface_binding.rest), 1))

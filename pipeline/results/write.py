@@ -39,8 +39,8 @@ THREADS = 4  # cv2, NumPy and the rasteriser release the interpreter lock, and e
 
 
 def write_result(folder: Path, result: Reconstruction, capture: Capture, template: Template | None = None) -> None:
-    """Writes every file of the result of ``capture``, as it was read, and in the order of ``template``; each under a
-    temporary name first. Raises OSError where the disk is full."""
+    """Writes every file of a result, each under a temporary name first. ``capture`` is the one that was reconstructed,
+    as read; with ``template`` the head is also written in its vertex order. Raises OSError if the disk is full."""
     capture = reassign_images(capture, pictures=result.views.assignment)
     head, blendshape_rig = head_mesh(result), result.evidence.blendshape_rig
     with task_pool(THREADS) as pool:
@@ -82,8 +82,8 @@ def _write_meshes(folder: Path, result: Reconstruction, head: Mesh) -> None:
 
 
 def head_mesh(result: Reconstruction) -> Mesh:
-    """Returns the result mesh in the head frame, at its true size: the pose is undone, the scale is not, so that the
-    GLB's metres are metres."""
+    """Returns the result's mesh in the head frame, in true millimetres: rotation and translation of the pose are
+    undone, the scale is kept."""
     head_from_world = _head_from_world(result.head.fit.world_from_head)
     mesh = result.mesh_world
     return Mesh(head_from_world.apply(mesh.vertices), mesh.faces, result.texturing.vertices.colours)
@@ -112,7 +112,7 @@ def _write_overviews(folder: Path, result: Reconstruction, capture: Capture, hea
 
 
 def _sheet(result: Reconstruction, capture: Capture, shown: list[str], panels: list[np.ndarray]) -> np.ndarray:
-    """A row a camera: the front one first, then others spread over the rig's order."""
+    """Draws the contact sheet, one row for each camera: the front camera first, then others spread over the rig."""
     front = [name for name in shown if name == result.alignment.front]
     others = [name for name in shown if name != result.alignment.front]
     spread = np.linspace(0, len(others) - 1, min(SHEET_ROWS - len(front), len(others))).round().astype(int)

@@ -14,7 +14,8 @@ from rig.mesh import Mesh
 
 
 def write_expression(folder: Path, result: Reconstruction, blendshape_rig: BlendshapeRig) -> None:
-    """Writes the files that the settings ask for; colours are the photographed head's, vertex by vertex."""
+    """Writes ``neutral.glb`` and ``posed.glb`` if the settings ask for them. Their colours are those of the
+    photographed head's vertices."""
     place, outputs = result.head.fit.world_from_head, result.settings.outputs
     head_from_world = RigidTransform(place.rotation, place.translation).inverse()
     neutral = Mesh(

@@ -25,7 +25,7 @@ SKIN_SHARE = 0.1  # of a material's polygons on the skin, beyond which it shows 
 
 
 def write_template(folder: Path, result: Reconstruction, template: Template) -> None:
-    """Writes the files. Raises OSError."""
+    """Writes the head in the template's vertex order, with its textures and materials. Raises OSError."""
     head, surface_binding, name = result.mesh_world, template.surface_binding, f"head-{template.name}"
     vertices = surface_binding.on(head.vertices, head.faces)
     textures = (
@@ -59,7 +59,7 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
 
 
 def _tile_suffix(tile: Tile) -> str:
-    """UDIM's number, of all tiles but the first."""
+    """Returns the UDIM number of a tile as a suffix of file names; empty for the first tile."""
     return "" if tile == (0, 0) else f"-{1001 + tile[0] + 10 * tile[1]}"
 
 
@@ -72,8 +72,8 @@ def _colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t
 
 
 def _materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh, bytes]:
-    """The mesh with a material wherever its file had one, or one in all where it had none; and the library: materials
-    of the skin show the image of the tile in which they lie."""
+    """Returns the mesh with a material for each part that has one in its file, or else one for all of it, and the
+    material library. Materials of the skin show the image of the tile that most of their skin lies in."""
     mesh = template.mesh
     tiles, skin = corner_tiles(mesh), skin_polygons(mesh, template.surface_binding)
     used = [(before, line.partition(" ")[2]) for before, line in mesh.statements if line.startswith("usemtl ")]

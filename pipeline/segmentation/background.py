@@ -24,7 +24,8 @@ STEPS = 4  # of reweighting; the field moves by less than 0.1 grey level after t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Holds the plate as it would look now, its noise against the image, and how sure that is."""
+    """Holds the clean plates and what they need to look like the background of the image: a gain field, the noise, and
+    which pixels show the background."""
 
     plates: UInt8[np.ndarray, "p h w 3"]
     field: Float32[np.ndarray, "hc wc 3"]  # what their mean is multiplied by
@@ -35,8 +36,8 @@ class Background:
 
 
 def coarse_size(shape: tuple[int, ...], width: int) -> tuple[int, int]:
-    """Returns the width and height of the coarse level: the integer reduction that comes nearest to ``width``
-    columns."""
+    """Returns the width and height (px) of the coarse level: the image's, divided by the whole number that brings the
+    width nearest to ``width``."""
     factor = max(1, round(shape[1] / width))
     return max(1, shape[1] // factor), max(1, shape[0] // factor)
 
@@ -47,7 +48,8 @@ def estimate_background(
     plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...],
     settings: SegmentationSettings,
 ) -> Background:
-    """Fits the plates to an image in which the subject stands."""
+    """Estimates the background of an image with the subject in it, by fitting a smooth gain field to the clean
+    plates."""
     size = (image_coarse.shape[1], image_coarse.shape[0])
     small = np.stack([cv2.resize(plate, size, interpolation=cv2.INTER_AREA) for plate in plates]).astype(np.float32)
     plate_coarse = small.mean(axis=0)
@@ -72,7 +74,7 @@ def estimate_background(
 
 
 def _mode_of_ratio(image: Float32[np.ndarray, "h w"], plate: Float32[np.ndarray, "h w"]) -> float:
-    """The most frequent ratio of image to plate, between a third and three."""
+    """Returns the most frequent ratio of image to plate, between a third and three; 1 if too few pixels are usable."""
     usable = (plate > 8) & (image > 4) & (plate < 250) & (image < 250)  # neither black nor clipped
     if usable.sum() < 100:
         return 1.0
@@ -85,7 +87,7 @@ def _mode_of_ratio(image: Float32[np.ndarray, "h w"], plate: Float32[np.ndarray,
 
 
 def _tukey(square: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Tukey's biweight of the worst channel."""
+    """Returns Tukey's biweight of each pixel, for the channel with the largest squared residual."""
     worst = np.maximum(np.maximum(square[:, :, 0], square[:, :, 1]), square[:, :, 2]) / TUKEY**2
     return np.where(worst < 1, (1 - worst) ** 2, 0).astype(np.float32)
 
@@ -96,8 +98,8 @@ def _gain_field(
     weight: Float32[np.ndarray, "h w"],
     sigma: float,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Local least squares ``image = gain * plate`` in a Gaussian window, drawn to the whole image's gain where there
-    is no background nearby."""
+    """Estimates the gain of the image over the plate at each pixel, by least squares in a Gaussian window. With no
+    background nearby it tends to the gain of the whole image."""
     weighted = plate * cv2.merge([weight] * 3)
     size = (max(8, image.shape[1] // 4), max(8, image.shape[0] // 4))  # a smooth field needs no more
     num = cv2.resize(weighted * image, size, interpolation=cv2.INTER_AREA)
@@ -111,7 +113,8 @@ def _gain_field(
 
 
 def _image_noise(image: UInt8[np.ndarray, "h w 3"], plates: UInt8[np.ndarray, "p h w 3"]) -> Float32[np.ndarray, " 3"]:
-    """Standard deviation of image minus plate from differences of neighbours, which no light drift can reach."""
+    """Estimates the standard deviation (levels) of image minus plate from differences of neighbouring pixels, which
+    slow changes of light do not affect."""
     pairs = [image[::8, x::4].astype(np.float32) - plates[:, ::8, x::4].mean(axis=0) for x in (0, 1)]
     columns = min(pair.shape[1] for pair in pairs)
     steps = pairs[1][:, :columns] - pairs[0][:, :columns]
@@ -125,7 +128,8 @@ def _noise_by_level(
     plate_coarse: Float32[np.ndarray, "hc wc 3"],
     inliers: Bool[np.ndarray, "hc wc"],
 ) -> Float32[np.ndarray, "hc wc 3"]:
-    """The noise (levels) of every coarse pixel, from a curve over brightness that the background pixels draw."""
+    """Estimates the noise (levels) of every coarse pixel from its brightness, by a curve measured on the background
+    pixels."""
     rows, columns = np.arange(3, image.shape[0], 6), np.arange(3, image.shape[1], 6)  # 20,000 samples are enough
     at = np.ix_(rows * inliers.shape[0] // image.shape[0], columns * inliers.shape[1] // image.shape[1])
     kept = inliers[at]
@@ -148,7 +152,8 @@ def _noise_by_level(
 def _with_temporal_noise(
     noise: Float32[np.ndarray, "hc wc 3"], plates: Float32[np.ndarray, "p hc wc 3"]
 ) -> Float32[np.ndarray, "hc wc 3"]:
-    """Adds what several plates show beyond the curve: a flickering lamp, a curtain that moves."""
+    """Adds to the noise the variation between the plates, if there are three or more: a flickering lamp, a moving
+    curtain."""
     if len(plates) < 3:
         return noise
     small = plates / np.maximum(plates.mean(axis=(1, 2), keepdims=True), 1.0)  # changes of exposure are not noise

@@ -20,8 +20,8 @@ from rig.rig import Rig
 def count_rejecting_cameras(
     doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
 ) -> Int8[np.ndarray, "h w"]:
-    """Tells how many of the other cameras deny the subject at each doubtful pixel of camera ``name`` (at most
-    ``MAX_DISSENT``); -1 where nobody was asked or too few can see.
+    """Counts, for each doubtful pixel of camera ``name``, how many other cameras see no subject anywhere on its ray (at
+    most ``MAX_DISSENT``); -1 for pixels without doubt or with too few witnesses.
 
     Masks may be smaller than the images; all are evenly reduced.
     """
@@ -43,7 +43,8 @@ def count_rejecting_cameras(
 
 
 def _stacked(masks: list[np.ndarray], widths: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (mask pixels) outside each mask, negative beyond the images; and image pixels a mask pixel."""
+    """Returns the distance of each pixel outside its mask (mask pixels, negative beyond the image), and how many image
+    pixels wide a mask pixel is."""
     height, width = max(mask.shape[0] for mask in masks), max(mask.shape[1] for mask in masks)
     out = np.full((len(masks), height, width), -1.0, np.float32)
     for k, mask in enumerate(masks):

@@ -46,7 +46,8 @@ UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must le
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """Holds what one image says by itself. All arrays are at the coarse level; without a subject the mask is empty."""
+    """Holds the decision on one image by itself: what is subject and what is plate. All arrays are at the coarse level;
+    without a subject the mask is empty."""
 
     coarse: Float32[np.ndarray, "h w 3"]  # the image
     background: Background
@@ -62,14 +63,14 @@ class Decision:
 
     @property
     def reduction(self) -> float:
-        """Returns pixels of the image along a side of a coarse one."""
+        """Returns how many image pixels a coarse pixel is wide."""
         return self.background.plates.shape[2] / self.mask.shape[1]
 
 
 def decide(
     image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...], settings: SegmentationSettings
 ) -> Decision:
-    """Judges one image against its clean plates."""
+    """Decides which pixels of one image show the subject, by comparing it with its clean plates at a coarse level."""
     size = coarse_size(image.shape, settings.coarse_columns)
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     background = estimate_background(image, coarse, empty_plates(plates), settings)
@@ -99,14 +100,15 @@ def decide(
 
 
 def doubtful(decision: Decision) -> Bool[np.ndarray, "h w"]:
-    """Returns where another camera's word could make a pixel the subject's."""
+    """Tells which pixels outside the mask might still be the subject: those near it where the subject and the plate
+    look alike. Other cameras are asked about them."""
     near = dilated(decision.mask, REACH) & ~decision.mask
     return near & ~decision.clear & (decision.own_odds > -ALLOWED)
 
 
 def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: SegmentationSettings) -> Decision:
-    """Returns the decision after other cameras spoke: ``dissent`` is how many of them deny that a doubtful pixel shows
-    the subject, negative where they were not asked."""
+    """Returns the decision revised by the other cameras. ``dissent`` counts, for each doubtful pixel, the cameras that
+    rule the subject out there; it is negative where they were not asked."""
     prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
     revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MAX_ODDS, MAX_ODDS)
     odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
@@ -125,8 +127,8 @@ def _own_odds(
     variance: Float32[np.ndarray, "h w 3"],
     settings: SegmentationSettings,
 ) -> Float32[np.ndarray, "h w"]:
-    """Log odds of the subject's own colours against the plate: of that nearby, in the shade that suits the pixel best,
-    or of all that it shows."""
+    """Returns the log odds that a pixel has a colour of the subject rather than the plate: the subject's colour nearby,
+    in the best shade, or any colour found in the mask."""
     nearby = 0.5 * (chi2 - colours_apart(paint, image, variance) ** 2) - PAINT_ODDS
     bins = (image / (256 / PALETTE)).astype(np.int32).clip(0, PALETTE - 1)
     counts = np.zeros((PALETTE,) * 3, np.float32)
@@ -142,9 +144,8 @@ def _own_odds(
 def find_mixtures(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], background: Background
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Returns the squared difference to the plate (mean of the channels), and how far a coarse pixel is a mixture of
-    subject and plate: where strands cross the plate, pixels differ within it by as much as their mean differs from the
-    plate."""
+    """Returns the squared difference of each coarse pixel to the plate (mean of the channels), and a measure of how far
+    the pixel mixes subject and plate, as at strands of hair: the variance within it relative to that difference."""
     half = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(
         np.float32
     )
@@ -158,7 +159,8 @@ def find_mixtures(
 def _against_plate(
     image: Float32[np.ndarray, "h w 3"], background: Background, reduction: float, settings: SegmentationSettings
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w 3"]]:
-    """Chi-squared of a coarse image against the plate, and the variance of the difference."""
+    """Returns the chi-squared of a coarse image against the plate, and the variance (levels squared) of their
+    difference."""
     difference = image - background.coarse
     measured = 1.4826 * np.median(np.abs(difference[background.inliers]), axis=0) if background.inliers.any() else 0.0
     noise = np.maximum(background.noise / reduction, measured)  # JPEG and demosaicing leave noise that does not average
@@ -170,7 +172,8 @@ def _against_plate(
 def colours_apart(
     colour: Float32[np.ndarray, "h w 3"], other: Float32[np.ndarray, "h w 3"], variance: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Tells how far (standard deviations) a colour is from another, in the shade that brings it nearest."""
+    """Returns the distance (standard deviations) between two colours, after ``colour`` is darkened or lightened to come
+    nearest to ``other``."""
     sigma = np.sqrt(variance)
     f, b = colour / sigma, other / sigma
     shade = np.clip(((f * b) @ CHANNEL_SUM) / np.maximum((f * f) @ CHANNEL_SUM, 1e-6), *SHADES)
@@ -184,9 +187,9 @@ def _other_colour(
     variance: Float32[np.ndarray, "h w 3"],
     settings: SegmentationSettings,
 ) -> tuple[Bool[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Where neither the plate in any shade nor a mixture of it and the subject's colour nearby (``paint``, in a few
-    shades: strands are not all alike) explains a faint difference, so that the subject has another colour there; and
-    the chi-squared that they leave, of nine pixels' mean."""
+    """Finds faint differences to the plate that neither a shadow nor a mixture with the subject's colour nearby
+    (``paint``) explains, so that the subject has another colour there. Also returns the chi-squared left unexplained,
+    over the mean of nine pixels."""
     weight = 3 / variance  # of a mean over nine pixels, whose errors are not all their own
     faint = ((difference**2 * weight) @ CHANNEL_SUM < MAX_FAINT_CHI2).astype(np.float32)
     mean = cv2.blur(difference * faint[:, :, None], (3, 3)) / np.maximum(cv2.blur(faint, (3, 3)), 0.1)[:, :, None]
@@ -201,8 +204,8 @@ def _other_colour(
 
 
 def _closed(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Gaps of up to four coarse pixels closed. Where a gap is one, between locks of hair, alpha finds it again; where
-    the subject has the backdrop's colour it cannot, and the mask stays whole."""
+    """Returns the mask with gaps of up to four coarse pixels closed. The matting opens real gaps, as between locks of
+    hair, again; where the subject has the backdrop's colour it cannot, and the mask stays whole."""
     padded = np.pad(mask, CLOSING, mode="edge")
     return eroded(dilated(padded, CLOSING), CLOSING)[CLOSING:-CLOSING, CLOSING:-CLOSING]
 
@@ -212,7 +215,8 @@ def whole_subject(
     plain: Bool[np.ndarray, "h w"],
     settings: SegmentationSettings,
 ) -> tuple[Bool[np.ndarray, "h w"], tuple[float, ...]]:
-    """Returns the largest component with its small gaps and holes filled, and the areas of the others by its own."""
+    """Returns the largest component of the mask with its small gaps and holes filled, and the areas of the other
+    components as shares of its area."""
     mask = mask | (_closed(mask) & ~plain)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
     if count < 2:

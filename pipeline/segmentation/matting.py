@@ -46,8 +46,8 @@ MARGIN_PX = 12  # around the band: beyond every window here and in what follows
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matte:
-    """Holds the alpha (about 0 to 1, smoothed) in the box that holds the subject, and how far it stands out along its
-    contour."""
+    """Holds the subject's alpha (about 0 to 1, smoothed) within a box of the image, and the contrast to the background
+    along its contour."""
 
     alpha: Float32[np.ndarray, "hb wb"]
     box: tuple[slice, slice]  # rows and columns of the image; a margin without subject but at the image's own border
@@ -55,10 +55,11 @@ class Matte:
 
 
 def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings: SegmentationSettings) -> Matte:
-    """Returns the alpha of the subject that was decided upon.
+    """Computes the subject's alpha from a coarse decision.
 
-    Where its colour is nothing like the plate, pixels are asked in a band that is wide enough for hair, which is sparse
-    far inside its outline. Elsewhere the decision, which has seen more pixels, is believed but for its border.
+    Where the subject's colour differs clearly from the plate, alpha is solved in a band wide enough for hair, which is
+    sparse far inside its outline. Elsewhere alpha follows the decision, which averages more pixels, and is solved at
+    its border only.
     """
     background, mask, clear = decision.background, decision.mask, decision.clear
     probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))
@@ -85,7 +86,7 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
 
 
 def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int, ...]) -> tuple[slice, slice]:
-    """The image's part that a part of the coarse level covers."""
+    """Returns the rows and columns of the image that a range of coarse rows and columns covers."""
     rows, columns = (
         slice(round(part.start * many / few), round(part.stop * many / few))
         for part, few, many in zip(cells, coarse, fine, strict=False)
@@ -96,7 +97,7 @@ def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int
 def _smooth(
     alpha: Float32[np.ndarray, "h w"], trust: Float32[np.ndarray, "h w"], sigma: float
 ) -> Float32[np.ndarray, "h w"]:
-    """Alpha averaged by ``trust`` (1 / variance), in a window that is wider where it is low."""
+    """Returns alpha averaged with weights ``trust`` (1 / variance), in a window that is wider where trust is low."""
     near = cv2.GaussianBlur(alpha, (0, 0), sigma)
     if not (trust < MAX_ALPHA_INFORMATION).any():
         return near
@@ -109,7 +110,7 @@ def _smooth(
 def _light_outside(
     image: Float32[np.ndarray, "h w 3"], background: Background, mask: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w 3"]:
-    """What the background just outside shines like, by what was expected of it."""
+    """Returns the ratio of the image to the expected background just outside the subject, spread over all pixels."""
     clear = ~dilated(mask, 2)
     if not clear.any():
         return np.ones_like(image)
@@ -120,7 +121,7 @@ def _light_outside(
 def _subject_inside(
     image: UInt8[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"], coarse: Float32[np.ndarray, "hc wc 3"]
 ) -> Float32[np.ndarray, "h2 w2 3"]:
-    """The subject's colour near its contour, at half resolution."""
+    """Returns the subject's colour near its contour, at half resolution, spread from solid pixels inside."""
     half = (image.shape[1] // 2, image.shape[0] // 2)
     inner = eroded(alpha > 0.5, INSIDE_PX) & (alpha > SOLID)
     sure = cv2.resize(255 * inner.view(np.uint8), half, interpolation=cv2.INTER_AREA) == 255

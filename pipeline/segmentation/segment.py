@@ -47,8 +47,8 @@ MIN_GAIN, MAX_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; be
 
 
 def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress) -> dict[str, Silhouette]:
-    """Returns the silhouette of every camera of the rig; without any plate or mask the subject is found from the
-    photographs. Raises InputError where only some cameras have neither."""
+    """Returns the silhouette of every camera of the rig. A capture without any plate or mask is segmented from the
+    photographs alone. Raises InputError if only some cameras have neither."""
     if not capture.backgrounds and not capture.masks:
         return _without_plates(capture, rig, settings, report)
     blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
@@ -88,7 +88,8 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
 def _without_plates(
     capture: Capture, rig: Rig, settings: SegmentationSettings, report: Progress
 ) -> dict[str, Silhouette]:
-    """Finds the subject as views tell it by each other; where few do, as its face does."""
+    """Finds the silhouettes without plates or masks. With few views the search starts at the face; with more, only if
+    too few silhouettes are usable otherwise."""
     few = len(rig) < SEEDED_VIEWS
     found = _searched(capture, rig, settings, find_head_seed(capture.images, rig) if few else None, report)
     if not few and _usable_count(found) < ENOUGH_USABLE * len(rig):
@@ -106,7 +107,7 @@ def _usable_count(silhouettes: Mapping[str, Silhouette]) -> int:
 def _searched(
     capture: Capture, rig: Rig, settings: SegmentationSettings, head: HeadSeed | None, report: Progress
 ) -> dict[str, Silhouette]:
-    """The silhouettes of a search that begins at ``head``, or where all cameras look."""
+    """Returns the silhouettes of a search that starts at ``head`` or, if None, where all cameras look."""
     from pipeline.segmentation.without_plates.decide import decide_without_plates  # packages that few captures need
 
     found = decide_without_plates(
@@ -120,7 +121,8 @@ def _searched(
 
 
 def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouette:
-    """What is said of a weak outline where there was no plate: another remedy than a change of the backdrop."""
+    """Returns the silhouette with its warning of a weak outline reworded for captures without plates, where a change of
+    the backdrop is no remedy."""
     quality, weak = silhouette.quality, float(np.asarray(silhouette.quality.figures.get("weak_share", 1.0)))
     if weak <= settings.weak_share_warned:
         return silhouette
@@ -132,13 +134,14 @@ def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouet
 
 
 def _speaks_of(message: Message, code: str) -> bool:
-    """Whether a message has a code, or says why a view is left out by one that has."""
+    """Tells whether a message has the given code, or has a remark with that code."""
     remark = message.parameters.get("remark")
     return message.code == code or (isinstance(remark, Message) and remark.code == code)
 
 
 def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
-    """The silhouette of a view that was cut along its edges; where windows disagreed its outline is weak."""
+    """Returns the silhouette of a view that was cut along its edges; its outline is weak where the windows of the cut
+    disagree."""
     alpha, holes = _without_specks(share, np.zeros_like(share))
     mask = alpha > 0.5
     undecided = dilated(np.abs(share - 0.5) < UNDECIDED, 1)
@@ -152,7 +155,8 @@ def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -
 def _operators(
     mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | None, settings: SegmentationSettings
 ) -> Silhouette:
-    """The silhouette of a ready mask; where its edges are soft the outline is where the subject's share is half."""
+    """Returns the silhouette of a ready mask. If the mask has soft edges (``share``), its outline is where the share is
+    one half."""
     if share is None:
         return replace(silhouette_from_mask(mask), quality=_mask_quality(mask, settings))
     smooth = cv2.GaussianBlur(share * np.float32(1 / 255), (0, 0), settings.alpha_blur_px)
@@ -160,12 +164,12 @@ def _operators(
 
 
 def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Silhouette:
-    """Returns the silhouette of one image against its clean plates, without the other cameras' help."""
+    """Returns the silhouette of one image from its clean plates alone, without other cameras."""
     return _refined(image, decide(image, plates, settings), settings)
 
 
 def _refined(image: ImageRgb, decision: Decision, settings: SegmentationSettings) -> Silhouette:
-    """From a coarse decision to a sub-pixel silhouette."""
+    """Returns the sub-pixel silhouette of a coarse decision, or an unusable one if the mask is too small."""
     if decision.mask.mean() < settings.least_area:
         return _nothing(image.shape[:2], decision.background)
     matte = solve_matte(image, decision, settings)
@@ -195,10 +199,11 @@ def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings
 def _without_specks(
     alpha: Float32[np.ndarray, "h w"], coarse: Float32[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, "h w"], int]:
-    """Alpha of the subject's own component without holes of noise, and how many holes are left.
+    """Returns the alpha of the subject's own component with holes of noise filled, and the number of holes left.
 
-    Noise is what is small, and what the ``coarse`` probability, whose pixels average the sensor's noise away, calls
-    subject all over: shaded skin before a backdrop of its colour. A gap in hair of that size is seen there, too.
+    A hole is noise if it is small, or if the ``coarse`` probability, in which the sensor's noise averages out, is high
+    all over it: shaded skin before a backdrop of its colour. A real gap in hair of that size is seen at the coarse
+    level too.
     """
     mask = alpha > 0.5
     labels, areas = _labelled(mask, 4)
@@ -217,7 +222,7 @@ def _without_specks(
 
 
 def _labelled(mask: Bool[np.ndarray, "h w"], connectivity: int) -> tuple[np.ndarray, np.ndarray]:
-    """Labels of the components, 0 where the mask is False, and their areas."""
+    """Returns the label of each pixel's component, 0 where the mask is False, and the area of each component."""
     _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
         mask.view(np.uint8), connectivity, cv2.CV_16U, cv2.CCL_SPAGHETTI
     )
@@ -225,7 +230,7 @@ def _labelled(mask: Bool[np.ndarray, "h w"], connectivity: int) -> tuple[np.ndar
 
 
 def _mask_quality(mask: Bool[np.ndarray, "h w"], settings: SegmentationSettings) -> ViewQuality:
-    """The quality of an operator's mask."""
+    """Returns the quality of a mask that the operator supplied."""
     components = len(_labelled(mask, 8)[1]) - 1
     holes = len(_labelled(np.pad(~mask, 1, constant_values=True), 4)[1]) - 2
     return _quality(mask, (components, holes), float("inf"), 0.0, {}, settings)
@@ -239,7 +244,7 @@ def _quality(
     figures: dict,
     settings: SegmentationSettings,
 ) -> ViewQuality:
-    """What can be said of a mask by itself."""
+    """Judges a mask by itself: what cuts it off, its contrast and area, and the warnings that follow."""
     borders = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
     cut_off = tuple(name for name, line in borders.items() if line.sum() > 2)
     warnings, fatal = [], []
@@ -266,8 +271,8 @@ def _quality(
 
 
 def _crown_side(mask: Bool[np.ndarray, "h w"]) -> str:
-    """The border beyond which the crown would be: opposite to the one through which the body leaves the picture, for
-    cameras may hang on their side or upside down. A body fills as much of a border as it is wide; a cut crown less."""
+    """Returns the border beyond which the crown would lie: opposite the border through which the body leaves the
+    picture, since cameras may be turned. A body fills at a border nearly its full width; a cut crown fills less."""
     across, down = mask.sum(axis=0), mask.sum(axis=1)
     widest = {"top": down.max(), "bottom": down.max(), "left": across.max(), "right": across.max()}
     touched = {"top": mask[0].sum(), "bottom": mask[-1].sum(), "left": mask[:, 0].sum(), "right": mask[:, -1].sum()}

@@ -21,8 +21,8 @@ def find_shadows(
     odds: Float32[np.ndarray, "h w"],
     settings: SegmentationSettings,
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Returns chi-squared against the plate in the shade that suits a pixel best, and where that explains one that
-    differs, and does so softly."""
+    """Returns the chi-squared of each pixel against the plate in its best shade, and which pixels are soft shadows:
+    they differ from the plate, a darker shade explains them, and they begin gradually."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
     depth = 1 - np.clip(ratio, settings.darkest_shadow, 1.0)
     shaded = (1 - depth)[:, :, None] * plate
@@ -35,9 +35,11 @@ def find_shadows(
 def _soft_shadows(
     candidate: Bool[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"], strength: Float32[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Candidates that begin softly: the plain background beside them is already darker. A coat begins at once, also
-    within a shadow, and is cut from it there.
-    ``strength`` is the difference to the plate, 1 where it is first noticed."""
+    """Returns the candidates that begin softly, with plain background beside them that is already darker. A coat begins
+    abruptly, also within a shadow, and is not included.
+
+    ``strength`` is the difference to the plate, 1 where it is first noticed.
+    """
     across, down = (cv2.Sobel(depth, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0))
     candidate = candidate & (across**2 + down**2 < STEEP**2)
     noticed = (strength > 1).view(np.uint8)
@@ -61,6 +63,6 @@ def _soft_shadows(
 def _means(
     values: Float32[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], labels: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the values of each component, and how many pixels it is over."""
+    """Returns the mean value of each component, over the pixels ``where``, and how many pixels that is."""
     sizes = np.bincount(labels[where], minlength=count)
     return np.bincount(labels[where], values[where], count) / np.maximum(sizes, 1), sizes

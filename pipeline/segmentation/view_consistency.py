@@ -37,7 +37,8 @@ MAX_CONTRADICTED = 0.5  # ... which contradicts less than this share of what the
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Votes:
-    """Holds what each camera says of each voxel."""
+    """Holds, for each camera and voxel, whether the camera sees the voxel and whether its silhouette leaves the voxel
+    empty."""
 
     pixels: Float[np.ndarray, "k n 2"]
     radius_px: Float[np.ndarray, " k"]  # of a voxel in each camera
@@ -47,13 +48,14 @@ class Votes:
 
 
 def voxel_grid(centre: Float[np.ndarray, " 3"], edge: float, count: int) -> Float[np.ndarray, "n 3"]:
-    """Centres of ``count`` voxels a side, world frame."""
+    """Returns the centres (world frame, mm) of a cube's voxels, ``count`` along each side."""
     line = (np.arange(count) + 0.5) / count - 0.5
     return centre + edge * np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRID) -> Votes:
-    """Returns every camera's vote on every voxel of a coarse grid around the subject."""
+    """Projects the voxels of a coarse grid around the subject into every camera. Returns which voxels each silhouette
+    contains or excludes."""
     centre, edge = hull_extent(silhouettes, rig)
     voxels = voxel_grid(centre, edge, count)
 
@@ -78,7 +80,8 @@ def judge_agreement(
     *,
     ready: Collection[str] = (),
 ) -> dict[str, Silhouette]:
-    """Returns the same silhouettes with what the other cameras say of each in its quality.
+    """Compares each silhouette with those of the other cameras. Returns the same silhouettes with what disagrees added
+    to their quality.
 
     Args:
         silhouettes: by camera; those that are not usable have no say.
@@ -110,7 +113,8 @@ def judge_agreement(
 
 
 def _shares(votes: Votes, k: int, mask: Bool[np.ndarray, "h w"]) -> tuple[float, float]:
-    """Strange and missing area of camera k, by the area of its mask."""
+    """Returns two areas of camera k as shares of its mask: the part that other cameras exclude (strange), and what they
+    all contain but the mask lacks (missing)."""
     small = _reduced(mask)
     size, area = small.shape[::-1], max(float(small.sum()), 1.0)
     others = np.delete(np.arange(len(votes.seen)), k)
@@ -126,7 +130,8 @@ def _shares(votes: Votes, k: int, mask: Bool[np.ndarray, "h w"]) -> tuple[float,
 
 
 def _contradicted(votes: Votes, k: int, masks: Sequence[Bool[np.ndarray, "_ _"]]) -> float:
-    """Mean over the other cameras of the share of their mask behind which camera k alone leaves nothing."""
+    """Returns, as a mean over the other cameras, the share of their mask that camera k alone leaves without any
+    voxel."""
     shares = []
     for j in range(len(votes.seen)):
         others = np.delete(np.arange(len(votes.seen)), [j, k])
@@ -143,7 +148,7 @@ def _contradicted(votes: Votes, k: int, masks: Sequence[Bool[np.ndarray, "_ _"]]
 
 
 def _allowed(others: int) -> int:
-    """How many cameras may call a voxel empty that is there: one may err, where enough are left."""
+    """Returns how many of the other cameras may wrongly exclude a voxel: one if there are five or more, else none."""
     return 1 if others >= 5 else 0
 
 
@@ -155,7 +160,7 @@ def _reduced(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "r c"]:
 def _splat(
     votes: Votes, k: int, chosen: Bool[np.ndarray, " n"], size: tuple[int, int], *, grow: bool = True
 ) -> Bool[np.ndarray, "h w"]:
-    """The reduced image's pixels that a chosen voxel covers."""
+    """Returns the pixels of camera k's reduced image that the chosen voxels cover."""
     drawn = np.zeros((size[1], size[0]), np.uint8)
     at = (votes.pixels[k][chosen] / REDUCTION).astype(int)
     drawn[np.clip(at[:, 1], 0, size[1] - 1), np.clip(at[:, 0], 0, size[0] - 1)] = 1

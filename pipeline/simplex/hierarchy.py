@@ -29,7 +29,7 @@ LIMIT = 3500  # evaluations a level: 60 modes have converged or will not
 
 @dataclass(frozen=True, slots=True)
 class HierarchyLevel:
-    """Holds which decimation of the mesh, and how large the images."""
+    """Holds which decimation of the mesh a level uses, and the scale of its images."""
 
     mesh: str
     image_scale: float
@@ -51,10 +51,11 @@ def fit_simplex(
     speaking: Literal["face", "all"] = "face",
     weighted: bool = True,
 ) -> Fit:
-    """Returns coefficients that minimise eq. (2) from the mean head. ``report("fit", fraction)`` may raise Cancelled.
+    """Finds the coefficients that minimise eq. (2), starting from the mean head. ``report("fit", fraction)`` may raise
+    Cancelled.
 
-    ``speaking`` and ``weighted`` are the objective's: which pixels count, and whether by eq. (5) or eq. (4).
-    ``rig`` and ``silhouettes`` may differ: cameras without a silhouette stay out.
+    ``speaking`` and ``weighted`` are the objective's: which pixels count, and whether by eq. (5) or eq. (4). ``rig``
+    and ``silhouettes`` may differ: cameras without a silhouette stay out.
     """
     rig = rig.subset(name for name in silhouettes if silhouettes[name].quality.usable)
     coefficients = np.zeros(min(settings.modes, len(model.modes)))

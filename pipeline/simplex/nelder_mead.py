@@ -20,7 +20,7 @@ SPREAD_TINY = 1e-30  # keeps the relative spread defined at a minimum of exactly
 
 @dataclass(frozen=True, slots=True)
 class Stats:
-    """Holds what it took: calls of the function, the least value found, the relative spread of the values at the
+    """Holds how many times the function was called, the least value found, and the relative spread of the values at the
     end."""
 
     evaluations: int
@@ -30,7 +30,7 @@ class Stats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Holds what the search found; ``value`` is the best point; ``result`` says why the search ended there."""
+    """Holds the best point found (``value``), why the search ended (``result``), and its statistics."""
 
     value: Float[np.ndarray, " n"]
     result: Literal["converged", "evaluation limit"]
@@ -46,7 +46,7 @@ def minimise(
     limit: int = 3500,
     watch: Watcher = lambda evaluations, cost: None,
 ) -> Solution:
-    """Returns a local minimum of ``function`` by the downhill simplex.
+    """Searches for a local minimum of ``function`` by the downhill simplex.
 
     The initial simplex is ``p_0 = start`` and ``p_i = p_0 + steps[i] e_i`` (section 4.4). It ends when the relative
     spread falls below ``tolerance``, or after the first move that reaches ``limit`` evaluations (a shrink may overrun
@@ -69,7 +69,8 @@ def minimise(
 
 
 def _move(function: Function, points: Float[np.ndarray, "n1 n"], values: Float[np.ndarray, " n1"]) -> int:
-    """Replaces the worst point (or shrinks all), in place; returns the number of evaluations. Points come sorted."""
+    """Replaces the worst point of the sorted simplex, or shrinks the simplex, in place. Returns the number of
+    evaluations."""
     centre = points[:-1].mean(axis=0)
 
     def try_at(factor: float) -> tuple[Float[np.ndarray, " n"], float]:

@@ -34,7 +34,7 @@ OUTLINE_PX = 2.0  # a vertex this near to the model's outline names the region o
 
 
 class SilhouetteObjective:
-    """Holds eq. (2) at one level of the hierarchy; owns the renderer's buffers for it. Close it, or use ``with``."""
+    """Computes eq. (2) at one level of the hierarchy, with the renderer's buffers for it. Close it, or use ``with``."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class SilhouetteObjective:
         self._drawn.close()
 
     def __call__(self, coefficients: Float[np.ndarray, " m"]) -> float:
-        """E of eq. (2) at ``coefficients`` (standard deviations), in units of pixels on the contour."""
+        """Returns E of eq. (2) at ``coefficients`` (standard deviations), in units of pixels on the contour."""
         return float(self._drawn.xor_costs(self.vertices_world(coefficients)).sum())
 
     def vertices_world(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "v 3"]:
@@ -93,8 +93,8 @@ class SilhouetteObjective:
 
 
 def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -> Int[np.ndarray, "g 3"]:
-    """Returns the triangles with a fan over every hole, so that each edge has its counterpart; the same triangles where
-    a hole reaches the face region, whose outline may speak, or two holes meet."""
+    """Returns the triangles with a fan over every hole, so that each edge belongs to two triangles. Returns them
+    unchanged if a hole reaches the face region, whose outline counts, or if two holes meet."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
     edges = {(a, b) for a, b in directed}
     rim = [(a, b) for a, b in edges if (b, a) not in edges]
@@ -113,12 +113,12 @@ def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -
 
 
 def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.ndarray, "_ _"]:
-    """Returns the mask at another resolution: True where the contour leaves a pixel's centre inside, as the renderer
+    """Returns the mask at another resolution: True where a pixel's centre lies inside the contour, as the renderer
     draws.
 
     From the signed distance (px, negative inside), averaged over the pixel. The contour of a binary mask often runs
-    through a larger pixel's very centre; were all those ties to fall to one side, the contour would move by 0.15 px
-    all around (0.3 px where pixels of the mask are counted), so they fall as the squares of a chessboard.
+    through a larger pixel's very centre; were all those ties to fall to one side, the contour would move by 0.15 px all
+    around (0.3 px where pixels of the mask are counted), so they fall as the squares of a chessboard.
     """
     height, width = distance.shape
     smaller = cv2.resize(distance, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
@@ -129,9 +129,10 @@ def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.n
 def face_pixels(
     outline_mask: Bool[np.ndarray, "h w"], pixels: Float[np.ndarray, "v 2"], face_region: Bool[np.ndarray, " v"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns True where the nearest stretch of the model's outline belongs to the face region.
+    """Tells for which pixels the nearest part of the model's outline belongs to the face region.
 
-    ``pixels`` are the model's vertices in this view; those near to the edge of ``outline_mask`` name its stretches.
+    ``pixels`` are the model's vertices in this view; those near the edge of ``outline_mask`` decide which part of the
+    outline is face.
     """
     height, width = outline_mask.shape
     with np.errstate(invalid="ignore"):

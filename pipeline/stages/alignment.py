@@ -25,10 +25,10 @@ from rig.rig import Rig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """Holds the pose of the mean head, the camera that the subject faces, and what the pose came from.
+    """Holds the pose of the mean head, the camera that the subject faces, and the method that found the pose.
 
-    ``landmarks``: of the face that was found, where the pose came from them. ``rival``: how much more the best other
-    pose costs, as a share, where silhouettes decided.
+    ``landmarks``: those of the subject's face, if the pose came from them. ``rival``: how much more the best other pose
+    costs, as a share, if the pose came from silhouettes.
     """
 
     world_from_head: Similarity
@@ -39,7 +39,8 @@ class Alignment:
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:
-    """Returns the camera that the subject faces: the stated one, or the middle of the fan. Raises EigenheadError."""
+    """Returns the camera that the subject faces: the one in the settings, or else the middle one of the rig. Raises
+    EigenheadError."""
     if settings.front is None:
         return rig.front_camera()
     if settings.front not in rig:
@@ -49,8 +50,8 @@ def front_camera(rig: Rig, settings: Settings) -> str:
 
 @stage("alignment")
 def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> Staged[Alignment]:
-    """Aligns the mean head to feature points where the capture has any, to the face that was found, or to the
-    silhouettes. Raises TooFewFeatures, NoSubject."""
+    """Aligns the mean head to the capture's feature points or, without any, to the face in the photographs or, without
+    a face, to the silhouettes. Raises TooFewFeatures, NoSubject."""
     model, rig, settings = model_basis(context.model, context.settings), context.rig, context.settings
     face = None if faces.subject is None else faces.subject.matched
     if views.capture.features or face is None:
@@ -66,7 +67,7 @@ def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> St
 def align_to_views(
     model: HeadModel, views: Views, rig: Rig, settings: Settings, *, progress: Progress
 ) -> Staged[Alignment]:
-    """Aligns the mean head to feature points where the capture has any, to the silhouettes otherwise."""
+    """Aligns the mean head to the capture's feature points or, without any, to the silhouettes."""
     front = front_camera(rig, settings)
     if not views.capture.features:
         stated = settings.front is not None

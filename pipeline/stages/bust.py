@@ -22,8 +22,8 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bust:
-    """Holds a closed surface of all that the cameras see, with its colours (sRGB). ``views`` are the images that
-    coloured a vertex, 0 = filled from its neighbours."""
+    """Holds the closed surface of everything that the cameras see, with its colours (sRGB). ``views``: how many images
+    coloured each vertex; 0 if it was filled from its neighbours."""
 
     surface: BustSurface
     normals: Float[np.ndarray, "v 3"]
@@ -40,11 +40,10 @@ class Bust:
 def fuse_bust(
     context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, coloured: Capture
 ) -> Staged[Bust | None]:
-    """Fuses the depth maps to one closed mesh in the colours of ``coloured``, hidden by its own parts where these stand
-    before each other.
+    """Fuses the depth maps to one closed mesh, coloured from the photographs of ``coloured``.
 
-    Returns None where the settings do not ask for it, and None with the warning ``no-bust`` where fewer than three
-    views know any depth.
+    Returns None if the settings ask for the head only, and None with the warning ``no-bust`` if the depth maps do not
+    determine a surface.
     """
     settings, rig, displaced = context.settings, context.rig, refined.displaced
     if settings.outputs.surface == "head":

@@ -42,7 +42,8 @@ class ReconstructionContext:
     networks: FaceNetworks = field(default_factory=load_networks)
 
     def within_stage(self, name: str) -> "ReconstructionContext":
-        """Returns the context whose progress is reported under ``name``, whatever a part of that stage calls itself."""
+        """Returns the context with all progress reported under ``name``, whatever stage name the called code
+        reports."""
         return replace(self, progress=partial(_report_as, self.progress, name))
 
 

@@ -24,7 +24,8 @@ from pipeline.stereo.window_bias import WindowBias
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Depth:
-    """Holds the depth maps with what their pixels show, and the same as oriented points beside the fitted face."""
+    """Holds the depth maps, the parts that their pixels show, the same surface as oriented points, and the bias of the
+    depth measured on the fitted face."""
 
     maps: tuple[DepthMap, ...]  # none where no stage needs them
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]  # as they were matched, without highlights
@@ -35,13 +36,14 @@ class Depth:
 
 
 def is_refined(head: HeadFit, settings: Settings) -> bool:
-    """Returns whether the head is to be drawn to the dense surface: where photographs carried the fit itself."""
+    """Tells whether the head is to be deformed to the dense surface: the fit used the photographs and the settings ask
+    for fine detail."""
     return head.detail.level == "photo" and settings.detail in FINE_LEVELS
 
 
 @stage("depth")
 def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, labels: PartLabels) -> Staged[Depth]:
-    """Measures depth in every view, bounded by the fitted head, where a later stage needs it."""
+    """Measures depth in every view, within bounds set by the fitted head, if a later stage needs it."""
     settings, mesh = context.settings, head.mesh_world
     maps: tuple[DepthMap, ...] = ()
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]] = views.capture.images

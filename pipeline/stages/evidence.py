@@ -42,7 +42,7 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Holds figures of the delivered head. Mappings by camera have every camera of the rig."""
+    """Holds the figures of the delivered head. Mappings by camera have an entry for every camera of the rig."""
 
     start_masks: Masks  # of the head that the fit started from
     fitted_masks: Masks
@@ -65,10 +65,11 @@ def judge_head(
     texturing: Texturing,
     pose: PoseEvidence,
 ) -> Staged[Evidence]:
-    """Measures the delivered head, and warns of what heads, rigs and masks cannot be.
+    """Measures the delivered head, and warns if it is not plausible.
 
-    Raises UnexplainedOutlines where it explains hardly any outline and no found face says that it lies right (long hair
-    all around has outlines of its own), unless the settings let that pass."""
+    Raises UnexplainedOutlines if it explains hardly any outline and no face in the photographs confirms its pose,
+    unless the settings allow that: long hair all around has outlines of its own.
+    """
     fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
     before = start_masks(model, alignment.world_from_head, rig)
     fitted = {name: np.isfinite(depth) for name, depth in texturing.depths.items()}
@@ -100,9 +101,11 @@ def judge_head(
 
 
 def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced: DeformedSurface) -> tuple[Fit, float]:
-    """Returns the fit with the expression that the deformed head makes, and of how many deviations a weight must be.
+    """Returns the fit with the expression read from the deformed head, and the number of standard deviations from which
+    a weight is reported.
 
-    The surface is read where the fit found a made face at all; lids wherever points about the eye decided them.
+    The expression is read only if the fit's own is not neutral; the lids are taken over wherever points about the eye
+    decided them.
     """
     fit, model, settings = head.fit, head.model, context.settings.fitting
     rows = blinks_of(model)
@@ -122,15 +125,15 @@ def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced:
 
 
 def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> frozenset[str]:
-    """Returns which eyes are closed, of what the head shows and how far the found lids stand apart: those decide where
-    they can."""
+    """Returns which eyes are closed. The measured ``openings`` of the lids override ``closed``, the eyes that are
+    closed on the head, wherever they are clear."""
     met = {side for side, opening in openings.items() if opening < MIN_HALF_OPENING}
     apart = {side for side, opening in openings.items() if opening > MAX_CLOSED_OPENING}
     return (closed | met) - apart
 
 
 def eye_warnings(closed: frozenset[str]) -> list[ReportWarning]:
-    """Warns of closed eyes: they are no fault, but most studios want another shot."""
+    """Returns a warning if any eye is closed: it is no fault, but most studios want another shot."""
     if not closed:
         return []
     both = len(closed) == 2

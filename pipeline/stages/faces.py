@@ -12,9 +12,10 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Faces:
-    """Holds what the networks found; None where the settings do not ask them.
+    """Holds the subject's faces in the photographs; None if the settings do not ask for them.
 
-    ``eye_openings``: how far the lids of each eye stand apart (``faces.eyes``), where the subject's face was found.
+    ``eye_openings``: how far the lids of each eye stand apart (``faces.eyes``), if the views agree on the subject's
+    face.
     """
 
     subject: SubjectFaces | None

@@ -28,8 +28,8 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlineFit:
-    """Holds a head fitted to the outlines alone: the simplex's fit, or the contour solver's state, from which it goes
-    on."""
+    """Holds a head fitted to the outlines alone. ``solution`` is the simplex's fit, or the state from which the contour
+    solver continues."""
 
     solution: ContourSolution | Fit
     model: HeadModel  # with the modes that the solution has
@@ -38,7 +38,7 @@ class OutlineFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadFit:
-    """Holds a fit with its posterior, the model with the modes that it has, and how deep it went."""
+    """Holds a fit with its posterior, the model whose modes it uses, and the level of detail that it reached."""
 
     fit: Fit
     model: HeadModel
@@ -46,18 +46,19 @@ class HeadFit:
 
     @property
     def mesh_world(self) -> Mesh:
-        """Returns the fitted head, full level, mm."""
+        """Returns the fitted head, full level, world frame, mm."""
         return fitted_mesh(self.model, self.fit)
 
 
 def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
-    """Returns the fit's head, full level, world frame, mm."""
+    """Returns the head of a fit, full level, world frame, mm."""
     return Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), model.levels["full"].faces)
 
 
 @stage("fit")
 def fit_outlines(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[OutlineFit]:
-    """Fits shape and pose to the silhouettes, by the simplex or on the rim."""
+    """Fits shape and pose to the silhouettes with the contour solver; with the simplex method, then fits the shape
+    again at that pose."""
     settings, rig = context.settings, context.rig
     model, features = model_basis(context.model, settings), views.capture.features
     solved = solve_contour(
@@ -89,7 +90,8 @@ def fit_outlines(context: ReconstructionContext, views: Views, alignment: Alignm
 
 @stage("fit")
 def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels) -> Staged[HeadFit]:
-    """Goes on with what the photographs show inside the outlines, as deep as settings and photographs let it."""
+    """Refines the fit with the photographs inside the outlines, to the level of detail that settings and photographs
+    allow."""
     settings, model, solved = context.settings, outlines.model, outlines.solution
     if isinstance(solved, Fit):
         return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))

@@ -18,18 +18,19 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLabels:
-    """Holds maps by camera; empty where no stage needs them."""
+    """Holds the part map of each camera; empty if no stage needs them."""
 
     maps: Mapping[str, PartMap]
 
     def hair_probability(self) -> dict[str, Float32[ndarray, "_ _"]]:
-        """Returns how probably each pixel shows hair, by camera."""
+        """Returns, for each camera, the probability of hair at every pixel."""
         return {name: part.probability[..., Part.HAIR.channel] for name, part in self.maps.items()}
 
 
 @stage("parts")
 def label_parts(context: ReconstructionContext, views: Views, model: HeadModel, head_world: Mesh) -> Staged[PartLabels]:
-    """Labels the pixels of every photograph, seeded by a head of ``model``'s topology (mm)."""
+    """Labels the pixels of every photograph as skin, hair or clothes, starting from a fitted head (world, mm) with the
+    vertices of ``model``."""
     settings = context.settings
     if settings.detail not in PHOTO_LEVELS and settings.outputs.surface == "head":
         return Staged(PartLabels({}))

@@ -14,7 +14,8 @@ from pipeline.stages.refined_head import RefinedHead
 def check_pose(
     context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
 ) -> Staged[PoseEvidence]:
-    """Compares the delivered head with the faces that were found, and its pose with the best other one."""
+    """Compares the delivered head with the faces in the photographs, and the cost of its pose with that of the best
+    other pose."""
     evidence, warnings = judge_pose(
         refined.mesh_world,
         head.fit.world_from_head,

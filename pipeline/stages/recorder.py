@@ -16,7 +16,7 @@ P = ParamSpec("P")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Staged(Generic[T]):
-    """Holds a stage's product and what an operator should know of it."""
+    """Holds the product of a stage and its warnings."""
 
     product: T
     warnings: Sequence[ReportWarning] = ()
@@ -37,7 +37,7 @@ class Stage(Generic[P, T]):
 
 
 def stage(name: str) -> Callable[[StageFunction[P, T]], Stage[P, T]]:
-    """Names the decorated function as a stage. Two stages of one name are two visits of it."""
+    """Makes the decorated function a stage with the given name. The seconds of stages with the same name add up."""
 
     def named(function: StageFunction[P, T]) -> Stage[P, T]:
         return Stage(name, function)
@@ -46,10 +46,10 @@ def stage(name: str) -> Callable[[StageFunction[P, T]], Stage[P, T]]:
 
 
 class Recorder:
-    """Runs stages one after the other, with their seconds by name and their warnings in order.
+    """Runs stages one after the other and records their seconds and warnings.
 
-    ``progress`` is told when a stage begins, and by the stage itself how far it is; where it raises Cancelled, so does
-    the stage.
+    ``progress`` is called when a stage begins, and by the stage as it advances; if it raises Cancelled, the stage does
+    too.
     """
 
     def __init__(self, progress: Progress) -> None:

@@ -25,9 +25,10 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedHead:
-    """Holds the head as delivered: the fit's, or that deformed to the dense surface, without spoilt triangles.
+    """Holds the delivered head without spoilt triangles: the fit's, or that deformed to the dense surface.
 
-    ``deviation_mm``: posterior standard deviation of each vertex; ``displaced``: None where the fit's own head is it.
+    ``deviation_mm``: posterior standard deviation of each vertex; ``displaced``: the deformed surface, None if the
+    fit's head is delivered.
     """
 
     mesh_world: Mesh  # full level, mm
@@ -40,7 +41,8 @@ class RefinedHead:
 def refine_head(
     context: ReconstructionContext, views: Views, faces: Faces, head: HeadFit, labels: PartLabels, depth: Depth
 ) -> Staged[RefinedHead]:
-    """Deforms the fitted head to the dense surface where that shows enough of the face."""
+    """Deforms the fitted head to the dense surface. Keeps the fit's head if the settings ask for less detail or the
+    surface shows too little of the face."""
     settings, fit, model, mesh = context.settings, head.fit, head.model, head.mesh_world
     deviation_mm = vertex_deviation_mm(model, fit)
     if not is_refined(head, settings):

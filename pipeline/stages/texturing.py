@@ -23,7 +23,7 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texturing:
-    """Holds the delivered head's colours, and what of a texture the settings ask for."""
+    """Holds the delivered head's vertex colours, and the textures that the settings ask for."""
 
     normals: Float[np.ndarray, "v 3"]
     depths: Mapping[str, Float32[np.ndarray, "_ _"]]  # mm, of the head in each camera; inf beside it
@@ -39,7 +39,7 @@ class Texturing:
 def texture_head(
     context: ReconstructionContext, views: Views, head: HeadFit, refined: RefinedHead
 ) -> Staged[Texturing]:
-    """Colours the delivered head from the photographs."""
+    """Colours the delivered head from the photographs, and paints its textures."""
     settings, rig, model, mesh = context.settings, context.rig, head.model, refined.mesh_world
     normals, depths, face = mesh.normals(), depth_maps(rig, mesh), model.levels["full"].face_region
     layout, layout_warnings = find_layout(model, settings)

@@ -12,10 +12,10 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Holds the capture with every picture under its own camera, and its silhouettes; those that take no part are not
-    usable.
+    """Holds the capture with every picture under the right camera, and its silhouettes; views that take no part are
+    marked unusable.
 
-    ``assignment``: for each camera that was given another's picture, the name under which its own is filed.
+    ``assignment``: for each camera that had another's picture, the name under which its own was filed.
     """
 
     capture: Capture
@@ -25,7 +25,8 @@ class Views:
 
 @stage("segmentation")
 def find_views(context: ReconstructionContext) -> Staged[Views]:
-    """Finds the silhouettes of the capture. Raises TooFewViews, ExchangedPictures, WrongRig."""
+    """Finds the silhouettes of the capture and decides which views take part. Raises TooFewViews, ExchangedPictures,
+    WrongRig."""
     settings, rig = context.settings, context.rig
 
     def segmented(capture: Capture) -> dict[str, Silhouette]:

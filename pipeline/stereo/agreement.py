@@ -30,7 +30,8 @@ PIXEL_SHARE = 0.56  # of a pixel's square on the surface, brought onto the ray, 
 def depth_maps(
     crops: Sequence[Crop], stack: Stack, fields: Sequence[Field], settings: DenseSettings
 ) -> tuple[DepthMap, ...]:
-    """Returns the fields of full size, held against each other."""
+    """Compares the full-size fields of all views with each other. Returns a depth map for each view that keeps only
+    places that other views confirm."""
     matched = np.concatenate([(1.0 / np.sqrt(field.information + 1e-6)).ravel() for field in fields])
     depth = np.concatenate([field.depth.ravel() for field in fields])
     slopes = np.concatenate([field.slopes.reshape(-1, 2) for field in fields])
@@ -56,7 +57,7 @@ def depth_maps(
 def stated_deviation(
     camera: Camera, field: Field, agreeing: UInt8[np.ndarray, "h w"], apart: Float32[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Returns the standard deviation of the depth, mm.
+    """Returns the standard deviation (mm) of the depth at each pixel, along the ray.
 
     Args:
         agreeing: how many other views have the surface at the same place.
@@ -90,8 +91,8 @@ def _depth_map(
 
 
 def normals_world(camera: Camera, field: Field) -> Float32[np.ndarray, "h w 3"]:
-    """Returns unit normals towards the camera: of the plane ``z(x, y)`` through points ``z (x - cx, y - cy, f) /
-    f``."""
+    """Returns the unit normal (world frame, towards the camera) of the surface at each pixel, from the field's depth
+    and slopes."""
     k = camera.intrinsics
     column, row = np.meshgrid(np.arange(k.width, dtype=np.float32), np.arange(k.height, dtype=np.float32))
     x, y = (column - k.cx) / k.fx, (row - k.cy) / k.fy

@@ -28,7 +28,7 @@ BLUR_PX = 0.5  # before every halving, and of the full size: what is left is fit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds a crop at one size. ``camera`` belongs to this size."""
+    """Holds a crop at one size: its camera, grey values and distances to the outline, all in pixels of this size."""
 
     camera: Camera
     grey: Float32[np.ndarray, "h w"]
@@ -38,7 +38,7 @@ class Level:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crop:
-    """Holds what one camera shows of the subject; ``levels`` halve from one to the next."""
+    """Holds one camera's picture of the subject; each of its ``levels`` has half the size of the one before."""
 
     levels: tuple[Level, ...]
     colour: UInt8[np.ndarray, "h w 3"]
@@ -57,7 +57,7 @@ def make_crops(
     pixel_mm: float,
     at_world: Float[np.ndarray, " 3"],
 ) -> list[Crop]:
-    """Returns the crops of all cameras that have a photograph and a usable silhouette with something in it.
+    """Returns the crops of all cameras that have a photograph and a usable silhouette that is not empty.
 
     Args:
         pixel_mm: a photograph with smaller pixels than this (mm, at ``at_world``) is reduced to it.
@@ -105,10 +105,10 @@ def _crop(
 
 
 def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
-    """Returns a pinhole at the camera's pose, whose image just holds the subject; sides are multiples of the least
-    level's.
+    """Returns a pinhole camera at the camera's pose whose image just holds the subject. Width and height are multiples
+    of 2^(``LEVELS`` - 1), so that they can be halved.
 
-    Where the photograph cuts the subject off, the crop goes on beyond it: the pixels of its edge are then unseen.
+    Where the photograph cuts the subject off, the crop extends ``MARGIN_PX`` beyond it; pixels there are unseen.
     """
     row, column = np.flatnonzero(silhouette.mask.any(axis=1)), np.flatnonzero(silhouette.mask.any(axis=0))
     k = camera.intrinsics

@@ -26,12 +26,12 @@ class DepthMap:
 
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:
-        """Returns where the photographs say how far the surface is."""
+        """Tells which pixels have a known depth."""
         return np.isfinite(self.deviation_mm)
 
 
 def points_world(depth_map: DepthMap) -> Float[np.ndarray, "n 3"]:
-    """Returns the known pixels as points of the world frame, mm, row by row."""
+    """Returns the surface points (world frame, mm) of the known pixels, row by row."""
     camera = depth_map.camera
     row, column = np.nonzero(depth_map.known)
     z, k = depth_map.depth_mm[row, column].astype(float), camera.intrinsics

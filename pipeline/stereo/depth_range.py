@@ -32,8 +32,8 @@ STEEPEST = 3.0  # slope against the image plane: 72 degrees
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthRange:
-    """Holds the depth bounds (mm) of one view's pixels, 0 where there is none, and their slopes by x and y (mm a
-    pixel)."""
+    """Holds the nearest and farthest depth (mm) that the search tries at each pixel of a view, 0 where it tries none,
+    and the slopes of both bounds by x and y (mm per pixel)."""
 
     near: Float32[np.ndarray, "h w"]
     far: Float32[np.ndarray, "h w"]
@@ -48,11 +48,11 @@ def find_depth_ranges(
     extent: tuple[Float[np.ndarray, " 3"], float],
     settings: DenseSettings,
 ) -> list[DepthRange]:
-    """Returns the room of every view at the size of ``stack``.
+    """Finds the range of depths to search in every view, at the size of ``stack``.
 
     Args:
-        least: the crops at their least size, where silhouettes and head are asked.
-        head_world: the fitted head, world frame, mm; without it the hull's back bounds the room.
+        least: the crops at their least size, where the range is first found.
+        head_world: the fitted head, world frame, mm; without it the range ends ``reach_mm`` behind the hull's front.
         extent: middle (world) and edge (mm) of a cube that holds the subject.
     """
 
@@ -71,7 +71,7 @@ def _bounds(
     extent: tuple[Float[np.ndarray, " 3"], float],
     settings: DenseSettings,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Depth bounds at the least size; 0 where there is none."""
+    """Returns the nearest and farthest depth (mm) of each pixel at the least size; 0 where no depth is possible."""
     camera = crop.levels[-1].camera
     centre, edge = extent
     middle, half = float(camera.camera_from_world.apply(centre)[2]), 0.5 * np.sqrt(3.0) * edge
@@ -101,12 +101,10 @@ def _bound_by_head(
     head: Float[np.ndarray, "h w"],
     settings: DenseSettings,
 ) -> None:
-    """Narrows the bounds in place to what may stand before and behind the fitted head, whose depths are ``head`` (mm,
-    infinite beside it).
+    """Narrows the bounds in place to depths near the fitted head, whose depths are ``head`` (mm, infinite beside it).
 
-    Cameras that all stand on one side leave a hull that reaches decimetres before the face. There neither its front
-    nor what is ``reach_mm`` behind it says where the subject is: the head does, and beside it its nearest and farthest
-    places.
+    Cameras that all stand on one side leave a visual hull that begins decimetres before the face. Then the bounds come
+    from the head: from its depth at the pixel or, beside it, from its least and greatest depth.
     """
     seen = room & np.isfinite(head)
     if not seen.any() or np.median((head - near)[seen]) < LOOSE_HULL_MM:
@@ -120,7 +118,7 @@ def _bound_by_head(
 
 
 def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"], stack: Stack, view: int) -> DepthRange:
-    """The bounds, smooth, at the size of ``stack``, over all that its view shows of the subject."""
+    """Returns the bounds smoothed, enlarged to the size of ``stack`` and extended over every pixel of the subject."""
     room = near > 0.0
     width, height = (int(side) for side in stack.size[view])
     distance = stack.image(stack.distance_px, view)
@@ -137,7 +135,7 @@ def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"],
 
 
 def _extended(values: Float32[np.ndarray, "h w"], room: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Blurred within the room, and carried on beyond it."""
+    """Returns the values blurred within the room; pixels outside take the value of the nearest pixel inside."""
     weight = cv2.GaussianBlur(room.astype(np.float32), (0, 0), BOUND_BLUR_PX)
     smooth = cv2.GaussianBlur(np.where(room, values, np.float32(0.0)), (0, 0), BOUND_BLUR_PX) / np.maximum(weight, 1e-3)
     _, nearest = cv2.distanceTransformWithLabels(

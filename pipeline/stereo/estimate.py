@@ -53,16 +53,17 @@ def estimate_depth(
     *,
     report: Progress,
 ) -> tuple[DepthMap, ...]:
-    """Returns what each photograph, matched with its neighbours, says of the surface.
+    """Measures depth, normal and deviation in each photograph by matching it with its neighbours.
 
     Args:
         images: RGB, by camera name.
         silhouettes: by camera name; a view whose silhouette is not usable takes no part.
         head_world: the head fitted so far (world, mm), which bounds the search from behind; None where there is none.
-        report: told ``"dense"`` and the share that is done; may raise to stop.
+        report: called with ``"dense"`` and the share that is done; may raise to stop.
 
     Returns:
-        A map a view that takes part, in the order of the rig; fewer than two views know nothing.
+        One depth map for each view that takes part, in the order of the rig. With fewer than two views no depth is
+        known.
     """
     extent = hull_extent(silhouettes, rig)
     report("dense", 0.0)

@@ -8,8 +8,8 @@ from jaxtyping import Float32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """Holds the depth (mm of camera z, 0 where there is no surface) and slopes (mm a pixel, by x and y) of a view's
-    pixels."""
+    """Holds one view's current estimate of the surface: at each pixel the depth (mm of camera z, 0 where there is no
+    surface) and the slopes (mm per pixel, by x and y)."""
 
     depth: Float32[np.ndarray, "h w"]
     slopes: Float32[np.ndarray, "h w 2"]

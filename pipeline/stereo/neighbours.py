@@ -12,8 +12,8 @@ from rig.camera import Camera
 def choose_neighbours(
     cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"], settings: DenseSettings
 ) -> list[Int[np.ndarray, " _"]]:
-    """Returns for every camera the numbers of those to compare it with, the nearest in angle first; empty where it has
-    none.
+    """Returns, for each camera, the indices of the cameras to match it with, by increasing angle between their lines of
+    sight; empty if there are none.
 
     Args:
         at_world: about the middle of the subject; angles are between the lines of sight to it.

@@ -29,7 +29,8 @@ MAX_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
 def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> list[Field]:
-    """Returns the fields at twice the size, the size of ``stack``."""
+    """Returns the fields enlarged to twice their size, the size of ``stack``, with a share of their information
+    kept."""
 
     def work(view: int) -> Field:
         field, distance = fields[view], stack.image(stack.distance_px, view)
@@ -56,8 +57,8 @@ def refined(
     rounds: int,
     speck_px: int,
 ) -> list[Field]:
-    """Returns the fields after planes of neighbours ``steps_px`` away were tried (odd; empty: none), without pieces of
-    ``speck_px`` pixels or fewer, and after ``rounds`` slides."""
+    """Improves the field of every view. Each pixel tries the planes of pixels ``steps_px`` away (odd; empty: none),
+    specks of at most ``speck_px`` pixels are replaced, and least squares then moves the planes in ``rounds`` rounds."""
 
     def work(view: int) -> Field:
         return _refined(

@@ -24,7 +24,7 @@ STEP_COST, EDGE_COST = np.float32(0.1), np.float32(0.8)
 
 
 def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> int:
-    """Returns how often the crops are halved for the search: until a pixel is about ``SEARCH_PIXEL_MM``.
+    """Returns how many times the crops are halved for the search, so that a pixel is about ``SEARCH_PIXEL_MM``.
 
     Args:
         cameras: of the crops at full size; one at least.
@@ -43,7 +43,8 @@ def first_fields(
     pattern: Float32[np.ndarray, "2 s"],
     settings: DenseSettings,
 ) -> list[Field]:
-    """Returns the fields of all views by a sweep through their rooms; their information is 0.
+    """Finds a first depth in every view by trying depths in even steps through the range of each pixel. The information
+    of the returned fields is 0.
 
     Args:
         neighbours: of each view, those that it is compared with.
@@ -61,14 +62,15 @@ def first_fields(
 
 
 def label_strides(room: DepthRange, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
-    """Returns one in how many labels is matched: 1, 2, 4 ..., so that places lie no farther apart than in the deepest
-    room."""
+    """Returns, for each pixel, that only one label in so many is matched: 1, 2, 4 ... A narrow range needs fewer labels
+    for the same spacing in depth."""
     depth = np.clip(room.far - room.near, settings.reach_mm / settings.labels, settings.reach_mm)
     return (2 ** np.floor(np.log2(settings.reach_mm / depth))).astype(np.int32)
 
 
 def _cheapest(cost: Float32[np.ndarray, "h w d"], room: DepthRange, strides: Int32[np.ndarray, "h w"]) -> Field:
-    """The label of the cheapest paths, and within a stride the least of its own costs: paths are no likeness."""
+    """Returns the field of the labels whose aggregated path cost is least, refined within a stride by the unaggregated
+    matching costs."""
     paths = np.empty_like(cost)
     aggregate(cost, room.far > 0.0, STEP_COST, EDGE_COST, paths)
     labels = cost.shape[2]

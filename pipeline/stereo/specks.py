@@ -13,11 +13,12 @@ SWEEPS = 30  # a speck of 60 pixels is 8 wide
 def take_specks_off(
     depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"], pixel_mm: float, most_px: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Lays pieces of ``most_px`` pixels or fewer onto the membrane through what is about them; returns where.
+    """Replaces, in place, pieces of at most ``most_px`` pixels by a membrane through their surroundings. Returns which
+    pixels were replaced.
 
-    A piece stays where nothing tells what is about it: at an outline, where it may go on behind, and among so many
-    others that together they are larger than a piece may be. A quarter of draw-b's clothes at the search's size are
-    such pieces beside each other: two fifths of them are right, and membranes over all of them lost 6 % of the clothes.
+    A piece stays if its surroundings are not known: at an outline, where the surface may go on behind, and among so
+    many others that together they exceed ``most_px``. A quarter of draw-b's clothes at the search's size are such
+    pieces beside each other: two fifths of them are right, and membranes over all of them lost 6 % of the clothes.
     """
     specks = np.zeros(depth.shape, bool)
     mark_specks(depth, slopes, GAP_PX * pixel_mm, most_px, specks)

@@ -18,7 +18,7 @@ SHADES = 256  # of a grey level: the images are smooth, and rounding is to be fa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stack:
-    """Holds views of one size.
+    """Holds all views at one size as flat arrays.
 
     A point at depth ``z`` of pixel ``(x, y)`` in view r lies in view k at the pixel ``(p0 / p2, p1 / p2)`` and the
     depth ``p2``, where ``p = z (turn[r, k] @ (x, y, 1)) + shift[r, k]``.
@@ -34,8 +34,8 @@ class Stack:
     shift: Float[np.ndarray, "n n 3"]
 
     def homographies(self, view: int, others: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m 16"]:
-        """Returns what leads from one view to others, as compiled loops take it: turn (9), shift (3), width, height,
-        offset, noise."""
+        """Returns what maps pixels of one view to each of the others, one row for each, as compiled loops take it: turn
+        (9), shift (3), width, height, offset, noise."""
         flat = self.turn[view, others].reshape(len(others), 9)
         return np.column_stack(
             [flat, self.shift[view, others], self.size[others], self.offset[others], self.noise[others]]
@@ -44,7 +44,7 @@ class Stack:
     def match_arguments(
         self, view: int, others: Int[np.ndarray, " m"], pattern: Float32[np.ndarray, "2 s"], contrast_levels: float
     ) -> Sight:
-        """Returns a view and the others that it is matched with, for compiled loops."""
+        """Packs a view, and the other views to match it with, for compiled loops."""
         return Sight(
             int(self.offset[view]), float(self.noise[view]), self.homographies(view, others), self.pairs,
             self.distance_px, pattern, contrast_levels * SHADES,
@@ -54,13 +54,14 @@ class Stack:
         return len(self.size)
 
     def image(self, values: np.ndarray, view: int) -> np.ndarray:
-        """Returns one view's part of a row of values, as an image."""
+        """Returns one view's part of a flat array of pixel values, reshaped to an image."""
         width, height = self.size[view]
         return values[self.offset[view] : self.offset[view] + width * height].reshape(height, width, *values.shape[1:])
 
 
 def stack_crops(crops: Sequence[Crop], level: int) -> Stack:
-    """Returns the crops at ``level``: 0 is full size, each further one halves it."""
+    """Packs the crops at one ``level`` into flat arrays; level 0 is full size, and each further level has half the
+    size."""
     levels = [crop.levels[level] for crop in crops]
     cameras = [each.camera for each in levels]
     count = len(levels)
@@ -87,6 +88,7 @@ def stack_crops(crops: Sequence[Crop], level: int) -> Stack:
 
 
 def pack_pairs(grey: Float32[np.ndarray, "h w"]) -> UInt32[np.ndarray, "h w"]:
-    """Returns grey values (0 to 255) with their right neighbours; the last of a row is its own neighbour."""
+    """Packs each grey value (0 to 255) and that of the pixel to its right into one 32-bit word; the last pixel of a row
+    counts as its own right neighbour."""
     shades = np.clip(grey * SHADES, 0.0, 65535.0).astype(np.uint32)
     return shades | (np.concatenate([shades[:, 1:], shades[:, -1:]], axis=1) << 16)

@@ -20,7 +20,8 @@ WINDOW_MM, REACH_MM = 2.5, 6.25  # standard deviation of the window, and where i
 
 @dataclass(frozen=True, slots=True)
 class WindowBias:
-    """Holds ``common_mm`` along the normal, everywhere, and the ``share`` of the windowed height."""
+    """Holds the bias of dense matching along the normal: ``common_mm``, the same everywhere, and ``share``, the factor
+    of the windowed height."""
 
     common_mm: float = 0.0
     share: float = 0.0
@@ -31,8 +32,8 @@ def windowed_height(
     normals: Float[np.ndarray, "v 3"],
     wanted: Bool[np.ndarray, " v"] | None = None,
 ) -> Float[np.ndarray, " v"]:
-    """Tells how far (mm, along the normal) the mean of the surface over a window lies above each vertex; sheets that
-    face another way do not count. 0 where nobody asks: only the ``wanted`` ones are found (all of them, if None)."""
+    """Computes how far (mm, along the normal) the mean of the surface over a window lies above each vertex. Parts that
+    face another way do not count. With ``wanted``, the other vertices get 0."""
     height_mm, cells = np.zeros(len(vertices)), sorted_into_cells(vertices, REACH_MM)
     chosen = (
         np.ones(len(vertices), bool) if wanted is None else wanted.copy()
@@ -48,7 +49,8 @@ def windowed_height(
 
 
 def without_bias(mesh_world: Mesh, measured: Bool[np.ndarray, " v"], bias: WindowBias) -> Mesh:
-    """Returns the mesh with its measured vertices where they would be without the windows."""
+    """Returns the mesh with the bias of the matching windows subtracted at its measured vertices, along their
+    normals."""
     if bias == WindowBias():
         return mesh_world
     vertices, normals = mesh_world.vertices, mesh_world.normals()

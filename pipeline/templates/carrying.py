@@ -24,14 +24,14 @@ WHOLE_ANCHORS = 40  # that lead a closed part
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attachment:
-    """Holds points on a triangle surface."""
+    """Holds points attached to a triangle surface: each by its triangle, barycentric weights and an offset."""
 
     triangles: Int[np.ndarray, " n"]  # rows of the surface's faces
     weights: Float[np.ndarray, "n 3"]  # barycentric
     offsets: Float[np.ndarray, "n 3"]  # mm, in the triangle's frame (``frames``)
 
     def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
-        """Returns the points on the same surface with other vertices."""
+        """Returns where the attached points lie on the same surface with moved ``vertices``."""
         corners = vertices[faces[self.triangles]]
         off = np.einsum("nax,na->nx", frames(corners), self.offsets)
         return np.einsum("nk,nkx->nx", self.weights, corners) + off
@@ -43,8 +43,8 @@ def bind_vertices(
     vertices: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Attachment, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns points attached where the surface is nearest and faces as they do; their distances (mm), and the cosine
-    between their unit normals and the surface's."""
+    """Attaches points to the nearest place of a surface that faces the same way. Returns the attachment, the distances
+    (mm), and the cosine between each point's unit normal and the surface's."""
     surface = SurfaceIndex(vertices, faces)
     hits = surface.closest(points, CANDIDATES, facing=normals)
     offsets = np.einsum("nax,nx->na", frames(vertices[faces[hits.triangles]]), points - hits.points)
@@ -53,8 +53,8 @@ def bind_vertices(
 
 
 def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Returns rows: along the first edge, across it in the plane, the normal. Zero rows where a triangle has no
-    area."""
+    """Returns three unit vectors for each triangle, as rows: along its first edge, across that edge in the plane, and
+    the normal; zero if the triangle has no area."""
     along, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(along, other)
     axes = np.stack([along, np.cross(normal, along), normal], axis=1)
@@ -63,7 +63,7 @@ def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceBinding:
-    """Holds all vertices of a mesh as a model's surface carries them. Rows are the mesh's vertices."""
+    """Holds how a model's surface carries all vertices of another mesh. Rows are the vertices of that mesh."""
 
     rest: Float[np.ndarray, "t 3"]  # where the mesh lay when it was registered, mm
     skin: Int[np.ndarray, " n"]  # rows that the surface carries, as ``attachment`` says
@@ -73,7 +73,7 @@ class SurfaceBinding:
     whole_anchors: Int[np.ndarray, "w k"]  # rows of the mesh that lead each closed part
 
     def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "t 3"]:
-        """Returns the mesh's vertices on a head: the model's full level, in any frame, mm."""
+        """Returns the mesh's vertices carried by a head; ``vertices`` are the model's full level, in any frame, mm."""
         out = np.empty_like(self.rest)
         out[self.skin] = self.attachment.on(vertices, faces)
         deep = self.wholes < 0
@@ -92,7 +92,8 @@ def surface_binding(
     attachment: Attachment,
     wholes: Int[np.ndarray, " t"],
 ) -> SurfaceBinding:
-    """Returns a Carrier with its anchors chosen: the skin nearest to what lies deeper, and some of all of it."""
+    """Builds the binding and chooses its anchors: skin nearest to what lies deeper, and some spread over all of the
+    skin."""
     tree = KDTree(rest[skin])
     deep = wholes < 0
     deep[skin] = False
@@ -113,7 +114,8 @@ def surface_binding(
 
 
 def _nearest(tree: KDTree, part: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " k"]:
-    """The points of a tree that lie nearest to any of a part's: about an eyeball, the edges of its lids."""
+    """Returns at most ``count`` points of the tree that lie nearest to any point of a part: for an eyeball, the edges
+    of its lids."""
     distance, row = tree.query(part, k=count)
     distance, row = np.ravel(distance), np.ravel(row)
     order = np.argsort(distance, kind="stable")

@@ -22,7 +22,7 @@ DAMAGE = (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.Bad
 
 
 class BadTemplate(EigenheadError):
-    """Refuses a file that should hold a registered mesh template and is of another kind, or damaged."""
+    """Reports a file that should hold a registered template but is of another kind, or damaged."""
 
     def __init__(self, path: Path, why: Message | str) -> None:
         super().__init__(compose("template-unusable", path=str(path), why=why, name=path.stem))
@@ -30,7 +30,7 @@ class BadTemplate(EigenheadError):
 
 
 class OtherModel(EigenheadError):
-    """Reports a template that another model carries than the one in use."""
+    """Reports a template that was registered to another model than the one in use."""
 
     def __init__(self, template: "TemplateHeader", model_name: str) -> None:
         same = template.model_name == model_name
@@ -49,7 +49,7 @@ class OtherModel(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class TemplateHeader:
-    """Says whose mesh was registered to which model, and how well."""
+    """Holds which mesh was registered to which model, and figures of how well."""
 
     name: str
     source: str  # the OBJ file's name
@@ -59,13 +59,13 @@ class TemplateHeader:
     figures: Mapping[str, float] = field(default_factory=dict)  # of the registration
 
     def check_model(self, model_name: str, model_sha256: str) -> None:
-        """Raises OtherModel."""
+        """Raises OtherModel if the template was registered to another model."""
         if model_sha256 != self.model_sha256:
             raise OtherModel(self, model_name)
 
 
 def read_header(path: Path) -> TemplateHeader:
-    """Raises BadTemplate."""
+    """Returns the header of a template file. Raises BadTemplate."""
     try:
         with np.load(path, allow_pickle=False) as file:
             meta = read_meta(path, file)
@@ -91,9 +91,8 @@ def header_words(meta: Mapping[str, Any]) -> dict[str, str]:
 
 
 def check_template(name: str | None, model: str) -> None:
-    """Checks whether a job with this model, a name or a file, may ask for the template of this name, or for none.
-
-    Raises UnknownTemplate, BadTemplate, OtherModel, UnknownModel."""
+    """Checks that a job with this model (a name or a file) can use the named template; None is always allowed. Raises
+    UnknownTemplate, BadTemplate, OtherModel, UnknownModel."""
     path = model_path(model)
     if name is not None:
         read_header(template_path(name)).check_model(model, model_sha256(path))

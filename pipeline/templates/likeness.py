@@ -25,7 +25,7 @@ from rig.mesh import vertex_normals
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Holds some steps of the search. Lengths in mm."""
+    """Holds the limits of several steps of the search. Lengths in mm."""
 
     steps: int
     modes: int | None  # the first ones; None: all, the smooth deformations too
@@ -52,7 +52,7 @@ ROWS = 6000  # vertices of the model that look for the mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likeness:
-    """Holds the model as the mesh has it."""
+    """Holds the model fitted to a mesh, and how far it is from the mesh."""
 
     vertices: Float[np.ndarray, "v 3"]  # of the full level, in the frame that the search began in
     distances: Float[np.ndarray, " s"]  # mm, of some vertices of the model from the mesh; inf where nothing was met
@@ -64,7 +64,8 @@ class Likeness:
 def fit_model_to_mesh(
     model: HeadModel, mesh: Surface, landmarks: Mapping[str, Float[np.ndarray, " 3"]] = MappingProxyType({})
 ) -> Likeness:
-    """Returns the model fitted to a mesh that lies about where the model does (mm), and to landmarks of the mesh."""
+    """Fits shape and pose of the model to a mesh and to landmarks of the mesh. The mesh must already lie about where
+    the model does (mm)."""
     wide = with_kernel(model, len(model.modes))
     full, count = model.levels["full"], len(model.modes)
     rows = np.arange(0, len(model.mean), max(1, len(model.mean) // ROWS))  # of the cage: even over the surface
@@ -95,7 +96,8 @@ def fit_model_to_mesh(
 
 
 class _Mesh:
-    """The mesh to be met: its surface, and points of it by position and normal together."""
+    """Holds the mesh that the model is fitted to, with search trees of its surface and of its points by position and
+    normal."""
 
     def __init__(self, mesh: Surface) -> None:
         self._mesh, self._surface = mesh, SurfaceIndex(mesh.vertices, mesh.faces)
@@ -105,8 +107,8 @@ class _Mesh:
     def meet(
         self, points: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"], stage: Stage
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Returns where points meet the mesh, its normals there, the distances, and weights: 0 where it faces another
-        way, is too far, or ends (there the nearest point lies sideways)."""
+        """Returns, for each point, its closest place on the mesh, the normal there, the distance, and a weight: 0 where
+        the mesh faces another way, is too far, or ends (there the closest place lies sideways)."""
         places, planes = self._nearest(points, normals, stage.normal_mm)
         apart = places - points
         off = np.linalg.norm(apart, axis=1)
@@ -148,7 +150,8 @@ def _gauss_newton_step(
     z: Float[np.ndarray, " k"],
     place: Similarity,
 ) -> tuple[Float[np.ndarray, " k"], Similarity]:
-    """One Gauss-Newton step over the active modes, turn, shift and size."""
+    """Returns the coefficients and the pose after one Gauss-Newton step over the active modes, rotation, translation
+    and scale."""
     active = modes.shape[2]
     turned = (place.scale * planes @ place.rotation).astype(np.float32)  # n^T s R
     along = sum(turned[:, axis, None] * modes[:, axis] for axis in range(3))

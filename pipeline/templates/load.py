@@ -16,9 +16,10 @@ from rig.progress import Progress
 
 
 def load_template(name: str | None, model: HeadModel) -> Template | None:
-    """Returns the template of this name for a job with this model; None for none.
+    """Loads the named template for a job with this model; returns None if ``name`` is None.
 
-    Raises UnknownTemplate, BadTemplate, OtherModel."""
+    Raises UnknownTemplate, BadTemplate, OtherModel.
+    """
     if name is None:
         return None
     template = read_template(template_path(name))
@@ -34,7 +35,8 @@ def make_template(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     report: Progress,
 ) -> tuple[Template, Registration]:
-    """Returns the mesh of an OBJ file, registered to a model. Raises InputError naming every fault of the file."""
+    """Registers the mesh of an OBJ file to a model. Returns the template and the registration. Raises InputError with
+    every fault of the file."""
     mesh = read_polygons(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()

@@ -12,7 +12,7 @@ from rig.messages.message import compose
 
 
 class UnknownTemplate(EigenheadError):
-    """Refuses a name that no template has."""
+    """Reports a name that no registered template has."""
 
     def __init__(self, name: str) -> None:
         known = [*list_templates()] or ["none"]
@@ -20,7 +20,7 @@ class UnknownTemplate(EigenheadError):
 
 
 class WrongName(EigenheadError):
-    """Refuses a name that no template can have."""
+    """Reports a name that is not allowed for a template."""
 
     def __init__(self, name: str) -> None:
         super().__init__(compose("template-name-wrong", name=f"{name!r:.60}"))
@@ -36,14 +36,14 @@ def templates_folder() -> Path:
 
 
 def list_templates() -> dict[str, Path]:
-    """Returns templates at hand by name."""
+    """Returns the files of all registered templates, by name."""
     folder = templates_folder()
     found = sorted(folder.glob("*.npz")) if folder.is_dir() else []
     return {path.stem: path for path in found if is_name(path.stem)}
 
 
 def template_path(name: str) -> Path:
-    """Returns the file behind a name. Raises UnknownTemplate."""
+    """Returns the file of the named template. Raises UnknownTemplate."""
     found = list_templates().get(name)
     if found is None:
         raise UnknownTemplate(name)
@@ -51,14 +51,14 @@ def template_path(name: str) -> Path:
 
 
 def new_path(name: str) -> Path:
-    """Returns where a template of this name lies, or would. Raises WrongName."""
+    """Returns the path at which a template of this name is stored, whether it exists or not. Raises WrongName."""
     if not is_name(name):
         raise WrongName(name)
     return templates_folder() / f"{name}.npz"
 
 
 def remove_template(name: str) -> Path:
-    """Removes a template and its picture; returns where it was. Raises UnknownTemplate."""
+    """Removes a template and its picture. Returns the path of the removed file. Raises UnknownTemplate."""
     path = template_path(name)
     path.unlink()
     path.with_suffix(".png").unlink(missing_ok=True)

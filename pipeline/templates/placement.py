@@ -35,7 +35,7 @@ UNLIKE_MM = 8.0  # mean distance of the face beyond which a place is none
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Holds a triangle mesh with its unit normals, mm once it is placed."""
+    """Holds a triangle mesh with unit vertex normals, in mm once it is placed."""
 
     vertices: Float[np.ndarray, "t 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -46,7 +46,7 @@ class Surface:
 
 
 def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
-    """Returns the mesh with faces that look outwards: those of a file that has them inside out are turned over."""
+    """Returns the mesh with all its faces turned over if they look inwards."""
     corners = vertices[faces] - vertices[np.unique(faces)].mean(axis=0)
     if np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         faces = faces[:, ::-1]
@@ -54,7 +54,7 @@ def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -
 
 
 def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str) -> Similarity:
-    """Returns head_from_template from landmarks of the mesh. Raises InputError."""
+    """Computes head_from_template from at least four landmarks of the mesh. Raises InputError."""
     names = [each for each in landmarks if each in model.landmarks]
     if len(names) < 4:
         raise InputError(name, [compose("template-landmarks-too-few", count=len(names), names=names or ["none"])])
@@ -66,7 +66,8 @@ def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarra
 
 
 def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
-    """Returns head_from_template by search. Raises InputError where the mesh looks like no head."""
+    """Finds head_from_template by a search over units, axes and closest points. Raises InputError if the mesh does not
+    resemble a head."""
     used = mesh.vertices[np.unique(mesh.faces)]
     extent = float(np.ptp(used, axis=0).max())
     factors = [f for f in UNITS.values() if EXTENT_MM[0] < extent * f < EXTENT_MM[1]]
@@ -96,7 +97,8 @@ def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
 
 
 def _model_points(model: HeadModel, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of the model without its neck, their normals, and their weights: the face counts most, for masks."""
+    """Returns points of the model without its neck, their normals, and their weights: points of the face weigh most,
+    since the mesh may be only a mask."""
     vertices, regions = model.vertices(np.zeros(0)), head_regions(model)
     rows = np.flatnonzero(~regions["neck"])
     rows = rows[:: max(1, len(rows) // count)]
@@ -105,8 +107,7 @@ def _model_points(model: HeadModel, count: int) -> tuple[np.ndarray, np.ndarray,
 
 
 def samples(mesh: Surface) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Returns points of a mesh and its unit normals there: the vertices that faces use, and the middles of the
-    faces."""
+    """Returns points of a mesh and the unit normals there: its used vertices, and the middles of its faces."""
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     normal = mesh.normals[mesh.faces].sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -115,7 +116,7 @@ def samples(mesh: Surface) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, 
 
 
 def _axis_turns() -> list[Float[np.ndarray, "3 3"]]:
-    """The 24 rotations that take axes to axes."""
+    """Returns the 24 rotations that map the coordinate axes onto each other."""
     turns = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix = np.eye(3)[list(order)] * np.array(signs)[:, None]
@@ -127,7 +128,7 @@ def _axis_turns() -> list[Float[np.ndarray, "3 3"]]:
 def _starts(
     model: HeadModel, points: np.ndarray, turned: Similarity, used: Float[np.ndarray, "t 3"]
 ) -> list[Similarity]:
-    """Shifts that bring nose to nose, crown to crown, and middle to middle."""
+    """Returns three poses that bring the mesh's nose, crown or middle to that of the model."""
     here, ours = turned.apply(used), model.vertices(np.zeros(0))
     low, high = here.min(axis=0), here.max(axis=0)
     nose, crown = here[here[:, 2].argmax()], np.array([*(low + high)[[0]] / 2, high[1], (low + high)[2] / 2])
@@ -148,9 +149,9 @@ def _closest_points(
     place: Similarity,
     steps: int,
 ) -> tuple[float, Similarity]:
-    """What the model's points are off the mesh (weighted mean, mm, none more than ``FAR_MM``), and the place found.
-
-    ``tree`` holds the mesh's points times ``factor``, and their normals."""
+    """Refines a pose by iterated closest points. Returns the least weighted mean distance (mm, each at most ``FAR_MM``)
+    of the model's points from the mesh, and the pose. ``tree`` holds the mesh's points times ``factor``, and their
+    normals."""
     start = place.scale
     found = (FAR_MM, place)
     for step in range(steps + 1):

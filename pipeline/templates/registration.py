@@ -46,12 +46,12 @@ LIKE_MM = 2.0  # median distance of the fitted face from the mesh
 
 
 class NotRegistered(InputError):
-    """Reports a mesh that cannot be registered; ``faults`` says why and what to do."""
+    """Reports a mesh that cannot be registered, with the reasons and what to do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Holds a mesh on a model's surface, and how well it lies there."""
+    """Holds a mesh bound to a model's surface, and how well it lies there."""
 
     surface_binding: SurfaceBinding
     place: Similarity  # head_from_template, from the start
@@ -62,7 +62,7 @@ class Registration:
     covered: float  # share of the model's face region that the mesh shows
 
     def figures(self) -> dict[str, float]:
-        """Returns what is printed of it."""
+        """Returns the figures of the registration by name, for printing."""
         return {
             "vertices": float(len(self.surface_binding.rest)),
             "skin_share": len(self.surface_binding.skin) / len(self.surface_binding.rest),
@@ -82,9 +82,11 @@ def register(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     report: Progress,
 ) -> Registration:
-    """Registers a mesh, in any unit and any axis convention or with landmarks in its frame, to a model.
+    """Registers a mesh to a model: places it, fits the model to it, draws the mesh onto that head and binds it. The
+    mesh may have any unit and any axes; ``landmarks`` are in its frame.
 
-    Raises InputError where the mesh is no head, and NotRegistered where it is none that the model can follow."""
+    Raises InputError if the mesh is no head, and NotRegistered if the model cannot follow it.
+    """
     report("placing", 0.0)
     surface = outward(mesh.vertices, mesh.triangles())
     place = place_by_landmarks(model, landmarks, name) if landmarks else find_place(model, surface, name)
@@ -117,7 +119,8 @@ def register(
 
 
 def _check(like: Likeness, name: str, *, marked: bool) -> float:
-    """The share of the face that was met. Raises NotRegistered; who marks a strange head's landmarks may have it."""
+    """Returns the share of the face region's area that the mesh shows. Raises NotRegistered if it shows too little or
+    differs too much; with landmarks an unusual shape is allowed."""
     met, area = np.isfinite(like.distances), np.where(like.in_face, like.areas, 0.0)
     covered = float(area[met].sum() / area.sum())
     faults = []
@@ -134,8 +137,9 @@ def _check(like: Likeness, name: str, *, marked: bool) -> float:
 
 
 def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
-    """Returns vertices at one place made one where the surface ends there, for files tear it along texture seams; and
-    which one each became. Lashes that begin on a lid stay parts of their own: the lid does not end there."""
+    """Joins vertices at the same position where the surface ends, since files cut it along texture seams. Returns the
+    mesh, and the new row of each old vertex. Lashes stay separate parts, since the lid does not end where they begin.
+    """
     ends = np.zeros(len(mesh.vertices), bool)
     ends[boundary_edges(mesh.faces)] = True
     identity = np.where(ends, -1, np.arange(len(ends)))[:, None]
@@ -159,7 +163,8 @@ def _graph(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_array:
 
 
 def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bool[np.ndarray, " p"]:
-    """Returns which parts are skin: those that enough of the head's area meets before anything else of the mesh."""
+    """Tells which connected parts of the mesh are skin: those that enough of the head's area meets before any other
+    part."""
     rows = slice(None, None, max(1, len(head.vertices) // 6000))
     hits = SurfaceIndex(mesh.vertices, mesh.faces).closest(head.vertices[rows], CANDIDATES, facing=head.normals[rows])
     part = parts[mesh.faces[hits.triangles, 0]]
@@ -169,8 +174,8 @@ def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bo
 
 
 def balls(mesh: Surface, parts: Int[np.ndarray, " t"], among: Bool[np.ndarray, " p"]) -> Int[np.ndarray, " t"]:
-    """Returns a number for every vertex of a closed, round part of those ``among`` which are looked at; -1 for all
-    others."""
+    """Returns, for each vertex, the number of the closed, round part that it belongs to, considering only the parts
+    ``among``; -1 for all other vertices."""
     closed = among.copy()
     closed[parts[boundary_edges(mesh.faces).ravel()]] = False
     closed[parts[~_used(mesh)]] = False
@@ -199,8 +204,8 @@ def parting(
     faces: Int[np.ndarray, "f 3"],
     model: HeadModel,
 ) -> Bool[np.ndarray, " t"]:
-    """Returns vertices that leave their neighbours on some head: they were attached to another sheet of the surface,
-    the inside of a lid or the eyeball, than these."""
+    """Tells which vertices move away from their neighbours on some random head, because they were attached to another
+    layer of the surface: the inside of a lid, or the eyeball."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
     graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]
@@ -213,8 +218,8 @@ def parting(
 
 
 def without_edge(skin: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " t"]:
-    """Returns the skin less its vertices next to what lies deeper: where a lid turns inwards it is a matter of chance
-    which vertex still meets the model's, and all of them follow more evenly."""
+    """Returns the skin without its vertices next to deeper parts. Where a lid turns inwards it is chance which vertices
+    still meet the model's lid; without them all follow evenly."""
     out = skin.copy()
     for _ in range(EDGE_RINGS):
         out[faces[~out[faces].all(axis=1)]] = False
@@ -232,7 +237,8 @@ def without_specks(mask: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) 
 def _drawn(
     mesh: Surface, skin: Bool[np.ndarray, " t"], head: Surface, marks: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> Float[np.ndarray, "t 3"]:
-    """The mesh with its skin drawn onto the head, and its landmarks onto the head's; other parts stay."""
+    """Returns the mesh's vertices with the skin drawn onto the head, and its landmarks onto the head's; other parts
+    stay."""
     rows = np.flatnonzero(skin)
     place = np.full(len(skin), -1)
     place[rows] = np.arange(len(rows))
@@ -251,7 +257,7 @@ def _drawn(
 def _followed(
     before: Float[np.ndarray, "t 3"], after: Float[np.ndarray, "t 3"], skin: Bool[np.ndarray, " t"]
 ) -> Float[np.ndarray, "t 3"]:
-    """``after`` on the skin, and everything else moved from ``before`` as the skin about it was."""
+    """Returns ``after`` for the skin; all other vertices move from ``before`` smoothly with the skin around them."""
     rows = np.flatnonzero(skin)
     rows = rows[spread_nodes(before[rows], min(400, len(rows)))]
     out = after.copy()

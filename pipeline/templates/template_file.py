@@ -86,7 +86,8 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray]) -> Template:
 
 
 def _check(path: Path, template: Template) -> None:
-    """Rows that lie outside what they index would fail a job at its end."""
+    """Raises BadTemplate if rows or numbers of the file are invalid, which would otherwise fail a job only at its
+    end."""
     mesh, surface_binding = template.mesh, template.surface_binding
     count = len(surface_binding.rest)
     rows = (mesh.corners, surface_binding.skin, surface_binding.anchors, surface_binding.whole_anchors)

@@ -38,8 +38,8 @@ NOT_THIS_MM = 5.0  # RMS over the face after the best fit: beyond any fault of a
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds a round of the search: iterations of closest points, with so many points of the head; the best starts are
-    kept."""
+    """Holds one round of the search: how many points of the head and iterations of closest points it uses, and how many
+    of the best starts it keeps."""
 
     points: int
     iterations: int
@@ -52,8 +52,9 @@ ROUNDS = (Round(50, 6, 0.7, 60), Round(100, 12, 0.7, 16), Round(240, 25, 0.6, 8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BestFit:
-    """Holds the fit. ``start``: landmarks or search. ``scale``: the measured head's size by the reference's, 1 = right.
-    ``rms_mm``: distance of the fitted points after the rigid motion; ``points`` of them had a counterpart."""
+    """Holds the rigid motion that lays a head on its reference. ``start``: landmarks or search. ``scale``: size of the
+    measured head relative to the reference, 1 = right. ``rms_mm``: RMS distance after the rigid motion; ``points`` of
+    the fitted points had a counterpart."""
 
     reference_from_world: RigidTransform
     start: str
@@ -63,7 +64,8 @@ class BestFit:
 
 
 def best_fit(measured: Measured, reference: Reference) -> BestFit:
-    """Lays the face of a measured head on the reference. Raises InputError where that is no scan of this head."""
+    """Finds the rigid motion that lays the face of a measured head on the reference. Raises InputError if the reference
+    is no scan of this head."""
     face = measured.regions["face"]
     rng = np.random.default_rng(0)
     count = min(POINTS, int(face.sum()))
@@ -88,7 +90,7 @@ def best_fit(measured: Measured, reference: Reference) -> BestFit:
 
 
 def counted(hits: Hits, reference: Reference) -> Bool[np.ndarray, " n"]:
-    """Returns which closest points are counterparts: near, and not at the rim of the scan."""
+    """Tells which closest points are valid counterparts: near, and not at the rim of the scan."""
     return (hits.distances < FAR_MM) & ~reference.beside(hits)
 
 
@@ -100,7 +102,8 @@ def _refined(
     *,
     free_scale: bool,
 ) -> tuple[Similarity, float, int]:
-    """Gauss-Newton; far points are forgiven at first (Geman and McClure), and weigh as others do in the end.
+    """Refines a motion by Gauss-Newton. Returns the motion, the RMS distance (mm) and the number of points with a
+    counterpart. Far points weigh less at first (Geman and McClure), and the same as others in the end.
 
     The RMS counts a point that is far from the scan as ``FAR_MM`` off, so that a fit to a corner of it is no good one.
     """
@@ -133,7 +136,8 @@ def _gauss_newton_step(
     points: Float[np.ndarray, "n 3"], hits: Hits, used: Bool[np.ndarray, " m"], weights: Float[np.ndarray, " n"],
     free_scale: bool,
 ) -> Float[np.ndarray, " p"]:  # fmt: skip
-    """Turn about the points' middle, shift, and log scale where that is free."""
+    """Returns the rotation about the points' middle, the translation (mm) and, if ``free_scale``, the logarithm of the
+    scale."""
     normals = hits.normals[used]
     arms = points - points.mean(axis=0)
     columns = [np.cross(arms, normals), normals]
@@ -146,7 +150,8 @@ def _gauss_newton_step(
 
 
 def _searched(measured: Measured, reference: Reference, rng: np.random.Generator) -> list[Similarity]:
-    """The best starts from all turns: many looked at shortly with few points, fewer longer with more."""
+    """Returns the best starting motions among all rotations: many are tried briefly with few points, fewer of them
+    longer with more."""
     head = np.flatnonzero(~measured.regions["neck"])
     chosen = head[_drawn(measured.areas[head], ROUNDS[-1].points, rng)]
     vertices = measured.mesh_world.vertices
@@ -178,8 +183,8 @@ def _closest_points(
     translations: Float[np.ndarray, "k 3"],
     stage: Round,
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3 3"], Float[np.ndarray, "k 3"]]:
-    """Trimmed iterations of points closest in place and direction, all starts at once; the mean distance (mm) of
-    those that count, and the motions."""
+    """Runs trimmed iterations of points closest in position and direction, for all starts at once. Returns the mean
+    distance of the points that count, and the motions."""
     kept, means = int(stage.share * len(points)), np.full(len(rotations), np.inf)
     for _ in range(stage.iterations):
         there = np.einsum("kij,nj->kni", rotations, points) + translations[:, None]
@@ -198,7 +203,7 @@ def _closest_points(
 def _surface_points(
     reference: Reference, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Points spread over the reference by area, and their normals: middles of triangles."""
+    """Returns points drawn over the reference by area (middles of triangles), and their normals."""
     corners = reference.index.corners
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     chosen = _drawn(area, SURFACE_POINTS, rng)

@@ -41,7 +41,7 @@ NOTES = (
 
 
 class _Page(FPDF):
-    """A4 with our margins and fonts; text is Latin-1, other characters become a question mark."""
+    """Draws A4 pages with the certificate's margins and fonts; characters outside Latin-1 become question marks."""
 
     def __init__(self) -> None:
         super().__init__(unit="mm", format="A4")
@@ -69,7 +69,7 @@ class _Page(FPDF):
 
 
 def certificate_pdf(report: VerificationReport, judgement: Judgement, pictures: Pictures) -> bytes:
-    """Returns the two pages. The same report and pictures give the same bytes on the same day of the report."""
+    """Returns the certificate as a PDF of two pages. The same report and pictures give the same bytes."""
     pdf = _Page()
     pdf.set_creation_date(datetime.fromisoformat(report["date"]).replace(tzinfo=UTC))
     pdf.set_title("eigenhead: verification of a studio")
@@ -139,7 +139,7 @@ def _captures_table(pdf: _Page, report: VerificationReport) -> None:
 
 
 def _distances_table(pdf: _Page, report: VerificationReport) -> None:
-    """Mean over the captures; as many as the page has room for."""
+    """Draws the table of landmark distances, mean of all captures, with as many rows as fit on the page."""
     captures = list(report["captures"].values())
     names = list(captures[0]["distances"])
     if not names:
@@ -186,5 +186,6 @@ def _encoded(image: Resized) -> bytes:
 
 
 def latin(text: str) -> str:
-    """Keeps the characters that the PDF's own fonts know: Latin-1 alone."""
+    """Returns the text with every character outside Latin-1, which the PDF's fonts lack, replaced by a question
+    mark."""
     return text.encode("latin-1", "replace").decode("latin-1")

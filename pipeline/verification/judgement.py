@@ -35,7 +35,8 @@ MIN_FACING = 0.5  # share of the judged face where both surfaces face the same w
 
 @dataclass(frozen=True, slots=True)
 class RegionError:
-    """Deviations (mm) of a region, by area; ``covered`` is the share of it that the reference tells of."""
+    """Holds the deviations (mm) of a region, weighted by area; ``covered`` is the share of its area that the reference
+    shows."""
 
     covered: float
     mean_mm: float
@@ -46,7 +47,8 @@ class RegionError:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Holds one capture. ``deviation_mm`` is NaN where nothing can be said."""
+    """Holds the judgement of one capture. ``deviation_mm`` is NaN at vertices without a counterpart on the
+    reference."""
 
     name: str
     fit: BestFit
@@ -68,8 +70,8 @@ class Judged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judgement:
-    """Holds all captures together. ``repeatability`` has the regions' figures of ``Scatter``, empty for one capture;
-    ``repeated`` the errors of the mean deviation over the captures."""
+    """Holds the judgement of all captures together. ``repeatability`` has the figures of ``Scatter`` by region, empty
+    for one capture; ``repeated`` the errors of the mean deviation over the captures."""
 
     captures: tuple[Judged, ...]
     repeated_mm: Float[np.ndarray, " v"]
@@ -79,12 +81,13 @@ class Judgement:
 
     @property
     def passed(self) -> bool:
-        """Tells whether no limit is missed. What could not be judged (landmarks, one capture alone) is no failure."""
+        """Tells whether no limit is missed. Figures that could not be judged (no landmarks, a single capture) count as
+        no failure."""
         return all(check.passed is not False for check in self.checks)
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one model against the reference. Raises InputError where the reference is not of this head."""
+    """Judges heads of one model against the reference. Raises InputError if the reference is not of this head."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])
@@ -103,7 +106,7 @@ def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) ->
 
 
 def judge_one(measured: Measured, reference: Reference) -> Judged:
-    """Judges one head against the reference. Raises InputError where the reference is not of this head, or inside
+    """Judges one head against the reference. Raises InputError if the reference is not of this head, or is inside
     out."""
     fit = best_fit(measured, reference)
     there = fit.reference_from_world.apply(measured.mesh_world.vertices)
@@ -121,7 +124,7 @@ def judge_one(measured: Measured, reference: Reference) -> Judged:
 
 
 def region_errors(deviation_mm: Float[np.ndarray, " v"], measured: Measured) -> dict[str, RegionError]:
-    """Returns errors of every region of which the reference covers enough."""
+    """Returns the errors of every region of which the reference covers at least ``MIN_COVERED``."""
     found = {}
     known = np.isfinite(deviation_mm)
     for name in REGIONS:
@@ -144,7 +147,8 @@ def _region_error(deviation_mm: Float[np.ndarray, " n"], areas: Float[np.ndarray
 
 
 def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], share: float) -> float:
-    """Returns the range from the lowest to the highest value once the tails' weight is cut off, half on each side."""
+    """Returns the range of the values that holds the given share of the weight, with the rest cut off half on each
+    side."""
     low, high = weighted_quantiles(values, weights, (0.5 - share / 2, 0.5 + share / 2))
     return high - low
 
@@ -158,7 +162,8 @@ def weighted_quantiles(
 
 
 def distance_pairs(measured: Measured, reference: Reference) -> dict[str, tuple[float, float]]:
-    """Returns the anthropometric distances whose two landmarks both have: measured, and of the reference (mm)."""
+    """Returns every anthropometric distance whose landmarks both the head and the reference have: measured, and of the
+    reference (mm)."""
     found = {}
     for name, (one, other) in DISTANCES.items():
         if all(mark in marks for mark in (one, other) for marks in (measured.landmarks, reference.landmarks)):
@@ -170,7 +175,7 @@ def distance_pairs(measured: Measured, reference: Reference) -> dict[str, tuple[
 
 
 def _values(captures: Sequence[Judged], repeatability: Mapping[str, Mapping[str, float]]) -> dict[str, float | None]:
-    """The worst capture's figures, by the names of the limits."""
+    """Returns the figures of the worst capture, by the names of the limits."""
     faces = [one.regions.get("face") for one in captures]
     features = [one.regions[name].rms_mm for one in captures for name in FEATURES if name in one.regions]
     distances = [rms for one in captures if (rms := one.distance_rms_mm) is not None]

@@ -14,7 +14,7 @@ from pipeline.settings import read_table
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Holds the most that each figure of a verification may be; ``least_covered`` is the least."""
+    """Holds the limit of each figure of a verification: the most it may be, but for ``least_covered`` the least."""
 
     face_rms_mm: float = 0.35  # deviation from the reference, of any capture
     features_rms_mm: float = 0.8  # the same of eyes, nose and mouth, the worst of them
@@ -27,7 +27,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Holds a figure beside its limit; ``value`` None: the captures or the reference do not carry it."""
+    """Holds a figure beside its limit; ``value`` is None if the captures or the reference do not provide it."""
 
     name: str
     value: float | None
@@ -36,12 +36,12 @@ class Check:
 
 
 def limits_from_document(document: Mapping[str, Any], subject: str = "limits") -> Limits:
-    """Returns limits from decoded JSON or TOML. Raises InputError naming every unknown key and every wrong value."""
+    """Returns the limits from decoded JSON or TOML. Raises InputError that names every unknown key and wrong value."""
     return read_table(Limits, document, subject)
 
 
 def checks(limits: Limits, values: Mapping[str, float | None]) -> tuple[Check, ...]:
-    """Returns every limit with its verdict; ``values`` by the limits' names."""
+    """Returns a check for every limit; ``values`` are the figures by the limits' names."""
     found = []
     for field in fields(limits):
         limit, value = getattr(limits, field.name), values[field.name]

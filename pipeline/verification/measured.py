@@ -20,7 +20,7 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Holds one reconstructed head. ``stated_mm`` is the standard deviation that it states along its normals."""
+    """Holds one reconstructed head. ``stated_mm``: the standard deviation along the normals that its result states."""
 
     name: str
     mesh_world: Mesh
@@ -34,7 +34,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class ResultIdentity:
-    """Holds which model made a result; what it is called there and the digest of its file."""
+    """Holds the name of the model that made a result, and the digest of the model's file."""
 
     model: str
     sha256: str
@@ -45,7 +45,7 @@ def is_result(folder: Path) -> bool:
 
 
 def identity_of(folder: Path) -> ResultIdentity:
-    """Raises InputError where report.json is none."""
+    """Returns which model made a result. Raises InputError if report.json does not say it."""
     try:
         model = _report(folder)["model"]
         return ResultIdentity(str(model["name"]), str(model["sha256"]))
@@ -54,7 +54,7 @@ def identity_of(folder: Path) -> ResultIdentity:
 
 
 def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
-    """Returns a result folder made with ``model``. Raises InputError naming what does not fit."""
+    """Reads a result folder that was made with ``model``. Raises InputError that names what does not fit."""
     report = _report(folder)
     mesh, stated_mm = read_head_ply(folder / "head.ply")
     full = model.levels["full"]
@@ -81,7 +81,7 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
 
 
 def _report(folder: Path) -> ReportDocument:
-    """Decoded only: what is missing shows where it is read."""
+    """Returns the decoded report.json of a result; its contents are not checked. Raises InputError."""
     try:
         return json.loads((folder / "report.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -27,7 +27,7 @@ SHOWN = 0.95  # share of the face that lies within the ends of the scale
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pictures:
-    """Holds rows of views from ``AZIMUTHS_DEG``; ``end_mm`` is what the ends of the error's scale mean."""
+    """Holds rows of pictures from ``AZIMUTHS_DEG``; ``end_mm`` is the error (mm) at the ends of the colour scale."""
 
     reference: tuple[Resized, ...]
     result: tuple[Resized, ...]
@@ -36,8 +36,8 @@ class Pictures:
 
 
 def draw(first: Measured, reference: Reference, judgement: Judgement) -> Pictures:
-    """Draws all pictures. ``first``: the capture of ``judgement``'s first entry; the error is what all captures have in
-    common."""
+    """Draws all pictures. ``first``: the head of the first capture in ``judgement``; the error drawn on it is the one
+    that all captures have in common."""
     head = first.head_from_world.apply(first.mesh_world.vertices)
     fitted = Mesh(head, first.mesh_world.faces)
     head_from_reference = first.head_from_world @ judgement.captures[0].fit.reference_from_world.inverse()
@@ -53,14 +53,15 @@ def draw(first: Measured, reference: Reference, judgement: Judgement) -> Picture
 
 
 def scale_end(deviation_mm: Float[np.ndarray, " n"]) -> float:
-    """Returns the least of ``STEPS_MM`` that holds most of the deviations."""
+    """Returns the smallest of ``STEPS_MM`` that is larger than most of the deviations."""
     known = np.abs(deviation_mm[np.isfinite(deviation_mm)])
     wanted = float(np.quantile(known, SHOWN)) if len(known) else 0.0
     return next((step for step in STEPS_MM if step >= wanted), STEPS_MM[-1])
 
 
 def heat_colours(deviation_mm: Float[np.ndarray, " v"], end_mm: float) -> UInt8[np.ndarray, "v 3"]:
-    """Returns blue where the result lies inside the reference, red where outside, white where they agree."""
+    """Returns a colour for each deviation: blue where the result lies inside the reference, red where outside, white
+    where they agree."""
     place = np.clip(np.nan_to_num(deviation_mm) / end_mm, -1.0, 1.0)
     stops = np.linspace(-1.0, 1.0, len(RAMP))
     colours = np.stack([np.interp(place, stops, RAMP[:, channel]) for channel in range(3)], axis=1)
@@ -69,6 +70,6 @@ def heat_colours(deviation_mm: Float[np.ndarray, " v"], end_mm: float) -> UInt8[
 
 
 def legend(width: int = 600, height: int = 24) -> Resized:
-    """Returns the scale from ``-end_mm`` to ``end_mm``, left to right."""
+    """Draws the colour scale from ``-end_mm`` to ``end_mm``, left to right."""
     bar = heat_colours(np.linspace(-1.0, 1.0, width), 1.0)[None]
     return np.asarray(cv2.resize(bar, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)

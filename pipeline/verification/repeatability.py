@@ -21,8 +21,9 @@ STILL_MM = 1e-7  # a mean that moves by less is the mean
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """Holds the standard deviations (mm) over the shots of every vertex about the mean head, which has the first head's
-    place: ``position_mm`` in all three directions together, ``normal_mm`` along the mean head's normal."""
+    """Holds how each vertex scatters over several shots of one subject, as standard deviations (mm) about the mean
+    head, which lies where the first head does: ``position_mm`` over all three directions together, ``normal_mm`` along
+    the mean head's normal."""
 
     mean: Float[np.ndarray, "v 3"]
     position_mm: Float[np.ndarray, " v"]
@@ -55,8 +56,8 @@ class Scatter:
 def scatter(
     heads: Float[np.ndarray, "n v 3"], faces: Int[np.ndarray, "f 3"], laid_on: Bool[np.ndarray, " v"]
 ) -> Scatter:
-    """Returns scatter of two or more heads (mm, any frames) with the same vertices, laid on each other over
-    ``laid_on``."""
+    """Computes the scatter of two or more heads (mm, any frames) with the same vertices, after laying them on each
+    other over the vertices ``laid_on``."""
     if len(heads) < 2:
         raise ValueError(f"{len(heads)} heads have no scatter; two are needed")
     mean = heads[0]

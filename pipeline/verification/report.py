@@ -16,7 +16,7 @@ FORMAT = "eigenhead-verification/1"
 
 
 class RegionReport(TypedDict):
-    """In mm; ``covered`` is the share that the reference tells of."""
+    """Holds the errors of a region (mm); ``covered`` is the share of its area that the reference shows."""
 
     covered: float
     mean_mm: float
@@ -26,7 +26,7 @@ class RegionReport(TypedDict):
 
 
 class AlignmentReport(TypedDict):
-    """``x_reference = rotation @ x_world + translation``."""
+    """Holds the motion ``x_reference = rotation @ x_world + translation``, and how it was found."""
 
     method: str
     start: str
@@ -55,7 +55,7 @@ class CaptureReport(TypedDict):
 
 
 class CheckReport(TypedDict):
-    """``passed`` is null where the captures or the reference do not carry the figure."""
+    """Holds a figure and its limit; ``passed`` is null if the captures or the reference do not provide the figure."""
 
     value: float | None
     limit: float

@@ -50,10 +50,11 @@ MIN_CAMERAS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
-    """Holds who has whose picture. ``pictures``: for every camera that holds another's picture, the name under which
-    its own is filed.
+    """Holds which cameras hold each other's pictures. ``pictures``: for every camera that holds another's picture, the
+    name under which its own is filed.
 
-    ``gain`` is how many tangent planes agree that did not before, ``overwhelming`` whether that leaves no doubt.
+    ``gain`` is how much less misfit the tangent planes have after the exchange; ``overwhelming`` whether that leaves no
+    doubt.
     """
 
     pictures: Mapping[str, str]
@@ -61,7 +62,7 @@ class Assignment:
     overwhelming: bool = False
 
     def messages(self) -> list[Message]:
-        """Returns a sentence for every ring of the exchange."""
+        """Returns one message for each ring of cameras that exchanged pictures."""
         return ring_messages(self.pictures, compose("what-pictures"))
 
     def __str__(self) -> str:
@@ -72,8 +73,8 @@ NOTHING = Assignment({})
 
 
 def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignment:
-    """Returns the permutation of pictures among cameras of one size that the tangent planes ask for; none in a good
-    capture.
+    """Finds the exchange of pictures among cameras of one image size that makes the tangent planes of the silhouettes
+    agree.
 
     Args:
         silhouettes: by camera; views without a mask are left out of the question.
@@ -93,8 +94,8 @@ def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignme
 
 
 def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, float]:
-    """Tells how much each camera's picture contradicts the others where it is filed: 0.2 for its own, 0.5 and more for
-    another's (mean robust misfit of its tangent planes)."""
+    """Returns, for each camera, how much its picture contradicts the others (mean robust misfit of its tangent planes):
+    about 0.2 for the right picture, 0.5 and more for another camera's."""
     seen = with_masks(silhouettes, rig)
     if len(seen) < MIN_CAMERAS:
         return dict.fromkeys(seen.names, CUT_OFF_MISFIT)
@@ -117,7 +118,7 @@ def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
 
 
 def ring_messages(pictures: Mapping[str, str], what: Message) -> list[Message]:
-    """Returns a sentence for every ring of an exchange."""
+    """Returns one message for each ring of an exchange."""
     return [_ring_message(ring, what) for ring in rings(pictures)]
 
 
@@ -133,19 +134,20 @@ def _ring_message(ring: tuple[str, ...], what: Message) -> Message:
 
 
 def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
-    """Returns the cameras whose mask is more than a few pixels of anything."""
+    """Returns the cameras whose mask is thicker than a few pixels somewhere."""
     return rig.subset(
         name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
     )
 
 
 def _any_suspect(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> bool:
-    """Whether any camera's planes contradict the others more than good masks do."""
+    """Tells whether the planes of any camera contradict the others more than good masks do."""
     return bool((mean_misfit(tangency_errors_px(hulls, rig)) > SUSPECT_MISFIT).any())
 
 
 def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
-    """Misses (px of both images together) while every camera holds the picture that is filed under it."""
+    """Returns how far (px of both images together) the tangent planes of every two cameras miss each other, with all
+    pictures as filed."""
     cameras = list(rig)
     touches = [_touches(camera, hulls[i : i + 1], i, cameras) for i, camera in enumerate(cameras)]
     angle, step = (np.stack([touch[k][0] for touch in touches]) for k in range(2))
@@ -153,13 +155,14 @@ def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> F
 
 
 def _miss_px(gap: Float[np.ndarray, "*n"], step: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Angles by angles a pixel; NaN where a plane has no direction, as in two cameras at one place."""
+    """Converts gaps in angle to pixels: divides by the change of angle per pixel. NaN if that is undefined, as for two
+    cameras at one place."""
     return np.divide(gap, step, out=np.full(gap.shape, np.nan), where=step > MIN_SLOPE)
 
 
 def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
-    """Returns the robust misfit of each camera, the mean of its planes; of those that the border hides ``cut_off``, or
-    nothing."""
+    """Returns the mean robust misfit of each camera's tangent planes. Planes hidden by the image border count as
+    ``cut_off`` or, if None, not at all."""
     there = np.isfinite(errors_px)
     of_each = np.where(there, _robust(errors_px, ROBUST_SIGMAS * _noise_px(errors_px[there])), cut_off or 0.0)
     count = there.sum(axis=(1, 2)) if cut_off is None else 2 * (len(errors_px) - 1)
@@ -167,7 +170,8 @@ def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = N
 
 
 def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Assignment:
-    """The permutation as an answer: none where it leaves a camera that it moves in contradiction."""
+    """Returns the permutation ``held`` as an assignment; an empty one if it gains too little or a moved picture still
+    contradicts the others."""
     identity = np.arange(len(rig))
     displaced = np.flatnonzero(held != identity)
     if not len(displaced):
@@ -182,20 +186,22 @@ def _judged(held: Int[np.ndarray, " n"], misfit: Float32[np.ndarray, "n n n n"],
 
 
 def _noise_px(errors_px: Float[np.ndarray, " n"]) -> float:
-    """Standard deviation (px) of a plane's miss by the best quarter: half of them may be of exchanged pictures."""
+    """Estimates the standard deviation (px) of a plane's miss from the best quarter, since half of the planes may
+    belong to exchanged pictures."""
     quarter = float(np.quantile(np.abs(errors_px), 0.25)) if len(errors_px) else 0.0
     return float(np.clip(quarter / 0.3186, MIN_NOISE_PX, MAX_NOISE_PX))
 
 
 def _robust(miss_px: np.ndarray, scale_px: float) -> np.ndarray:
-    """Misfit of each plane, 0 to 1 (Geman and McClure)."""
+    """Returns the misfit of each plane, 0 to 1 (Geman and McClure)."""
     return miss_px**2 / (miss_px**2 + scale_px**2)
 
 
 def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float32[np.ndarray, "n n n n"]:
-    """Robust misfit of the two outer planes of cameras i and j, were camera i to hold picture a and camera j picture b.
+    """Returns the robust misfit of the two outer planes of cameras i and j if camera i held picture a and camera j
+    picture b, for all i, a, j, b.
 
-    Of a picture of another size than the camera nothing is said.
+    A picture whose size is not the camera's counts as cut off.
     """
     cameras, count = list(rig), len(rig)
     angle, step = np.full((2, count, count, count, 2), np.nan)  # camera i, picture a, the other camera j; top, bottom
@@ -215,8 +221,9 @@ def _misfit_tensor(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float
 def _touches(
     camera: Camera, hulls: Sequence[Float[np.ndarray, "_ 2"]], index: int, cameras: Sequence[Camera]
 ) -> tuple[Float[np.ndarray, "h n 2"], Float[np.ndarray, "h n 2"]]:
-    """Angles (rad) of the outermost planes through this camera and each other one that touch each of the silhouettes,
-    were it this camera's, and the change of angle a pixel. NaN where the border cuts the tangent off."""
+    """Returns, for each silhouette as if it were this camera's, the angles (rad) of the two outermost planes through
+    this and each other camera that touch it, and the change of angle per pixel. NaN where the image border cuts the
+    tangent off."""
     pixels, ends = np.concatenate(hulls), np.cumsum([0, *map(len, hulls)])
     rays = camera.rays_world(pixels)
     k = camera.intrinsics
@@ -240,7 +247,7 @@ def _touches(
 
 
 def _pencil(cameras: Sequence[Camera], i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """``epipolar_plane_axes`` of two cameras from where both look; the same for (i, j) and (j, i)."""
+    """Returns the ``epipolar_plane_axes`` of two cameras, the same for (i, j) and (j, i)."""
     one, two = cameras[min(i, j)], cameras[max(i, j)]
     return epipolar_plane_axes(one, two, one.axis_world + two.axis_world)
 
@@ -250,9 +257,8 @@ def _size(camera: Camera) -> tuple[int, int]:
 
 
 def _least_misfit(misfit: Float32[np.ndarray, "n n n n"], rig: Rig) -> Int[np.ndarray, " n"]:
-    """The permutation of least misfit, by exchanges of two from the identity: whatever ring an exchange is, each step
-    of it puts one picture right. Where all names are off by the same number, no single step helps, so that those
-    permutations are starts of their own."""
+    """Finds the permutation of least misfit by exchanging two pictures at a time, from the pictures as filed. If all
+    names are off by the same number no single exchange helps, so the search also starts from those permutations."""
     count = len(rig)
     sizes = [_size(camera) for camera in rig]
     allowed = np.array([[one == two for two in sizes] for one in sizes])
@@ -285,7 +291,7 @@ def _descended(
 
 
 def _rows(misfit: Float32[np.ndarray, "n n n n"], held: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-    """Misfit of camera i under each picture a, all others holding what they hold."""
+    """Returns the misfit of camera i with each picture a, while all other cameras hold the pictures ``held``."""
     every = np.arange(len(held))
     return misfit[:, :, every, held].sum(axis=2, dtype=float)
 

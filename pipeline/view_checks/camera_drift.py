@@ -47,9 +47,9 @@ CHANCE = 0.01  # that a good camera disagrees so much with the rest (F test)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """Holds a camera whose image does not stand where its calibration says: its shift (px) and standard deviation, the
-    turn that explains it, and how many standard deviations that is, all as if the mask were tight. ``moved``: a loose
-    mask cannot explain it, and the other cameras agree better without this one."""
+    """Holds a camera whose silhouette lies off where the calibration predicts: the shift (px) and its standard
+    deviation, the turn (degrees) that would explain it, and the shift in standard deviations, all assuming a tight
+    mask. ``moved``: a loose mask cannot explain the shift, and the other cameras agree better without this camera."""
 
     camera: str
     shift_px: Float[np.ndarray, " 2"]
@@ -60,11 +60,11 @@ class Drift:
 
     @property
     def code(self) -> str:
-        """Returns that of the warning that says it."""
+        """Returns the code of the warning for this camera."""
         return "camera-moved" if self.moved else "mask-loose"
 
     def warning(self) -> Message:
-        """Returns what a report says of it."""
+        """Returns the warning for the report."""
         shift_px = float(np.linalg.norm(self.shift_px))
         if not self.moved:
             return compose("mask-loose", camera=self.camera, shift_px=shift_px, turn_deg=self.turn_deg)
@@ -78,10 +78,10 @@ class Drift:
 
 
 def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, ...]:
-    """Returns cameras that no longer stand where their calibration says, or seem so by a loose mask, the farthest moved
+    """Finds cameras that have moved since the calibration, or seem to because of a loose mask; the largest shift comes
     first.
 
-    One after the other: what the worst camera does to its neighbours' equations goes with it.
+    The worst camera is removed before the next one is searched, since it disturbs the equations of its neighbours.
     """
     usable = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
     tangencies = find_tangencies(silhouettes, usable, INSET_MM)
@@ -99,7 +99,8 @@ def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, 
 
 
 def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | None:
-    """The shift that the camera's own equations agree on, if there is one worth an alarm."""
+    """Returns the shift that the camera's tangencies agree on; None if there are too few of them or the shift is not
+    significant."""
     rest = _normalised([t for t in tangencies if name not in t.cameras])
     scale = max(1.0, 1.4826 * float(np.median(np.abs(rest)))) if len(rest) else 1.0
     equations = ShiftEquations.of(name, tangencies, scale * NOISE_FLOOR_PX)
@@ -116,7 +117,7 @@ def _judge(name: str, tangencies: list[Tangency], camera: Camera) -> Drift | Non
 
 
 def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
-    """Misses of planes, in standard deviations of two contours that are good to the noise floor."""
+    """Returns the miss of each tangency in standard deviations, for contours with an error of ``NOISE_FLOOR_PX``."""
     excess = np.array([t.excess_px[0] for t in tangencies])
     slopes = np.array([t.steepness for t in tangencies]).reshape(-1, 2)
     return excess * slopes[:, 0] / (NOISE_FLOOR_PX * np.hypot(slopes[:, 0], slopes[:, 1]))
@@ -124,9 +125,9 @@ def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftEquations:
-    """Holds ``normal . shift + outward * loose = excess`` of one camera's tangencies, in its own pixels; ``pixels`` is
-    what an error of a pixel in both pictures amounts to, the other's in proportion of the pixels that a plane's turn
-    passes in each, ``noise_px`` what contours are good to."""
+    """Holds the equations ``normal . shift + outward * loose = excess`` of one camera's tangencies, in its pixels.
+    ``pixels`` is the error of each equation for an error of one pixel in both pictures; ``contour_noise_px`` is the
+    error of the contours."""
 
     normals: Float[np.ndarray, "n 2"]
     outward: Float[np.ndarray, " n"]
@@ -151,13 +152,15 @@ class ShiftEquations:
         )
 
     def missed(self, shift_px: Float[np.ndarray, " 2"], loose_px: float) -> Float[np.ndarray, " n"]:
-        """Returns what shift and looseness leave, in standard deviations."""
+        """Returns the residual of each equation, in standard deviations, for a shift (px) and a looseness of the mask
+        (px)."""
         return (self.normals @ shift_px + self.outward * loose_px - self.excess_px) / self.noise_px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftTerm:
-    """Holds ``(normal . shift - excess) / noise`` of one camera's tangencies, with Geman and McClure's loss."""
+    """Computes the residuals ``(normal . shift - excess) / noise`` of one camera's tangencies, with Geman and McClure's
+    loss."""
 
     equations: ShiftEquations
 
@@ -169,7 +172,7 @@ class ShiftTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shift:
-    """A shift (px), and how sure it is if masks are tight."""
+    """Holds a shift (px) with its standard deviation (px) and its size in standard deviations, for a tight mask."""
 
     shift_px: Float[np.ndarray, " 2"]
     deviation_px: float
@@ -177,8 +180,8 @@ class _Shift:
 
 
 def _robust_shift(equations: ShiftEquations) -> _Shift:
-    """The shift of least robust misfit, from the best of those that pairs of equations propose. Where the equations
-    are all of one direction, the shift stays zero across it."""
+    """Finds the shift of least robust misfit, starting from the best of those that pairs of equations propose. If all
+    equations have one direction, the shift across it stays zero."""
     pairs = np.stack(np.triu_indices(len(equations.excess_px), 1), axis=1)
     pairs = pairs[np.abs(np.linalg.det(equations.normals[pairs])) > MIN_INDEPENDENT]
     met = np.linalg.solve(equations.normals[pairs], equations.excess_px[pairs][:, :, None])[:, :, 0]
@@ -194,8 +197,8 @@ def _robust_shift(equations: ShiftEquations) -> _Shift:
 
 
 def _beyond_loose_masks(equations: ShiftEquations, found: _Shift) -> float:
-    """By how many standard deviations the shift explains the planes better than masks that are loose do: the root of
-    the difference of their costs, 0 where loose masks do as well. Each equation proposes a looseness."""
+    """Returns by how many standard deviations the shift explains the tangencies better than a loose mask does: the root
+    of the difference in cost, 0 if the loose mask does as well."""
     deviation_px = LOOSE_PX * float(np.median(equations.pixels))
     proposed = np.append(equations.outward * equations.excess_px, 0.0)
     loose = min(
@@ -209,19 +212,20 @@ def _cost(equations: ShiftEquations, shift_px: Float[np.ndarray, " 2"], loose_px
 
 
 def _explains(before: Float[np.ndarray, " n"], after: Float[np.ndarray, " n"]) -> bool:
-    """Whether the shift takes enough of the misfits away, and not of a single one alone: a bad stretch of one outline
-    is met by one tangent plane, a moved camera by all of its own."""
+    """Tells whether the shift removes enough of the misfit, also without the equation that it improves most: a bad
+    stretch of outline affects one tangent plane, a moved camera all of its planes."""
     others = np.arange(len(before)) != np.argmax(before - after)
     return all(after[k].sum() <= (1.0 - MIN_GAIN) * before[k].sum() for k in (slice(None), others))
 
 
 def _disagrees(misfits: Float[np.ndarray, " n"], rest: Float[np.ndarray, " m"]) -> bool:
-    """Whether planes agree better without a camera's own than chance allows (F test of the mean misfits)."""
+    """Tells whether the planes of the other cameras agree better among themselves than with this camera's, by more than
+    chance allows (F test of the mean misfits)."""
     if not len(rest) or not rest.any():
         return True
     return bool(fdtrc(len(misfits), len(rest), misfits.mean() / rest.mean()) < CHANCE)
 
 
 def _misfits(miss: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Robust misfit of misses in standard deviations, 0 to 1."""
+    """Returns the robust misfit, 0 to 1, of each miss in standard deviations."""
     return _LOSS.cost(miss**2) / ROBUST_SIGMAS**2

@@ -54,7 +54,7 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float |
 
 
 class WrongScale(EigenheadError):
-    """Reports outlines of a head that no head has the size of: the unit of the cameras is not millimetres."""
+    """Reports outlines whose head has a size that no head has, so that the cameras are probably not in millimetres."""
 
     def __init__(self, diameter_mm: float, *, masks_given: bool = False) -> None:
         part = masks_given and diameter_mm < HEAD_MM
@@ -65,8 +65,8 @@ class WrongScale(EigenheadError):
 def judge_head_size(
     silhouettes: Mapping[str, Silhouette], rig: Rig, *, masks_given: bool = False
 ) -> list[ReportWarning]:
-    """Warns of a head that is larger or smaller than most; raises WrongScale for one that nobody has. ``masks_given``:
-    they may show less than a head."""
+    """Returns a warning if the outlined head is unusually large or small. Raises WrongScale if its size is impossible.
+    ``masks_given``: the masks are the operator's and may show only a part of the head."""
     diameter = head_diameter_mm(silhouettes, rig)
     if diameter is None:
         return []
@@ -90,8 +90,7 @@ def _size_told(diameter_mm: float) -> Message:
 
 
 def crown_disc(mask: Bool[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, " 2"], float] | None:
-    """Returns the middle (px) and diameter (px) of the head in a mask whose crown is in the picture; None where it is
-    not."""
+    """Returns the middle (px) and diameter (px) of the head in a mask; None if its crown is not in the picture."""
     turns = _turns_to_upright(mask)
     upright = np.rot90(_without_strands(mask), turns)
     rows = np.flatnonzero(upright.any(axis=1))
@@ -115,20 +114,21 @@ def crown_disc(mask: Bool[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, " 2"], 
 
 
 def _without_strands(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The mask without what is thinner than STRAND_SHARE of its size."""
+    """Returns the mask without parts thinner than ``STRAND_SHARE`` of its size."""
     side = max(3, 2 * round(STRAND_SHARE * float(np.sqrt(mask.sum())) / 2) + 1)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc).view(bool)
 
 
 def _turns_to_upright(mask: Bool[np.ndarray, "h w"]) -> int:
-    """Quarter turns (anticlockwise) after which the body leaves through the bottom."""
+    """Returns the number of quarter turns (anticlockwise) after which the body leaves the picture through the
+    bottom."""
     touched = [mask[-1].sum(), mask[:, 0].sum(), mask[0].sum(), mask[:, -1].sum()]  # bottom, left, top, right
     return int(np.argmax(touched)) if max(touched) else 0
 
 
 def _crossing(cameras: list[Camera], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " 3"]:
-    """The point nearest to all rays (least squares)."""
+    """Returns the point (world, mm) nearest to the rays through one pixel of each camera, by least squares."""
     normal, right = 1e-9 * np.eye(3), np.zeros(3)
     for camera, pixel in zip(cameras, pixels, strict=True):
         ray = camera.rays_world(pixel[None])[0]

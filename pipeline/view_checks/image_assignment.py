@@ -47,8 +47,8 @@ Segmentation = Callable[[Capture], dict[str, Silhouette]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageAssignment:
-    """Holds a capture and its silhouettes with every picture under its own camera; ``pictures`` and ``plates`` say, for
-    each camera that was given another's, the name under which its own is filed."""
+    """Holds a capture and its silhouettes with every picture filed under the right camera. ``pictures`` and ``plates``
+    give, for each camera that had another's, the name under which its own was filed."""
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -58,7 +58,8 @@ class ImageAssignment:
 
 
 class ExchangedPictures(EigenheadError):
-    """Reports pictures filed under other cameras' names, and no leave or not enough evidence to file them back."""
+    """Reports pictures filed under other cameras' names that were not put right, because that was not wanted or the
+    evidence is not sure enough."""
 
     def __init__(self, found: Sequence[Message], *, doubtful: bool) -> None:
         reason = compose("exchange-doubtful") if doubtful else compose("exchange-not-wanted")
@@ -66,7 +67,7 @@ class ExchangedPictures(EigenheadError):
 
 
 class SamePictures(EigenheadError):
-    """So many cameras hold one picture that too few are left."""
+    """Reports that so many cameras hold the same picture that too few different ones are left."""
 
     def __init__(self, duplicates: Mapping[str, str], count: int) -> None:
         names = some_of(sorted({*duplicates, *duplicates.values()}))
@@ -80,12 +81,12 @@ class WrongRig(EigenheadError):
 def assign_images(
     capture: Capture, rig: Rig, segmented: Segmentation, *, exchanged: Literal["repair", "refuse"]
 ) -> ImageAssignment:
-    """Segments a capture, and files exchanged pictures and plates back.
+    """Segments a capture, and files exchanged pictures and plates under the right cameras.
 
     Args:
         capture: as it was read.
         rig: the cameras as calibrated.
-        segmented: the silhouettes of a capture; called again for every change of what is filed where.
+        segmented: computes the silhouettes of a capture; called again after every change of the files.
         exchanged: what to do about an exchange that is beyond doubt.
 
     Raises:
@@ -126,7 +127,8 @@ def assign_images(
 
 
 def _masks_alone(capture: Capture, silhouettes: Mapping[str, Silhouette], assignment: Assignment) -> bool:
-    """Whether ready masks alone are exchanged, for the photographs agree with them once they are filed back."""
+    """Tells whether only the ready masks are exchanged and not the photographs: the photographs fit the masks once
+    these are filed right."""
     names = assignment.pictures.keys()
     return (
         bool(names)
@@ -136,10 +138,10 @@ def _masks_alone(capture: Capture, silhouettes: Mapping[str, Silhouette], assign
 
 
 def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
-    """Returns, for cameras whose clean plate is another camera's, the name under which their own is filed.
+    """Returns, for each camera whose clean plate is another camera's, the name under which its own plate is filed.
 
-    Asked only where pictures hardly look like their plates; a permutation is believed where every plate in it explains
-    clearly more of the picture that it is given to.
+    Only cameras whose picture hardly resembles its plate are compared. An exchange counts only if every plate in it
+    fits its new picture clearly better.
     """
     named = [name for name in rig.names if name in capture.images and capture.backgrounds.get(name)]
     pictures = {name: _thumbnail(capture.images[name]) for name in named}
@@ -157,14 +159,14 @@ def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
 
 
 def _thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]:
-    """Log levels at PLATE_COLUMNS columns."""
+    """Returns the logarithm of the image's levels, reduced to ``PLATE_COLUMNS`` columns."""
     rows = max(1, round(image.shape[0] * PLATE_COLUMNS / image.shape[1]))
     small = cv2.resize(image, (PLATE_COLUMNS, rows), interpolation=cv2.INTER_AREA)
     return np.log(small.astype(np.float32) + 1.0)
 
 
 def _common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarray, "_ _ 3"]) -> float:
-    """Share of a picture that is the plate under another exposure."""
+    """Returns the share of the picture's pixels that show the plate, apart from a difference in exposure."""
     if picture.shape != plate.shape:
         return 0.0
     ratio = (picture - plate).reshape(-1, 3)
@@ -174,9 +176,10 @@ def _common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarr
 
 
 def duplicate_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
-    """Returns cameras that hold, pixel for pixel, the picture of another one, and that other: noise never repeats.
+    """Returns cameras whose picture equals another camera's in every pixel, each with that other camera: two shots
+    never have the same noise.
 
-    The picture is left to the camera whose silhouette contradicts the others least, if any.
+    The picture is left to the camera whose silhouette contradicts the others least, if it contradicts them little.
     """
     groups: list[list[str]] = []
     for name in (name for name in rig.names if name in capture.images):
@@ -211,7 +214,8 @@ def _left_out(silhouettes: Mapping[str, Silhouette], names: Mapping[str, str]) -
 
 
 def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[str, str]:
-    """Where each camera's plates are filed, plates having been matched to pictures before pictures to cameras."""
+    """Returns, for each camera, the name under which its plates are filed, given the exchange of plates among pictures
+    and the exchange of pictures among cameras."""
     found = {}
     for name in plates.keys() | pictures.keys():
         picture = pictures.get(name, name)
@@ -220,15 +224,15 @@ def _composed(plates: Mapping[str, str], pictures: Mapping[str, str]) -> dict[st
 
 
 def _filed_back(capture: Capture, pictures: Mapping[str, str], rig: Rig) -> Capture:
-    """Pictures and plates under their cameras. Points may have been picked in the pictures as they were filed, or
-    before: whichever contradicts itself less."""
+    """Returns the capture with pictures and plates under the right cameras. Feature points move with the pictures or
+    stay, whichever way the points contradict each other less."""
     moved = reassign_images(capture, pictures=pictures, plates=pictures, points=pictures)
     kept = replace(moved, features=capture.features)
     return min((moved, kept), key=lambda filed: _contradiction(filed.features, rig))
 
 
 def _contradiction(features: Features, rig: Rig) -> float:
-    """Misfit of all points that two views or more show."""
+    """Returns the sum of the triangulation misfits of all feature points seen in two or more views."""
     total = 0.0
     for views in features.values():
         known = {name: pixel for name, pixel in views.items() if name in rig}

@@ -29,8 +29,8 @@ MIN_SHIFT = 0.02  # of the picture's width; less is not told
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensReading:
-    """The rig with all focal lengths ``factor`` times as long and all principal points moved by ``shift``, in shares of
-    the pictures' width and height."""
+    """Holds the rig with all focal lengths multiplied by ``factor`` and all principal points moved by ``shift`` (shares
+    of the pictures' width and height)."""
 
     rig: Rig
     factor: float
@@ -38,11 +38,12 @@ class LensReading:
 
     @property
     def is_other(self) -> bool:
-        """Tells whether the intrinsics differ by more than outlines that are merely loose would ask for."""
+        """Tells whether the intrinsics differ from the calibrated ones by more than loose outlines alone would
+        cause."""
         return abs(np.log(self.factor)) >= OTHER_FACTOR or max(map(abs, self.shift)) >= OTHER_SHIFT
 
     def message(self) -> Message:
-        """Returns the sentence of the refusal."""
+        """Returns the message that refuses the rig and names the differences of its lenses."""
         k = self.rig.cameras[0].intrinsics
         changes = []
         if abs(self.factor - 1.0) >= MIN_FACTOR:
@@ -54,7 +55,8 @@ class LensReading:
 
 
 def find_lens_reading(hulls: Sequence[Pixels], rig: Rig, misfit: Callable[[Rig], float]) -> LensReading:
-    """Returns the focal factor and principal shift of least ``misfit`` of those that searches from ``FACTORS`` find.
+    """Searches from several focal lengths (``FACTORS``) for the focal factor and principal shift with the least
+    ``misfit``.
 
     Args:
         hulls: of the outlines, in the rig's order.

@@ -33,8 +33,9 @@ OWN_GAIN = 1.5  # how much higher the peaks must be where masks are given to oth
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """``offset_px``: where the photograph's edge lies, outside the outline positive; ``height`` of the peak there, and
-    ``height_at_outline``, by the mean; ``size_px``: root of the mask's area."""
+    """Holds the edge that the photograph shows along a silhouette's outline. ``offset_px``: how far outside the outline
+    the edge lies; ``height``: strength of the edge there, ``height_at_outline``: on the outline itself, both relative
+    to the mean; ``size_px``: root of the mask's area."""
 
     offset_px: float
     height: float
@@ -43,13 +44,14 @@ class Edge:
 
     @property
     def is_off(self) -> bool:
-        """Tells whether the edge is clear and lies beside the outline."""
+        """Tells whether the edge is clear and lies away from the outline."""
         clear = self.height >= max(CLEAR, CLEARER * self.height_at_outline)
         return clear and abs(self.offset_px) >= MIN_OFF * self.size_px
 
 
 def edge_beside(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
-    """Returns the photograph's edge along an outline; None where too little of the outline is in the picture."""
+    """Finds the photograph's strongest edge parallel to an outline; None if too little of the outline is inside the
+    picture."""
     size = float(np.sqrt(np.count_nonzero(silhouette.mask)))
     reach = max(4, round(REACH * size))
     pixels, normals = _outline(silhouette, reach)
@@ -67,7 +69,8 @@ def edge_beside(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
 
 
 def _outline(silhouette: Silhouette, reach: int) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n 2"]]:
-    """Pixels (x, y) of an outline, as far from the picture's border as is looked, and outward directions there."""
+    """Returns pixels (x, y) of an outline farther than ``reach`` from the picture's border, and the outward direction
+    at each."""
     distance = silhouette.distance
     height, width = distance.shape
     rows, columns = np.nonzero(np.abs(distance) < 0.6)
@@ -83,7 +86,8 @@ def _outline(silhouette: Silhouette, reach: int) -> tuple[Float32[np.ndarray, "n
 def masks_off_edges(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
 ) -> list[ReportWarning]:
-    """Warns of ready masks most of which lie as far outside, or inside, of what the photographs show.
+    """Returns a warning if most ready masks lie too far outside, or most too far inside, the edges that the photographs
+    show.
 
     Args:
         images: by camera.
@@ -104,7 +108,7 @@ def masks_off_edges(
 def masks_alone_exchanged(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], pictures: Mapping[str, str]
 ) -> bool:
-    """Tells whether ready masks lie under other cameras' names, and the photographs under their own.
+    """Tells whether ready masks are filed under other cameras' names while the photographs are filed right.
 
     Args:
         images: as they are filed.

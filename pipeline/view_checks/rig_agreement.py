@@ -43,7 +43,9 @@ Turn = Callable[[Pixels, Intrinsics], Pixels]
 
 
 def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
-    """Returns what is wrong with cameras and pictures as wholes, with the remedy; None where most cameras agree.
+    """Finds out why most cameras contradict each other: pictures turned or mirrored, another convention or other lenses
+    in the file, or another rig. Returns a message with the remedy; None if most cameras agree or the outlines are
+    merely loose.
 
     Args:
         silhouettes: by camera; views without a usable mask are left out of the question.
@@ -76,8 +78,8 @@ def _judged_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
 
 
 def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
-    """Tells whether most outlines contradict the others, though these cameras took the pictures (``wrong_rig`` is
-    None)."""
+    """Tells whether most outlines contradict the others. Meant for rigs that ``wrong_rig`` finds right, where the cause
+    is loose masks."""
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MIN_CAMERAS:
         return False
@@ -85,8 +87,8 @@ def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
-    """Returns the one camera that contradicts all others, who agree without it: it was moved farther than a shift of
-    its picture tells (``camera_drift``), its pose is wrong in the file, or its mask is. None where there is none."""
+    """Returns the one camera that contradicts all others while these agree without it; None if there is none. The
+    camera was moved farther than ``camera_drift`` can measure, or its pose or mask is wrong."""
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MISPLACED_AMONG:
         return None
@@ -101,14 +103,16 @@ def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | N
 
 
 def _median_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
-    """Median over the cameras of the mean robust misfit of their planes (0 to 1); NaN where too few planes speak."""
+    """Returns the median over the cameras of the mean robust misfit (0 to 1) of each one's planes; NaN if too few
+    cameras have enough planes."""
     errors_px = tangency_errors_px(hulls, rig)
     speaking = np.isfinite(errors_px).sum(axis=(1, 2)) >= MIN_PLANES
     return float(np.median(mean_misfit(errors_px)[speaking])) if speaking.sum() >= MIN_CAMERAS else np.nan
 
 
 def _are_loose(hulls: Sequence[Pixels], rig: Rig) -> bool:
-    """Whether so many planes meet closely as they do in the rig that took the pictures alone, whatever the masks."""
+    """Tells whether so many planes meet closely that these cameras must have taken the pictures, however loose the
+    masks."""
     errors_px = tangency_errors_px(hulls, rig)
     widths = np.array([camera.intrinsics.width for camera in rig], float)
     shares = np.abs(errors_px) / (np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0))[..., None]
@@ -137,12 +141,12 @@ def _turned_round(pixels: Pixels, k: Intrinsics) -> Pixels:
 
 
 def _turned_back(pixels: Pixels, k: Intrinsics) -> Pixels:
-    """By 90 degrees clockwise."""
+    """Returns the pixels after a turn of the picture by 90 degrees clockwise."""
     return np.stack([k.height - 1.0 - pixels[:, 1], pixels[:, 0]], axis=1)
 
 
 def _turned_on(pixels: Pixels, k: Intrinsics) -> Pixels:
-    """By 90 degrees anticlockwise."""
+    """Returns the pixels after a turn of the picture by 90 degrees anticlockwise."""
     return np.stack([pixels[:, 1], k.width - 1.0 - pixels[:, 0]], axis=1)
 
 

@@ -50,8 +50,9 @@ class TooFewViews(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsableViews:
-    """Holds a capture with every picture under its own camera and its silhouettes; those that take no part are not
-    usable. ``pictures``: for each camera that was given another's picture, the name under which its own is filed."""
+    """Holds a capture with every picture under the right camera, and its silhouettes; views that take no part are
+    marked unusable. ``pictures``: for each camera that had another's picture, the name under which its own was filed.
+    """
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -66,12 +67,12 @@ def usable_views(
     *,
     exchanged: Literal["repair", "refuse"],
 ) -> UsableViews:
-    """Segments a capture, files exchanged pictures back, and leaves out what contradicts the other views.
+    """Segments a capture, files exchanged pictures right, and marks views that contradict the others as unusable.
 
     Args:
         capture: as it was read.
         rig: the cameras as calibrated.
-        segmented: the silhouettes of a capture.
+        segmented: computes the silhouettes of a capture.
         exchanged: what to do about an exchange of pictures that is beyond doubt.
 
     Raises:
@@ -93,8 +94,8 @@ def usable_views(
 def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], list[ReportWarning]]:
-    """Leaves out the views of cameras that no longer stand where they were calibrated; each is named, and so are those
-    whose mask may be loose instead."""
+    """Marks the views of cameras that moved since the calibration as unusable. Also returns a warning for each of them,
+    and for each camera whose mask may be loose instead."""
     kept, warnings = dict(silhouettes), []
     for drift in find_drift(silhouettes, rig):
         if drift.moved:
@@ -109,7 +110,8 @@ def without_moved_cameras(
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
-    """Returns what the views' qualities say, as warnings of the report; what is true of many views is one of them."""
+    """Returns the remarks on the views' quality as warnings of the report; a remark that holds for many views becomes
+    one warning."""
     remarks_by_code: dict[str, list[Message]] = {"view-left-out": [], "view": [], "mask-doubtful": []}
     for name, silhouette in silhouettes.items():
         code = "view" if silhouette.quality.usable else "view-left-out"
@@ -128,7 +130,8 @@ def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
 
 
 def _doubt(remark: Message) -> ReportWarning:
-    """Of one view, or, where it is true of many, of the first with the number of the others."""
+    """Returns the warning of a doubtful mask: for one view or, if the remark holds for several, for the first of them
+    with the number of the others."""
     located = remark if remark.code == "located" else remark.parameters["fault"]
     assert isinstance(located, Message)
     camera, fault = str(located.parameters["where"]), located.parameters["fault"]

@@ -29,14 +29,14 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Says where in a reduced image the subject, and where the background, is sure enough to learn from."""
+    """Holds which pixels of a reduced image surely show the subject, and which surely show background."""
 
     subject: Mask
     background: Mask
 
 
 def histogram(colours: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "b b b"]:
-    """Tells how many pixels have each colour."""
+    """Counts how many pixels fall in each bin of colour."""
     counts = np.zeros((BINS,) * 3, np.float32)
     np.add.at(counts, tuple(_bins(colours).T), 1.0)
     return counts
@@ -50,8 +50,9 @@ def colour_odds(
     *,
     nearby: bool,
 ) -> Float32[np.ndarray, "h w"]:
-    """Returns the log odds of every pixel. ``common``: counts of the subject's colours in all views; ``noise``: levels;
-    ``nearby``: whether local colours count, which they may where the samples are nearly complete."""
+    """Returns the log odds of subject against background for every pixel, by its colour. ``common``: counts of the
+    subject's colours in all views; ``noise``: levels; ``nearby``: whether colours near the pixel count too, which needs
+    nearly complete samples."""
     subject = _log_density(image, (common, histogram(image[samples.subject])))
     background = _log_density(image, (histogram(image[samples.background]),))
     if nearby:
@@ -66,7 +67,7 @@ def _bins(colours: np.ndarray) -> np.ndarray:
 
 
 def _log_density(image: Image, counts: tuple[Float32[np.ndarray, "b b b"], ...]) -> Float[np.ndarray, "h w"]:
-    """Log of the mean density of several histograms, levels^-3."""
+    """Returns the log of the mean density (levels^-3) of several histograms at each pixel's colour."""
     density = np.zeros((BINS,) * 3)
     for one in counts:
         smooth = gaussian_filter(one, HISTOGRAM_BLUR, mode="constant")
@@ -75,7 +76,8 @@ def _log_density(image: Image, counts: tuple[Float32[np.ndarray, "b b b"], ...])
 
 
 def _log_nearby(image: Image, mask: Mask, scatter: Float32[np.ndarray, " 3"]) -> Float[np.ndarray, "h w"]:
-    """Log of a Gaussian density of the colours of ``mask`` nearby, levels^-3."""
+    """Returns the log density (levels^-3) of each pixel's colour under a Gaussian fitted to the colours of ``mask``
+    near the pixel."""
     weight = mask.astype(np.float32)
     mean, square = spread(image, weight, NEARBY_PX), spread(image * image, weight, NEARBY_PX)
     variance = np.maximum(square - mean * mean, 0) + scatter**2

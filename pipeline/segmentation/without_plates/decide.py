@@ -33,8 +33,8 @@ ALPHA_BLUR_PX = 1.0  # of the image that was cut
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WithoutPlates:
-    """Holds views by what the outline is taken from: ``decisions`` for the matting, ``shares`` (of the subject in each
-    pixel, full size) of those that were cut."""
+    """Holds the views in two groups, by how their outline is found: ``decisions`` go to the matting; ``shares`` are the
+    subject's share of each pixel (full size) in views that were cut."""
 
     decisions: Mapping[str, Decision]
     shares: Mapping[str, Float32[np.ndarray, "_ _"]]
@@ -48,8 +48,8 @@ def decide_without_plates(
     head: HeadSeed | None = None,
     report: Callable[[float], None] = lambda share: None,
 ) -> WithoutPlates:
-    """Decides what is subject in every photograph: ``pipeline.segmentation.matting`` finds the contour from it.
-    ``head``: where a face was found."""
+    """Decides which pixels show the subject in every photograph, without plates. ``head`` is the head's position if a
+    face was found."""
     small = {name: _reduced(images[name], settings.coarse_columns).astype(np.float32) for name in rig.names}
     sizes = {name: image.shape[:2] for name, image in small.items()}
     points = find_scene_points(images, rig, report=partial(_between, report, 0.0, POINTS_SHARE))
@@ -86,8 +86,8 @@ def background_seen(
     volume: ViewingVolume,
     plane: Float[np.ndarray, " 4"] | None,
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns reduced pixels (``size``: height, width) around points that are far from all subjects or on what it
-    stands on."""
+    """Returns the pixels of a reduced image (``size``: height, width) around scene points that are background: far from
+    the subject, or on the plane that it stands on."""
     seen_points = points.points[points.rows[name]]
     behind = np.linalg.norm(seen_points - volume.centre_world, axis=1) > volume.radius_mm
     if plane is not None:

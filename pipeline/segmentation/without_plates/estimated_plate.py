@@ -30,8 +30,8 @@ def decision_without_plate(
     *,
     solid: bool = False,
 ) -> Decision:
-    """Returns the decision that the present matting refines. ``solid``: a head, in which no backdrop is seen: what is
-    enclosed is skin or hair of the wall's colour."""
+    """Returns a decision for the matting, with a background estimated from the pixels around the mask. ``solid``: the
+    subject is a head, and holes in the mask are filled as skin or hair of the wall's colour."""
     mask, others = whole_subject(found.mask, found.odds < -1, settings)
     odds = found.odds
     if solid:
@@ -53,7 +53,8 @@ def decision_without_plate(
 def estimated_background(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], outside: Bool[np.ndarray, "h w"]
 ) -> Background:
-    """Returns the plate as the pixels ``outside`` let it be guessed, and how badly they do."""
+    """Estimates the background behind the subject from the pixels ``outside`` it; the noise includes the error of that
+    guess."""
     guess = spread(coarse, outside.astype(np.float32), NEARBY_PX)
     size = (image.shape[1], image.shape[0])
     share = cv2.resize(cv2.GaussianBlur(outside.astype(np.float32), (0, 0), 1.0), size, interpolation=cv2.INTER_LINEAR)
@@ -71,12 +72,13 @@ def estimated_background(
 
 
 def _pixel_noise(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " 3"]:
-    """Of one pixel (levels): differences of neighbours, most of which lie on no edge."""
+    """Returns the noise of one pixel (levels) in each channel, from differences of neighbours, most of which lie on no
+    edge."""
     steps = image[::4, 1:].astype(np.float32) - image[::4, :-1]
     return (1.4826 * np.median(np.abs(steps), axis=(0, 1)) / np.sqrt(2)).astype(np.float32)
 
 
 def plate_noise(decision: Decision) -> float:
-    """Returns by how much (levels) the guess is off along the subject's border."""
+    """Returns the median noise (levels) of the estimated background along the subject's border; 0 without a border."""
     rim = dilated(decision.mask, MARGIN) & ~eroded(decision.mask, MARGIN)
     return float(np.median(decision.background.noise[rim])) if rim.any() else 0.0

@@ -23,7 +23,8 @@ UPRIGHT = 0.7  # sine of the angle between view and up
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadSeed:
-    """Holds the head in the world (mm), and the face's landmarks in the views that show it."""
+    """Holds the head's centre, upward direction and size in the world (mm), and the face's landmarks (px) in the views
+    that show it."""
 
     centre_world: Float[np.ndarray, " 3"]
     up_world: Float[np.ndarray, " 3"]
@@ -32,7 +33,7 @@ class HeadSeed:
 
 
 def find_head_seed(images: Mapping[str, ImageRgb], rig: Rig) -> HeadSeed | None:
-    """Finds the subject's face in the photographs; None where no two of them agree on one."""
+    """Finds the subject's head from the face in the photographs; None if fewer than two photographs agree on a face."""
     face = find_subject(images, rig, _networks()).matched
     if face is None or len(face.detections) < 2:  # one view does not tell the distance
         return None
@@ -43,8 +44,8 @@ def find_head_seed(images: Mapping[str, ImageRgb], rig: Rig) -> HeadSeed | None:
 
 
 def head_core(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of a reduced image (``size``: height, width) that surely show the head: the face where it was
-    found, and the disc of the skull."""
+    """Returns the pixels of a reduced image (``size``: height, width) that surely show the head: the disc of the skull
+    and the outline of the face."""
     core = np.zeros(size, np.uint8)
     scale = size[1] / camera.intrinsics.width
     centre_camera = camera.camera_from_world.apply(seed.centre_world)
@@ -60,8 +61,8 @@ def head_core(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.
 
 
 def beside_head(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of a reduced image that surely show no part of the subject: above the chin, and farther to the
-    side than hair reaches. None where the camera sees the head from above or below."""
+    """Returns the pixels of a reduced image that surely do not show the subject: above the chin, and farther aside than
+    hair reaches. No pixel is marked if the camera sees the head from above or below."""
     centre_camera = camera.camera_from_world.apply(seed.centre_world)
     up = (camera.camera_from_world.rotation @ seed.up_world)[:2]
     if centre_camera[2] <= seed.skull_mm or np.linalg.norm(up) < UPRIGHT:

@@ -27,7 +27,7 @@ MIN_PIECE = 100  # px of outline
 
 @dataclass(frozen=True, slots=True)
 class Bands:
-    """Says how far inside and outside the given outline the edge is looked for, px of the images that are cut."""
+    """Holds how far inside and outside the given outline the edge is searched, in pixels of the images that are cut."""
 
     inside: int
     outside: int
@@ -40,7 +40,8 @@ BANDS = (Bands(14, 8), Bands(8, 6))
 def cut_along(
     image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], bands: Bands
 ) -> Float32[np.ndarray, "h w"]:
-    """Returns the share of the windows that hold a pixel for the subject, weighted towards their middles."""
+    """Cuts the image in windows along the mask's outline. Returns, for each pixel, the share of the windows over it
+    that assign it to the subject, weighted towards their middles."""
     height, width = mask.shape
     inner, outer = eroded(mask, bands.inside), ~dilated(mask, bands.outside)
     side = min(WINDOW, height, width)
@@ -69,7 +70,7 @@ def _cut(
     inner: Bool[np.ndarray, "h w"],
     outer: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"] | None:
-    """One window; None where it is not sure of enough on both sides."""
+    """Cuts one window into subject and background; None if too few of its pixels are sure on either side."""
     if min(np.count_nonzero(inner), np.count_nonzero(outer)) < MIN_SAMPLES:
         return None
     kinds = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -88,8 +89,8 @@ def cut_views(
     *,
     report: Callable[[float], None],
 ) -> dict[str, Float32[np.ndarray, "_ _"]]:
-    """Returns every view's share of the subject, at the size of ``images``; ``volume`` belongs to the size of
-    ``masks``."""
+    """Returns the subject's share of each pixel in every view, at the size of ``images``. ``volume`` belongs to the
+    size of ``masks``."""
     wide = {name: _resized(mask, images[name].shape[:2]) for name, mask in masks.items()}
     shares: dict[str, Float32[np.ndarray, "_ _"]] = {}
     for step, bands in enumerate(BANDS):
@@ -108,7 +109,7 @@ def _carved(
     masks: Mapping[str, Bool[np.ndarray, "_ _"]],
     volume: ViewingVolume,
 ) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """What was cut, without what the other views' cuts deny."""
+    """Returns the cut masks without the pixels that the cuts of the other views rule out."""
     odds = {
         name: (MAX_ODDS * (2 * cv2.resize(share, masks[name].shape[::-1], interpolation=cv2.INTER_AREA) - 1))
         for name, share in shares.items()

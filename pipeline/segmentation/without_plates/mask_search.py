@@ -48,8 +48,8 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """Holds what geometry knows of a view before any colour: surely subject, surely background, and where either may
-    be."""
+    """Holds what is known of a view from geometry alone: pixels that surely show the subject, that surely show
+    background, and that can show the subject at all."""
 
     core: Mask
     border: Mask
@@ -59,7 +59,8 @@ class Seeds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseMask:
-    """Holds ``odds`` of the subject when colours, neighbours and other views are heard; ``mask`` its one piece."""
+    """Holds the log odds of the subject after colours, neighbours and other views are combined, and the one connected
+    ``mask`` that follows."""
 
     odds: Float32[np.ndarray, "h w"]
     mask: Mask
@@ -103,8 +104,8 @@ def search_masks(
     head: HeadSeed | None = None,
     report: Callable[[float], None],
 ) -> dict[str, CoarseMask]:
-    """Returns the subject in every reduced image. ``background``: pixels that are known not to show it. ``bounded``:
-    the volume holds all of the subject, so that what is beyond it may be learnt as background nearby at once."""
+    """Finds the subject's mask in every reduced image. ``background``: pixels known not to show it. ``bounded``: the
+    volume holds all of the subject, so that pixels beyond it serve as background from an earlier round on."""
     up = guessed_up(rig) if head is None else head.up_world
     sizes = {name: image.shape[:2] for name, image in images.items()}
     seeds = {camera.name: find_seeds(camera, volume, up, sizes[camera.name], head) for camera in rig}
@@ -161,7 +162,7 @@ def _learn(found: CoarseMask, known: Mask, *, border: bool) -> Samples:
 
 
 def _one_piece(mask: Mask, core: Mask) -> Mask:
-    """The component that holds most of the core; without one, the largest."""
+    """Returns the component of the mask that holds most of the core or, if none does, the largest."""
     count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=4)
     if count < 2:
         return mask
@@ -171,7 +172,8 @@ def _one_piece(mask: Mask, core: Mask) -> Mask:
 
 
 def _with_texture(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
-    """A grey photograph with its surroundings' mean and scatter in place of two channels that say nothing."""
+    """Returns a grey photograph with two of its equal channels replaced by the local mean and scatter; colour
+    photographs are returned unchanged."""
     if np.ptp(image, axis=2).max() > MAX_GREY:
         return image
     grey = image[:, :, 0]
@@ -181,5 +183,6 @@ def _with_texture(image: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h
 
 
 def _noise(image: Float32[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
-    """Levels, a channel, from neighbours; weave and texture count as noise."""
+    """Estimates the noise (levels) of each channel from differences of neighbours, at least 1; weave and texture count
+    as noise."""
     return np.maximum(1.4826 * np.median(np.abs(np.diff(image, axis=1)), axis=(0, 1)) / np.sqrt(2), 1.0)

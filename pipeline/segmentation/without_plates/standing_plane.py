@@ -20,8 +20,8 @@ MIN_OFF_CENTRE = 0.08  # of the radius: the place that all cameras look at is no
 def standing_plane(
     points_world: Float[np.ndarray, "n 3"], centre_world: Float[np.ndarray, " 3"], radius_mm: float
 ) -> Float[np.ndarray, " 4"] | None:
-    """Returns a plane: ``plane . (x, 1)`` is the distance (mm) on the subject's side; None where there is no such
-    plane."""
+    """Finds a plane that many scene points lie on and hardly any lie beyond. ``plane . (x, 1)`` is the distance (mm),
+    positive on the subject's side; None if there is no such plane."""
     near = points_world[np.linalg.norm(points_world - centre_world, axis=1) < 2 * radius_mm]
     if len(near) < MIN_POINTS:
         return None
@@ -48,8 +48,8 @@ def ball_above(
     centre_world: Float[np.ndarray, " 3"],
     radius_mm: float,
 ) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns the centre and radius (mm) of what stands on the plane: around the points above it, with room for what
-    has none."""
+    """Returns the centre (world) and radius (mm) of a ball about the scene points above the plane, with some room for
+    parts without points."""
     height = points_world @ plane_world[:3] + plane_world[3]
     inside = np.linalg.norm(points_world - centre_world, axis=1) < radius_mm
     standing = points_world[inside & (height > 2 * NEAR * radius_mm)]
@@ -89,7 +89,7 @@ def _through(three: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, " 3"]) -
 def _refined(
     plane: Float[np.ndarray, " 4"], points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"], radius: float
 ) -> Float[np.ndarray, " 4"]:
-    """Least squares through the points near it."""
+    """Returns the plane fitted by least squares to the points near it."""
     for _ in range(3):
         on = points[np.abs(points @ plane[:3] + plane[3]) < NEAR * radius]
         middle = on.mean(axis=0)

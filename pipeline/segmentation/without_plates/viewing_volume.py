@@ -26,7 +26,7 @@ SOLID_ODDS = 0.5  # log odds that all pixels around a voxel must have in a view 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewingVolume:
-    """Voxels in a ball around the place that all cameras look at."""
+    """Holds the voxels of a ball around the place that all cameras look at, and their pixel in each view."""
 
     centre_world: Float[np.ndarray, " 3"]
     radius_mm: float
@@ -36,8 +36,9 @@ class ViewingVolume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherViews:
-    """Holds what all other views say of each pixel of one: ``support``, the greatest sum of their log odds along its
-    ray (negative where they leave nothing of the subject on it), and ``solid``, where each of them has the subject."""
+    """Holds, for each pixel of one view, what all other views say of its ray: ``support``, the greatest sum of their
+    log odds at a voxel on it (negative if they rule the subject out), and ``solid``, whether it meets a voxel that none
+    of them doubts."""
 
     support: Float32[np.ndarray, "h w"]
     solid: Bool[np.ndarray, "h w"]
@@ -46,8 +47,8 @@ class OtherViews:
 def viewing_ball(
     rig: Rig, centre_world: Float[np.ndarray, " 3"] | None = None
 ) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns centre (world) and radius (mm) of what the cameras look at: as far as the corners of the median image
-    reach. ``centre_world``: where it is known better than from where the cameras look."""
+    """Returns centre (world) and radius (mm) of a ball that reaches as far as the corners of the median image.
+    ``centre_world``: a better centre than the place where the cameras look."""
     centre = rig.centre_world() if centre_world is None else centre_world
     radius = float(
         np.median(
@@ -68,10 +69,10 @@ def viewing_volume(
     *,
     plane_world: Float[np.ndarray, " 4"] | None = None,
 ) -> ViewingVolume:
-    """Returns the volume of a rig whose reduced images have ``sizes`` (height, width), in ``ball``, centre and radius
-    (mm).
+    """Builds the volume from a ``ball``, centre and radius (mm), for reduced images of ``sizes`` (height, width).
 
-    ``plane_world``: what the subject stands on; only the side on which ``plane . (x, 1)`` is positive is kept."""
+    ``plane_world``: what the subject stands on; only the side on which ``plane . (x, 1)`` is positive is kept.
+    """
     centre, radius = ball
     line = ((np.arange(CELLS) + 0.5) / CELLS * 2 - 1) * radius
     offsets = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -92,7 +93,7 @@ def viewing_volume(
 
 
 def reachable(volume: ViewingVolume, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels on whose rays there are voxels at all."""
+    """Tells which pixels of a view have a voxel on their ray."""
     mask = np.zeros(size[0] * size[1], np.uint8)
     places = volume.places[name]
     mask[places[places >= 0]] = 1
@@ -100,7 +101,8 @@ def reachable(volume: ViewingVolume, name: str, size: tuple[int, int]) -> Bool[n
 
 
 def ask_other_views(volume: ViewingVolume, odds: Mapping[str, Float32[np.ndarray, "_ _"]]) -> dict[str, OtherViews]:
-    """Tells for each view what the others say; ``odds``: of subject against background, of every view."""
+    """Combines, for each view, the log odds of all other views along the rays of its pixels. ``odds``: of subject
+    against background, for every view."""
     count = len(next(iter(volume.places.values())))
     total, seen, against = np.zeros(count, np.float32), np.zeros(count, np.int32), np.zeros(count, np.int32)
     grants = min(MAX_GRANTS, GRANTS_SUM / max(1, len(odds) - 1))
