@@ -39,8 +39,8 @@ class Release:
 
 @dataclass(slots=True)
 class BoxLogic:
-    """Holds the state of one trigger box. ``handle`` returns the reply to a request; the ``on_`` hooks are called when
-    outputs change."""
+    """Holds the state of one trigger box. ``handle`` returns the reply to a request; ``on_release``, ``on_lights`` and
+    ``on_armed`` are called when outputs change."""
 
     on_release: Callable[[Release], None]
     on_lights: Callable[[int], None]
