@@ -57,8 +57,8 @@ class ReadingBasis:
 
 @lru_cache(maxsize=1)  # 10 MB; studios work with one model
 def reading_basis(population: HeadModel, model: HeadModel, eigenheads: int) -> ReadingBasis:
-    """Returns the sample places with three groups of modes: all eigenheads of ``population``, then the smooth modes and
-    the expressions of ``model``, the model that the fit used."""
+    """Returns points spread over the mean face of ``population`` and how each mode moves them: first all eigenheads of
+    ``population``, then the kernel modes and the expressions of ``model``, which the fit used."""
     full = population.levels["full"]
     inputs = (population.sha256, population.modes, model.modes, model.posed, eigenheads, SPACING_MM)
 

@@ -46,8 +46,8 @@ class NoCalibration(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class RigCheck:
-    """Holds the result of a check: ``rows`` has the texts of each camera under ``COLUMNS``, ``faults`` everything that
-    is wrong."""
+    """Holds the result of a check: ``rows`` has a row of texts for each camera, in the order of ``COLUMNS``; ``faults``
+    lists everything that is wrong."""
 
     rows: tuple[tuple[str, ...], ...]
     faults: tuple[Fault, ...]

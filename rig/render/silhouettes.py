@@ -213,7 +213,7 @@ def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
 
 
 def check_images(rig: Rig, images: Mapping[str, np.ndarray], kind: str) -> None:
-    """Raises InputError where a camera has no image of its size."""
+    """Raises InputError where a camera's image is missing or is not as large as the camera says."""
     faults = []
     for camera in rig:
         wanted = (camera.intrinsics.height, camera.intrinsics.width)

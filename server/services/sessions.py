@@ -75,7 +75,7 @@ class Sessions:
         return None
 
     def get(self, identity: str) -> Session:
-        """Returns a session. Raises NotFound."""
+        """Returns the session with this id. Raises NotFound where there is none."""
         record = self._store.session(identity)
         return _with_captures(record, self._library.captures_of([identity])[identity])
 

@@ -201,10 +201,10 @@ def _basel_landmarks(listed: list[dict], mean: Float[np.ndarray, "V 3"]) -> dict
 
 
 def read_plain(path: Path) -> Foreign:
-    """Returns npz with mean (V, 3), modes (M, V, 3) per standard deviation, faces (F, 3), mm; docs/models.md has the
-    rest.
+    """Reads a model from an npz file of mean (V, 3), modes (M, V, 3) and faces (F, 3), in mm; docs/models.md describes
+    it. A mode is the displacement of one standard deviation, or of unit length where sigma is there.
 
-    Optional: sigma (M,) multiplies unit modes; landmark_names and landmark_vertices; name, licence, source, notice;
+    Optional: sigma (M,), standard deviations of unit modes; landmark_names and landmark_vertices; name, licence, source, notice;
     subjects (total, male, female).
     """
     with np.load(path, allow_pickle=False) as file:

@@ -121,8 +121,8 @@ class BulkForm(WorkForm):
 
 class CapturesPage(Page, component="captures.js"):
     def look(self) -> CapturesState:
-        """Returns the state of the page. The capture that is looked at stays whatever arrives meanwhile, so that nobody
-        erases another one than they see."""
+        """Returns the state of the page. The selected capture stays selected when others arrive, so that nobody removes
+        a capture other than the one shown."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: CapturesState = shared.get(
             ("captures", *requested.values()), 0.3, lambda: captures_state(self.service, requested)

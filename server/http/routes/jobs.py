@@ -94,7 +94,8 @@ def get_job(service: ServiceOf, caller: Reader, job_id: str) -> JobOut:
 
 
 def known_job(service: ServiceOf, caller: Reader, job_id: str) -> str:
-    """A stream's 404 must come before its first byte."""
+    """Returns the job's id, or raises NotFound before a stream begins, since the status is sent before its first
+    byte."""
     service.jobs.state(job_id)
     return job_id
 
