@@ -189,7 +189,7 @@ class SyncCertificate:
 
     @property
     def spread_s(self) -> float | None:
-        """Returns the time (s) from the earliest to the latest picture of the shot, None where fewer than two arrived."""
+        """Returns the time (s) from the earliest to the latest picture of the shot; None where fewer than two came."""
         skews = [camera.skew_s for camera in self.cameras if camera.skew_s is not None]
         return max(skews) - min(skews) if len(skews) > 1 else None
 
