@@ -204,7 +204,7 @@ def read_plain(path: Path) -> Foreign:
     """Reads a model from an npz file of mean (V, 3), modes (M, V, 3) and faces (F, 3), in mm; docs/models.md describes
     it. A mode is the displacement of one standard deviation, or of unit length where sigma is there.
 
-    Optional: sigma (M,), standard deviations of unit modes; landmark_names and landmark_vertices; name, licence, source,
+    Optional: sigma (M,), standard deviations of unit modes; landmark_names, landmark_vertices; name, licence, source,
     notice; subjects (total, male, female).
     """
     with np.load(path, allow_pickle=False) as file:
