@@ -48,7 +48,7 @@ def check_jobs(page: Page, jobs: list[str], screenshots: Path) -> None:
     page.locator("#pick").click()
     page.get_by_role("button", name="All of this page").click()
     page.locator("#bulk-cancel").click()
-    expect(page.get_by_text("10 cancelled.")).to_be_visible()
+    expect(page.get_by_text("10 jobs cancelled.")).to_be_visible()
     expect(rows).to_have_count(0)
     page.locator("#state").select_option("")
     rows.first.focus()
