@@ -60,7 +60,7 @@ def table1(
     simplex_subjects: int = 100,
     folder: Path | None = None,
 ) -> Outcome:
-    """Tables 1 and 2, and pictures like figures 4 and 5. ``simplex_subjects``: how many the simplex fits too."""
+    """Returns tables 1 and 2 and pictures like figures 4 and 5. ``simplex_subjects``: how many the simplex fits too."""
     rows = _rows(
         model,
         default_layout(),
