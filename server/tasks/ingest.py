@@ -231,6 +231,7 @@ def check_capture(
         of_file: list[Message] = []
         features = features_from_bytes((root / "features.json").read_bytes(), rig, of_file)
         faults += [*of_file, *feature_faults(features, rig)]
+        digests["features.json"] = _sha256(root / "features.json")
     if len(empty) == len(rig):
         faults.append(compose("every-picture-its-plate"))
     if faults:

@@ -1,5 +1,7 @@
 """Faults of captures that the door names without a service around it."""
 
+import hashlib
+import json
 import shutil
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from rig.formats.archive import ArchiveLimits, pack_folder
 from rig.formats.cameras_file import write_rig_file
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import read_capture, write_capture
+from rig.formats.features_json import FEATURES_FORMAT
 from rig.formats.images import read_image, write_image
 from rig.messages.message import texts_of
 from server.storage.records import CaptureContent
@@ -50,6 +53,18 @@ def test_faults_of_cameras_files_and_features_are_told_at_once(tmp_path: Path) -
         checked(folder)
     for word in ("at one place", "images/foo.png has no camera", "'third_eye' is no landmark"):
         assert any(word in fault.text for fault in refusal.value.faults)
+
+
+def test_feature_points_are_part_of_what_an_upload_holds(tmp_path: Path) -> None:
+    """A job reads the files that the content names, and no others."""
+    folder = small_capture(tmp_path / "capture")
+    capture, rig = read_capture(folder)
+    places_mm = {"pronasale": (0.0, 0.0, 90.0), "gnathion": (0.0, -60.0, 70.0), "nasion": (20.0, 40.0, 80.0)}
+    points = {name: {c.name: c.project(np.array([at]))[0].tolist() for c in rig} for name, at in places_mm.items()}
+    (folder / "features.json").write_text(json.dumps({"format": FEATURES_FORMAT, "points": points}))
+    assert not capture.features
+    kept = hashlib.sha256((folder / "features.json").read_bytes()).hexdigest()
+    assert checked(folder).inputs["features.json"] == kept
 
 
 def test_an_upload_is_judged_as_a_shot_is(tmp_path: Path) -> None:
