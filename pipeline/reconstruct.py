@@ -52,6 +52,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         context.model.name,
         context.model.sha256,
         context.settings,
+        context.device.description if context.device else "cpu",
         context.capture.digests,
         views,
         faces,

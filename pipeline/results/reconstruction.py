@@ -30,6 +30,7 @@ class Reconstruction:
     model_name: str
     model_sha256: str
     settings: Settings
+    device: str  # that compared the photographs
     digests: Mapping[str, str]  # sha256 of every input file
     views: Views
     faces: Faces

@@ -85,6 +85,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "evaluations": head.fit.evaluations,
         "stopped_because": head.fit.termination_reason,
         "seconds": {"total": sum(result.seconds.values())} | dict(result.seconds),
+        "device": result.device,
         "settings": document_from_settings(result.settings),
         "inputs": dict(result.digests),
         "warnings": documents_of(result.warnings),

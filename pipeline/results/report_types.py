@@ -166,6 +166,7 @@ class Report(TypedDict):
     evaluations: int
     stopped_because: str
     seconds: dict[str, float]
+    device: NotRequired[str]  # not in files of earlier versions
     settings: dict[str, object]
     inputs: dict[str, str]
     warnings: list[MessageDocument]

@@ -11,6 +11,7 @@ from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
 from rig.capture import Capture
 from rig.progress import Progress, discard_progress
+from rig.render.compute import ComputeDevice
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 
@@ -30,6 +31,7 @@ class ReconstructionContext:
         progress: called with a stage's name and the share of it that is done; may raise Cancelled.
         segment: finds the silhouettes of a capture; a caller that caches them passes its own.
         networks: find faces; a caller of many jobs passes them on.
+        device: compares the photographs; None: the processor does.
     """
 
     capture: Capture
@@ -40,6 +42,7 @@ class ReconstructionContext:
     progress: Progress = discard_progress
     segment: Segment = field(default=segment)
     networks: FaceNetworks = field(default_factory=load_networks)
+    device: ComputeDevice | None = None
 
     def within_stage(self, name: str) -> "ReconstructionContext":
         """Returns the context with all progress reported under ``name``, whatever stage name the called code

@@ -49,7 +49,9 @@ def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, l
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]] = views.capture.images
     if is_refined(head, settings) or settings.outputs.surface != "head":
         images = without_highlights(images, views.silhouettes, context.rig, mesh)
-        maps = estimate_depth(images, views.silhouettes, context.rig, mesh, settings.dense, report=context.progress)
+        maps = estimate_depth(
+            images, views.silhouettes, context.rig, mesh, settings.dense, report=context.progress, device=context.device
+        )
     votes = vote_parts(maps, labels.maps, context.rig)
     points = dense_points(maps, votes, mesh, settings.fine)
     on_face = points_on_face(points, mesh, head.model.levels["full"].face_region)

@@ -24,22 +24,23 @@ from pipeline.stereo.agreement import depth_maps
 from pipeline.stereo.crops import make_crops
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.depth_range import find_depth_ranges
+from pipeline.stereo.field import Field
+from pipeline.stereo.matcher import matching_on
 from pipeline.stereo.neighbours import choose_neighbours
-from pipeline.stereo.refinement import doubled, refined
+from pipeline.stereo.refinement import Pass, doubled, refined
 from pipeline.stereo.search import find_search_level, first_fields
 from pipeline.stereo.stack import stack_crops
 from pipeline.stereo.window import square_pattern
 from rig.mesh import Mesh
 from rig.progress import Progress
+from rig.render.compute import ComputeDevice
 from rig.rig import Rig
 
 COARSEST_LEVEL = 3  # level of the search's bounds: an eighth of the photographs' size
-# By how often the size was doubled since the search:
-STEPS_PX = ((1, 3), (1,), ())  # how far planes are taken over from
-# Surface of so few pixels is a chance match where other surface encloses it; the same area at both sizes. Of what is
-# told of an oily head, 6.5 % lay 2 mm off without it, 5.9 % do now; with 200 at the first, ears go.
-SPECKS_PX = (60, 240, 0)
-ROUNDS = (2, 2, 1)  # of least squares
+# By how often the size was doubled since the search. Surface of so few pixels as a speck has is a chance match where
+# other surface encloses it; the same area at both sizes. Of what is told of an oily head, 6.5 % lay 2 mm off without
+# it, 5.9 % do now; with 200 at the first, ears go.
+PASSES = (Pass((1, 3), 60, 2), Pass((1,), 240, 2), Pass((), 0, 1))
 DONE = {2: 0.4, 1: 0.6, 0: 0.95}  # share of the work, by level
 
 
@@ -52,6 +53,7 @@ def estimate_depth(
     settings: DenseSettings,
     *,
     report: Progress,
+    device: ComputeDevice | None = None,
 ) -> tuple[DepthMap, ...]:
     """Measures depth, normal and deviation in each photograph by matching it with its neighbours.
 
@@ -60,6 +62,7 @@ def estimate_depth(
         silhouettes: by camera name; a view whose silhouette is not usable takes no part.
         head_world: the head fitted so far (world, mm), which bounds the search from behind; None where there is none.
         report: called with ``"dense"`` and the share that is done; may raise to stop.
+        device: compares the windows; None: compiled loops do.
 
     Returns:
         One depth map for each view that takes part, in the order of the rig. With fewer than two views no depth is
@@ -76,17 +79,17 @@ def estimate_depth(
     stack = stack_crops(crops, first)
     depth_ranges = find_depth_ranges(crops, stack_crops(crops, COARSEST_LEVEL), stack, head_world, extent, settings)
     report("dense", 0.1)
-    fields = first_fields(stack, depth_ranges, neighbours, pattern, settings)
-    report("dense", 0.3)
+    fields: list[Field] = []
     for doublings in range(first + 1):
         level = first - doublings
         if doublings:
             stack = stack_crops(crops, level)
             fields = doubled(fields, stack, settings)
-        steps_px, rounds, speck_px = STEPS_PX[doublings], ROUNDS[doublings], SPECKS_PX[doublings]
-        fields = refined(
-            fields, stack, neighbours, pattern, settings, steps_px=steps_px, rounds=rounds, speck_px=speck_px
-        )
+        with matching_on(device, stack, neighbours, pattern, settings.contrast_levels) as matching:
+            if not doublings:
+                fields = first_fields(matching, depth_ranges, settings)
+                report("dense", 0.3)
+            fields = refined(fields, matching, settings, PASSES[doublings])
         report("dense", DONE[level])
     found = depth_maps(crops, stack, fields, settings)
     report("dense", 1.0)

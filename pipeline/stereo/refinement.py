@@ -5,18 +5,17 @@ allows: its windows see shading that smaller ones do not, and miss what is small
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import MAX_UNSEEN_PX
 from pipeline.stereo.field import Field
 from pipeline.stereo.field_kernels import double, fit_planes
-from pipeline.stereo.matching_kernels import make_scratch
-from pipeline.stereo.refine_kernels import propagate, slide
+from pipeline.stereo.matcher import Matching, Planes
 from pipeline.stereo.specks import take_specks_off
 from pipeline.stereo.stack import Stack
 
@@ -46,67 +45,43 @@ def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> l
     return map_in_threads(work, len(fields))
 
 
-def refined(
-    fields: Sequence[Field],
-    stack: Stack,
-    neighbours: Sequence[Int[np.ndarray, " _"]],
-    pattern: Float32[np.ndarray, "2 s"],
-    settings: DenseSettings,
-    *,
-    steps_px: Sequence[int],
-    rounds: int,
-    speck_px: int,
-) -> list[Field]:
-    """Improves the field of every view. Each pixel tries the planes of pixels ``steps_px`` away (odd; empty: none),
-    specks of at most ``speck_px`` pixels are replaced, and least squares then moves the planes in ``rounds`` rounds."""
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """How the planes are improved at one size."""
+
+    steps_px: tuple[int, ...]  # each pixel tries the planes of pixels that far away (odd)
+    speck_px: int  # pieces of surface of so few pixels are replaced
+    rounds: int  # of least squares
+
+
+def refined(fields: Sequence[Field], matching: Matching, settings: DenseSettings, once: Pass) -> list[Field]:
+    """Improves the field of every view: pixels take over each other's planes, specks are replaced, and least squares
+    then moves the planes."""
 
     def work(view: int) -> Field:
-        return _refined(
-            fields[view],
-            stack,
-            view,
-            neighbours[view],
-            pattern,
-            settings,
-            steps_px=steps_px,
-            rounds=rounds,
-            speck_px=speck_px,
-        )
+        return _refined(fields[view], matching, view, settings, once)
 
     return map_in_threads(work, len(fields))
 
 
-def _refined(
-    field: Field,
-    stack: Stack,
-    view: int,
-    neighbours: Int[np.ndarray, " m"],
-    pattern: Float32[np.ndarray, "2 s"],
-    settings: DenseSettings,
-    *,
-    steps_px: Sequence[int],
-    rounds: int,
-    speck_px: int,
-) -> Field:
-    sight = stack.match_arguments(view, neighbours, pattern, settings.contrast_levels)
-    scratch = make_scratch(sight)
+def _refined(field: Field, matching: Matching, view: int, settings: DenseSettings, once: Pass) -> Field:
+    matcher = matching.matcher(view)
     depth, slopes, live = field.depth.copy(), field.slopes.copy(), field.depth > 0.0
-    pixel_mm = float(depth[live].mean() / stack.lens[view, 0]) if live.any() else 1.0
+    pixel_mm = float(depth[live].mean() / matching.stack.lens[view, 0]) if live.any() else 1.0
     specks = np.zeros(depth.shape, bool)
-    if steps_px:
-        cost, fresh = np.full(depth.shape, -1.0, np.float32), live.copy()
+    if once.steps_px:
+        planes = Planes(depth, slopes, np.full(depth.shape, -1.0, np.float32), live.copy())
         black = np.indices(depth.shape).sum(axis=0) % 2 == 0
         for _ in range(PLANE_ROUNDS):
             for parity, tried in ((0, ~black), (1, black)):
-                propagate(sight, scratch, parity, np.array(steps_px), SAME_PX * pixel_mm, fresh, depth, slopes, cost)
-                fresh[tried] = False
-            specks = take_specks_off(depth, slopes, pixel_mm, speck_px)
-            cost[specks], fresh[specks] = -1.0, True
+                matcher.propagate(planes, parity, once.steps_px, SAME_PX * pixel_mm)
+                planes.fresh[tried] = False
+            specks = take_specks_off(depth, slopes, pixel_mm, once.speck_px)
+            planes.cost[specks], planes.fresh[specks] = -1.0, True
     before, known = depth, np.where(specks, np.float32(0.0), field.information) + MIN_INFORMATION
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
-    for _ in range(rounds):
-        place, seen, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
-        slide(sight, scratch, MAX_SLIDE_PX, depth, slopes, place, seen, likeness)
+    for _ in range(once.rounds):
+        place, seen, likeness = matcher.slide(MAX_SLIDE_PX, depth, slopes)
         seen = seen / (settings.match_factor**2 + settings.match_floor_mm**2 * seen)
         information = seen + known
         joined = np.where(live, (seen * place + known * before) / information, 0.0).astype(np.float32)

@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int32
+from jaxtyping import Float, Float32, Int32
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.settings import DenseSettings
 from pipeline.stereo.depth_range import DepthRange
 from pipeline.stereo.field import Field
-from pipeline.stereo.matching_kernels import make_scratch
-from pipeline.stereo.stack import Stack
-from pipeline.stereo.sweep_kernels import aggregate, sweep_view
+from pipeline.stereo.matcher import Matching
+from pipeline.stereo.sweep_kernels import aggregate
 from rig.camera import Camera
 
 # On the subject, of images that are searched: windows of 5 pixels then span 10 mm. At 512 x 384 a quarter of the size,
@@ -36,29 +35,16 @@ def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3
     return min(max(halvings, FIRST_LEVELS[0]), FIRST_LEVELS[-1])
 
 
-def first_fields(
-    stack: Stack,
-    depth_ranges: Sequence[DepthRange],
-    neighbours: Sequence[Int[np.ndarray, " _"]],
-    pattern: Float32[np.ndarray, "2 s"],
-    settings: DenseSettings,
-) -> list[Field]:
+def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange], settings: DenseSettings) -> list[Field]:
     """Finds a first depth in every view by trying depths in even steps through the range of each pixel. The information
-    of the returned fields is 0.
-
-    Args:
-        neighbours: of each view, those that it is compared with.
-        pattern: samples of a window, across and down from its middle, px.
-    """
+    of the returned fields is 0."""
 
     def work(view: int) -> Field:
         room = depth_ranges[view]
-        cost, strides = np.empty((*room.near.shape, settings.labels), np.float32), label_strides(room, settings)
-        sight = stack.match_arguments(view, neighbours[view], pattern, settings.contrast_levels)
-        sweep_view(sight, make_scratch(sight), room.near, room.far, room.slopes, strides, cost)
-        return _cheapest(cost, room, strides)
+        strides = label_strides(room, settings)
+        return _cheapest(matching.matcher(view).sweep(room, strides, settings.labels), room, strides)
 
-    return map_in_threads(work, len(stack))
+    return map_in_threads(work, len(matching.stack))
 
 
 def label_strides(room: DepthRange, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:

@@ -26,7 +26,6 @@ CLIP_PLANES = range(0x3000, 0x3006)  # GL_CLIP_DISTANCE0 and on, as many as shad
 
 
 @runtime_checkable
-@runtime_checkable
 class Releasable(Protocol):
     def release(self) -> None: ...
 
@@ -134,7 +133,7 @@ class GlContext:
             self.gl.release()
 
 
-def shader_source(name: str) -> str:
-    """Returns the text of ``shaders/<name>``; a line ``#include <file>`` stands for that file."""
-    lines = (SHADERS / name).read_text(encoding="utf-8").splitlines()
-    return "\n".join(shader_source(line.split()[1]) if line.startswith("#include") else line for line in lines)
+def shader_source(name: str, folder: Path = SHADERS) -> str:
+    """Returns the text of a file of ``folder``; a line ``#include FILE`` stands for that file."""
+    lines = (folder / name).read_text(encoding="utf-8").splitlines()
+    return "\n".join(shader_source(line.split()[1], folder) if line.startswith("#include") else line for line in lines)

@@ -20,7 +20,7 @@ from rig.text import suggest
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
 from server.tasks.child import Child, WorkFailed
-from server.tasks.egl import try_egl
+from server.tasks.egl import try_compute, try_egl
 
 OTHER_VARIABLES = frozenset({MODELS, THREADS, PREFIX + "DEBUG", CACHE})  # not read in ServiceSettings
 # The tables of server.storage.database and of the job engine in words of the databases' own: SQLAlchemy takes longer
@@ -55,6 +55,7 @@ def examine(settings: ServiceSettings) -> dict[str, Finding]:
     checks: dict[str, Callable[[ServiceSettings], tuple[bool, str]]] = {
         "python": _python,
         "egl": _egl,
+        "gpu": _gpu,
         "model": _model,
         "cores": _cores,
         "memory": _memory,
@@ -87,6 +88,16 @@ def _egl(settings: ServiceSettings) -> tuple[bool, str]:
         return True, child.remote(try_egl)()
     except WorkFailed as error:
         return False, error.message.text
+    finally:
+        child.close()
+
+
+def _gpu(settings: ServiceSettings) -> tuple[bool, str]:
+    child = Child()
+    try:
+        return True, child.remote(try_compute)()
+    except WorkFailed as error:
+        return True, f"none: {error.message.text}"  # the processor does what a GPU would
     finally:
         child.close()
 

@@ -123,6 +123,12 @@ def reconstruct(
             autocompletion=completing(_templates),
         ),
     ] = None,
+    device: Annotated[
+        str | None,
+        chosen(
+            "What compares photographs: auto (the default; a GPU where there is one), cpu or gl.", of_setting("device")
+        ),
+    ] = None,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     trace: Trace = None,
     data: Data = None,
@@ -138,7 +144,7 @@ def reconstruct(
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
     outputs |= {name: word for name, word in words.items() if word}
     options = {"outputs": outputs or None, "texture": {"chart": True} if chart else None}
-    document = settings_document(settings, method=method, front=front, detail=detail, **options)
+    document = settings_document(settings, method=method, front=front, detail=detail, device=device, **options)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
     for warning in written["warnings"]:

@@ -13,3 +13,13 @@ def try_egl(context: WorkerContext, report: Progress) -> str:
         return gl.description
     finally:
         gl.close()
+
+
+def try_compute(context: WorkerContext, report: Progress) -> str:
+    """Opens a compute device and says whether jobs use it by themselves. Raises ComputeUnavailable."""
+    from rig.render.compute import ComputeDevice, is_software
+
+    with ComputeDevice.create() as device:
+        if is_software(device.description):
+            return f"none; --device gl runs in software, slower than the processor: {device.description}"
+        return f"compares photographs: {device.description}"

@@ -56,6 +56,7 @@ def reconstruct_capture(
     from pipeline.templates.load import load_template
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
+    from server.tasks.matching_device import matching_device
     from server.tasks.photographs import calibration_warnings, read_scaled_capture
     from server.tasks.prepare import prepare_kernels
 
@@ -72,7 +73,11 @@ def reconstruct_capture(
         if stage != DONE:  # the files are still to be written
             report(stage, fraction)
 
-    done = reconstruct(ReconstructionContext(shot, rig, head_model, chosen, renderer, tell, once))
+    done = reconstruct(
+        ReconstructionContext(
+            shot, rig, head_model, chosen, renderer, tell, once, device=matching_device(context, chosen, renderer)
+        )
+    )
     report("write", 0.0)
     warnings = calibration_warnings(Path(capture)) or ()
     done = replace(done, warnings=(*warnings, *done.warnings))

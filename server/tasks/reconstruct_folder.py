@@ -63,6 +63,7 @@ def reconstruct_folder(
     from pipeline.stages.context import ReconstructionContext
     from pipeline.templates.load import load_template
     from rig.render.renderer import Renderer
+    from server.tasks.matching_device import matching_device
 
     report("read", 0.0)
     name = model or "default"
@@ -70,9 +71,10 @@ def reconstruct_folder(
         head_model = context.keep(f"model {name}", lambda: load_model(name))
         template = load_template(chosen.outputs.template, head_model)
         renderer = context.keep("renderer", Renderer.create)
+        device = matching_device(context, chosen, renderer)
     segment = partial(keep_masks, kept)
     reconstruction = ReconstructionContext(
-        prepared.capture, prepared.rig, head_model, chosen, renderer, report, segment
+        prepared.capture, prepared.rig, head_model, chosen, renderer, report, segment, device=device
     )
     done = reconstruct(reconstruction)
     done = replace(done, warnings=(*prepared.warnings, *done.warnings))

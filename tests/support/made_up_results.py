@@ -67,6 +67,7 @@ def made_up_result(
         name,
         "ab" * 32,
         settings or Settings(),
+        "cpu",
         {"images/cam00.png": "cd" * 32},
         Views(capture, silhouettes or {}, {}),
         Faces(None),

@@ -131,6 +131,7 @@ TEMPLATES = {
     "kind-number": "number",
     "kind-switch": "true or false",
     "no-opengl": "cannot start OpenGL on EGL ({reason}); on Debian and Ubuntu this installs a software driver, which needs no graphics card: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri",
+    "no-compute": "no OpenGL 4.3 for compute shaders on EGL ({reason}); --device cpu needs none",
     "renderer-of-other-thread": "a renderer belongs to one thread of one process: {why}; create another one there",
     "renderer-closed": "it was closed",
     "renderer-elsewhere": "it was made elsewhere",

@@ -931,6 +931,7 @@ export default {
   "kind-number": "keine Zahl",
   "kind-switch": "weder true noch false",
   "no-opengl": "OpenGL lässt sich auf EGL nicht starten ({reason}); unter Debian und Ubuntu installiert dies einen Treiber in Software, der keine Grafikkarte braucht: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri",
+  "no-compute": "kein OpenGL 4.3 für Compute-Shader auf EGL ({reason}); --device cpu braucht keines",
   "renderer-of-other-thread": "ein Renderer gehört einem Thread eines Prozesses: {why}; dort einen neuen anlegen",
   "renderer-closed": "er wurde geschlossen",
   "renderer-elsewhere": "er wurde anderswo angelegt",

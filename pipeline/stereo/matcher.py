@@ -1,0 +1,192 @@
+"""Windows of the views compared with each other, at one size of the photographs: by compiled loops, or on a GPU.
+
+Both do the same; the loops are the reference. In the shaders all arithmetic is of single precision, and their order of
+operations is the driver's: depths differ by hundredths of a millimetre.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, Int32
+
+from pipeline.stereo.depth_range import DepthRange
+from pipeline.stereo.matching_kernels import Sight, farthest, make_scratch
+from pipeline.stereo.refine_kernels import propagate, slide
+from pipeline.stereo.stack import SHADES, Stack
+from pipeline.stereo.sweep_kernels import sweep_view
+from rig.render.compute import ComputeDevice, DeviceArray
+
+SHADERS = Path(__file__).with_name("shaders")
+GROUP = 8  # invocations across and down of one group, as in shaders/matching.glsl
+
+
+class Planes(NamedTuple):
+    """The plane that each pixel of a view has, and what is known of it; the arrays change in place."""
+
+    depth: Float32[np.ndarray, "h w"]  # mm; 0 where there is none
+    slopes: Float32[np.ndarray, "h w 2"]  # by x and y, mm a pixel
+    cost: Float32[np.ndarray, "h w"]  # below 0: not yet known
+    fresh: Bool[np.ndarray, "h w"]  # neighbours have not tried it yet
+
+
+class Matcher(Protocol):
+    """Compares windows of one view, on planes, with its neighbours."""
+
+    def sweep(
+        self, room: DepthRange, strides: Int32[np.ndarray, "h w"], labels: int
+    ) -> Float32[np.ndarray, "h w labels"]:
+        """Returns the cost of each place through the range of each pixel; ``strides``: one label in so many is matched,
+        those between are interpolated."""
+        ...
+
+    def propagate(self, planes: Planes, parity: int, steps_px: Sequence[int], same_mm: float) -> None:
+        """Lets pixels of one colour of the chequerboard take over their neighbours' planes where those cost less, as
+        ``refine_kernels.propagate`` says; changes ``planes``."""
+        ...
+
+    def slide(
+        self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
+    ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+        """Returns where a step of least squares puts each depth (mm, at most ``most_px`` away), the information
+        (1 / mm^2) and the likeness."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matching:
+    """Holds the views at one size and what their windows are compared by.
+
+    Attributes:
+        stack: the views.
+        neighbours: of each view, those that it is compared with.
+        pattern: samples of a window, across and down from its middle, px.
+        contrast_levels: difference in grey levels at which a sample counts half.
+        device: what compares; None: compiled loops.
+        uploaded: the stack's pixels and distances on the device.
+    """
+
+    stack: Stack
+    neighbours: Sequence[Int[np.ndarray, " _"]]
+    pattern: Float32[np.ndarray, "2 s"]
+    contrast_levels: float
+    device: ComputeDevice | None = None
+    uploaded: tuple[DeviceArray, ...] = ()
+
+    def matcher(self, view: int) -> Matcher:
+        """Returns what compares one view; for one thread."""
+        if self.device is None:
+            others = self.neighbours[view]
+            return LoopMatcher(self.stack.match_arguments(view, others, self.pattern, self.contrast_levels))
+        return ShaderMatcher(self, view, self.device)
+
+
+@contextmanager
+def matching_on(
+    device: ComputeDevice | None,
+    stack: Stack,
+    neighbours: Sequence[Int[np.ndarray, " _"]],
+    pattern: Float32[np.ndarray, "2 s"],
+    contrast_levels: float,
+) -> Iterator[Matching]:
+    """Yields the matching of a stack, whose pixels lie on the device until the end. A stack that is too large for the
+    device is matched by compiled loops."""
+    if device is None or stack.pairs.nbytes > device.largest_array:
+        yield Matching(stack, neighbours, pattern, contrast_levels)
+        return
+    with device.uploaded(stack.pairs, stack.distance_px, np.ascontiguousarray(pattern.T)) as held:
+        yield Matching(stack, neighbours, pattern, contrast_levels, device, held)
+
+
+class LoopMatcher:
+    """Compares windows by compiled loops."""
+
+    def __init__(self, sight: Sight) -> None:
+        self._sight, self._scratch = sight, make_scratch(sight)
+
+    def sweep(
+        self, room: DepthRange, strides: Int32[np.ndarray, "h w"], labels: int
+    ) -> Float32[np.ndarray, "h w labels"]:
+        cost = np.empty((*room.near.shape, labels), np.float32)
+        sweep_view(self._sight, self._scratch, room.near, room.far, room.slopes, strides, cost)
+        return cost
+
+    def propagate(self, planes: Planes, parity: int, steps_px: Sequence[int], same_mm: float) -> None:
+        steps = np.array(steps_px)
+        propagate(
+            self._sight, self._scratch, parity, steps, same_mm, planes.fresh, planes.depth, planes.slopes, planes.cost
+        )
+
+    def slide(
+        self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
+    ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+        place_mm, information, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
+        slide(self._sight, self._scratch, most_px, depth, slopes, place_mm, information, likeness)
+        return place_mm, information, likeness
+
+
+class ShaderMatcher:
+    """Compares windows by compute shaders."""
+
+    def __init__(self, matching: Matching, view: int, device: ComputeDevice) -> None:
+        stack, others = matching.stack, matching.neighbours[view]
+        self._device, (pairs, distances, pattern) = device, matching.uploaded
+        self._shared = (pairs, distances, packed_ways(stack, view, others), pattern)
+        self._constants = {"SAMPLES": matching.pattern.shape[1], "VIEWS": max(len(others), 1)}
+        self._size = int(stack.size[view][0]), int(stack.size[view][1])
+        self._uniforms = {
+            "start": int(stack.offset[view]),
+            "size": self._size,
+            "view_count": len(others),
+            "noise": float(stack.noise[view]),
+            "contrast": matching.contrast_levels * SHADES,
+            "reach": float(farthest(matching.pattern)),
+        }
+
+    def sweep(
+        self, room: DepthRange, strides: Int32[np.ndarray, "h w"], labels: int
+    ) -> Float32[np.ndarray, "h w labels"]:
+        cost = np.empty((*room.near.shape, labels), np.float32)
+        self._run("sweep.comp", [room.near, room.far, room.slopes, strides, cost], [4], labels=labels)
+        return cost
+
+    def propagate(self, planes: Planes, parity: int, steps_px: Sequence[int], same_mm: float) -> None:
+        flags, steps = planes.fresh.astype(np.uint32), np.array(steps_px, np.int32)
+        self._run(
+            "propagate.comp", [flags, planes.depth, planes.slopes, planes.cost, steps], [0, 1, 2, 3],
+            across=2, parity=parity, step_count=len(steps), same_mm=same_mm,
+        )  # fmt: skip
+        planes.fresh[:] = flags != 0
+
+    def slide(
+        self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
+    ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+        results = np.empty((*depth.shape, 4), np.float32)
+        self._run("slide.comp", [depth, slopes, results], [2], most_px=most_px)
+        return results[:, :, 0].copy(), results[:, :, 1].copy(), results[:, :, 2].copy()
+
+    def _run(
+        self, shader: str, arrays: list[np.ndarray], written: list[int], *, across: int = 1, **uniforms: float
+    ) -> None:
+        """Runs a shader over the view's pixels; one invocation takes ``across`` pixels of a row. ``written``: of
+        ``arrays``, which are bound after those that all shaders share."""
+        width, height = self._size
+        groups = -(-width // (across * GROUP)), -(-height // GROUP)
+        first = len(self._shared)
+        self._device.run(
+            SHADERS / shader, groups, [*self._shared, *arrays], [first + k for k in written],
+            constants=self._constants, uniforms={**self._uniforms, **uniforms},
+        )  # fmt: skip
+
+
+def packed_ways(stack: Stack, view: int, others: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 16"]:
+    """Returns the ways from a view to others as ``Way`` of shaders/matching.glsl has them; the last three numbers of a
+    row are integers. At least one row: no buffer may be empty."""
+    ways = stack.homographies(view, others)
+    packed = np.zeros((max(len(ways), 1), 16), np.float32)
+    packed[: len(ways), :12], packed[: len(ways), 12] = ways[:, :12], ways[:, 15]
+    packed.view(np.int32)[: len(ways), 13:] = ways[:, [14, 12, 13]]
+    return packed

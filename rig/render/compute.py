@@ -1,0 +1,152 @@
+"""Compute shaders: the GPU as a calculator, for whoever has a shader and arrays.
+
+OpenGL 4.3 on EGL, as silhouettes use it, so that no other driver is needed; Mesa's software renderer runs the same
+shaders where there is no GPU, slower than compiled loops do.
+"""
+
+import contextlib
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import moderngl
+import numpy as np
+
+from rig.errors import EigenheadError
+from rig.messages.message import compose
+from rig.render.context import Owned, shader_source
+
+DeviceName = Literal["auto", "cpu", "gl"]
+SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "software")  # in the name of a renderer that is no GPU
+GLSL = "#version 430 core"
+Uniforms = Mapping[str, float | int | tuple[int, int]]
+
+
+class ComputeUnavailable(EigenheadError):
+    """Reports that no compute shader can run on this machine."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(compose("no-compute", reason=reason))
+
+
+class DeviceArray:
+    """Holds an array in the memory of a compute device."""
+
+    def __init__(self, buffer: moderngl.Buffer) -> None:
+        self.buffer = buffer
+
+
+class ComputeDevice:
+    """Runs compute shaders in an OpenGL context of its own, for any thread of one process: one at a time, others wait.
+
+    ``with ComputeDevice.create() as device: ...``. Raises ComputeUnavailable where there is no OpenGL 4.3.
+    """
+
+    def __init__(self) -> None:
+        try:
+            self._gl: moderngl.Context = moderngl.create_context(standalone=True, require=430, backend="egl")  # type: ignore[arg-type]
+        except Exception as error:  # moderngl and glcontext raise bare Exceptions of several kinds
+            raise ComputeUnavailable(str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+        self._lock = threading.Lock()
+        self._shaders: dict[str, moderngl.ComputeShader] = {}
+        with self._gl:
+            info = self._gl.info
+            self.description = f"{info['GL_RENDERER']}, {info['GL_VERSION']}"
+            self.largest_array = int(info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])  # bytes
+
+    @classmethod
+    def create(cls) -> "ComputeDevice":
+        return cls()
+
+    def __enter__(self) -> "ComputeDevice":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Frees the context and all that it holds."""
+        with self._lock:
+            self._gl.release()
+
+    @contextlib.contextmanager
+    def uploaded(self, *arrays: np.ndarray) -> Iterator[tuple[DeviceArray, ...]]:
+        """Yields copies of the arrays on the device, which are freed at the end."""
+        with self._current():
+            held = tuple(DeviceArray(self._gl.buffer(np.ascontiguousarray(array))) for array in arrays)
+        try:
+            yield held
+        finally:
+            with self._current():
+                for each in held:
+                    each.buffer.release()
+
+    def run(
+        self,
+        shader: Path,
+        groups: tuple[int, int],
+        arrays: Sequence[DeviceArray | np.ndarray],
+        written: Sequence[int],
+        *,
+        constants: Mapping[str, int],
+        uniforms: Uniforms,
+    ) -> None:
+        """Runs a shader over ``groups`` of invocations across and down.
+
+        Args:
+            shader: file of its source; ``#include`` reads beside it.
+            arrays: of the bindings from 0 on; an array of NumPy is copied there for this run.
+            written: bindings of arrays of NumPy, contiguous, that receive what the shader wrote.
+            constants: defined for the preprocessor; each choice is compiled once.
+            uniforms: by name.
+        """
+        with self._current(), Owned() as owned:
+            program = self._program(shader, constants)
+            for name, value in uniforms.items():
+                program[name] = value
+            buffers = []
+            for binding, array in enumerate(arrays):
+                buffers.append(array.buffer if isinstance(array, DeviceArray) else owned(self._gl.buffer(array)))
+                buffers[-1].bind_to_storage_buffer(binding)
+            program.run(*groups)
+            self._gl.memory_barrier()
+            for binding in written:
+                buffers[binding].read_into(arrays[binding])
+
+    def _program(self, shader: Path, constants: Mapping[str, int]) -> moderngl.ComputeShader:
+        defines = [f"#define {name} {value}" for name, value in sorted(constants.items())]
+        source = "\n".join([GLSL, *defines, shader_source(shader.name, shader.parent)])
+        if source not in self._shaders:
+            self._shaders[source] = self._gl.compute_shader(source)
+        return self._shaders[source]
+
+    @contextlib.contextmanager
+    def _current(self) -> Iterator[None]:
+        with self._lock, self._gl:
+            yield
+
+
+def open_device(name: DeviceName, renderer: str) -> ComputeDevice | None:
+    """Returns the device to compute on; None for the processor.
+
+    Args:
+        name: ``gl`` is any OpenGL, ``auto`` a GPU where there is one.
+        renderer: description of the OpenGL that draws.
+
+    Raises:
+        ComputeUnavailable: where ``gl`` is asked for and cannot be had.
+    """
+    if name == "cpu" or (name == "auto" and is_software(renderer)):
+        return None
+    try:
+        return ComputeDevice.create()
+    except ComputeUnavailable:
+        if name == "gl":
+            raise
+        return None
+
+
+def is_software(renderer: str) -> bool:
+    """Tells whether a renderer's description is of a program that draws with the processor."""
+    return any(word in renderer.lower() for word in SOFTWARE)
