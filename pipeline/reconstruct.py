@@ -3,7 +3,7 @@
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.stages.alignment import Alignment, align_head
-from pipeline.stages.bust import fuse_bust
+from pipeline.stages.bust import colour_bust, fuse_depth, shape_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import measure_depth
 from pipeline.stages.evidence import judge_head
@@ -41,11 +41,13 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     alignment = run(align_head, context, views, faces)
     labels, head = fit_shape(run, context, views, alignment)
     depth = run(measure_depth, context, views, head, labels)
-    refined = run(refine_head, context, views, faces, head, labels, depth)
-    texturing = run(texture_head, context, views, head, refined)
-    bust = run(fuse_bust, context, views, depth, refined, texturing.capture)
-    pose = run(check_pose, context, faces, alignment, head, refined)
-    evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
+    with run.beside(fuse_depth, context, views, head.mesh_world, depth) as fused:
+        refined = run(refine_head, context, views, faces, head, labels, depth)
+    with run.beside(shape_bust, context, depth, refined, fused.product) as surface:
+        texturing = run(texture_head, context, views, head, refined)
+        pose = run(check_pose, context, faces, alignment, head, refined)
+        evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
+    bust = run(colour_bust, context, views, surface.product, texturing.capture)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(

@@ -1,8 +1,9 @@
 """What runs on which thread when, recorded for Chrome's trace viewer and Perfetto, and for ``experiments scaling``.
 
 Nothing is recorded, and nothing but one test is paid, unless a trace is active. Stages, parts of stages, shared loops
-and their slices are spans of one thread each; those of one thread nest. Wall clock and processor seconds stand side by
-side: on a busy machine only the latter say what work there was.
+and their slices are spans of one thread each; those of one thread nest. A stage that runs beside others lies in a
+``background``, the others in the ``foreground`` of the same name. Wall clock and processor seconds stand side by side:
+on a busy machine only the latter say what work there was.
 """
 
 import functools
@@ -17,7 +18,7 @@ from typing import Any, Literal, ParamSpec, TypeVar
 
 FORMAT = "eigenhead-trace/1"
 JOB = "job"
-Kind = Literal["job", "stage", "part", "loop", "slice"]
+Kind = Literal["job", "background", "foreground", "stage", "part", "loop", "slice"]
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -18,7 +18,7 @@ from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences, without_crossings
 from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
-from pipeline.fusion.refinement import refine_vertices
+from pipeline.fusion.refinement import Measured, refine_vertices
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
 from pipeline.fusion.skin import drawn_to_skin
 from pipeline.fusion.view_stack import stack_views
@@ -57,18 +57,27 @@ class BustSurface:
         return self.views > 0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthSurface:
+    """Holds the surface as the depth maps have it: of one piece, the windows' bias taken off; it may still cross
+    itself."""
+
+    mesh_world: Mesh
+    safe_world: Float[np.ndarray, "v 3"]  # places (mm) with which the mesh cannot cross itself
+    measured: Measured
+    warnings: tuple[ReportWarning, ...]
+
+
 def fuse(
     depth_maps: Sequence[DepthMap],
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     head_world: Mesh | None,
     *,
-    votes: PartVotes | None,
     bias: WindowBias,
     settings: BustSettings,
-    head_skin_world: Mesh | None = None,
     report: Progress,
-) -> BustSurface:
+) -> DepthSurface:
     """Returns the closed surface that the views agree on.
 
     Args:
@@ -76,10 +85,8 @@ def fuse(
         silhouettes: by camera, at least of the depth maps' cameras.
         rig: the cameras as calibrated, world frame.
         head_world: the fitted head, closed but for its neck (mm); None where there is none.
-        votes: what the places show; without them all that is seen counts as skin.
         bias: what the depth maps' windows err.
         settings: spacing of the vertices.
-        head_skin_world: what of the fitted head the photographs measured, where they did; seen skin agrees with it.
         report: called with the stage's progress.
 
     Raises:
@@ -93,21 +100,33 @@ def fuse(
     level = solve(maps, views, head_world, settings.spacing_mm)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
+    report("bust", 0.8)
     mesh, measured = refine_vertices(net, views, settings.spacing_mm)
     measured = without_islands(mesh, measured)
+    names = [depth_map.camera.name for depth_map in maps]
+    warnings = tuple(_mask_warnings(names, contradicted))
+    return DepthSurface(without_bias(mesh, measured.views > 0, bias), safe, measured, warnings)
+
+
+@traced
+def finished(surface: DepthSurface, votes: PartVotes | None, head_skin_world: Mesh | None) -> BustSurface:
+    """Returns the surface in agreement with the head, without self-intersections, and what it shows.
+
+    Args:
+        surface: as the depth maps have it.
+        votes: what the places show; without them all that is seen counts as skin.
+        head_skin_world: what of the fitted head the photographs measured, where they did; seen skin agrees with it.
+    """
+    mesh, measured = surface.mesh_world, surface.measured
     seen = measured.views > 0
-    mesh = without_bias(mesh, seen, bias)
     if head_skin_world is not None:
         skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, Part.SKIN.channel]
         mesh = drawn_to_skin(mesh, seen * skin, head_skin_world, seen_deviation_mm(measured))
-    mesh, _ = without_crossings(mesh, safe)
+    mesh, _ = without_crossings(mesh, surface.safe_world)
     mesh = without_coincidences(mesh)
-    report("bust", 0.9)
     shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
-    names = [depth_map.camera.name for depth_map in maps]
-    warnings = tuple(_mask_warnings(names, contradicted))
-    return BustSurface(mesh, deviation_mm(mesh, measured), part, measured.views, warnings)
+    return BustSurface(mesh, deviation_mm(mesh, measured), part, measured.views, surface.warnings)
 
 
 def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -> Iterator[ReportWarning]:

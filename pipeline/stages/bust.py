@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.fusion.fusion import BustSurface, fuse
+from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import part_of
 from pipeline.geometry.raster import depth_maps
@@ -37,32 +37,52 @@ class Bust:
 
 
 @stage("bust")
-def fuse_bust(
-    context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, coloured: Capture
-) -> Staged[Bust | None]:
-    """Fuses the depth maps to one closed mesh, coloured from the photographs of ``coloured``.
+def fuse_depth(
+    context: ReconstructionContext, views: Views, head_world: Mesh, depth: Depth
+) -> Staged[DepthSurface | None]:
+    """Fuses the depth maps to one closed surface, with the fitted head where nobody looks.
 
     Returns None if the settings ask for the head only, and None with the warning ``no-bust`` if the depth maps do not
     determine a surface.
     """
-    settings, rig, displaced = context.settings, context.rig, refined.displaced
+    settings = context.settings
     if settings.outputs.surface == "head":
         return Staged(None)
     try:
         surface = fuse(
             depth.maps,
             views.silhouettes,
-            rig,
-            refined.mesh_world,
-            votes=depth.votes,
+            context.rig,
+            head_world,
             bias=depth.window_bias,
             settings=settings.bust,
-            head_skin_world=None if displaced is None else part_of(refined.mesh_world, displaced.observed),
             report=context.progress,
         )
     except NoSurface as reason:
         return Staged(None, [compose("no-bust", reason=reason.message)])
-    mesh = surface.mesh_world
+    return Staged(surface, surface.warnings)
+
+
+@stage("bust")
+def shape_bust(
+    context: ReconstructionContext, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
+) -> Staged[BustSurface | None]:
+    """Brings the fused surface into agreement with the delivered head, and untangles it."""
+    if fused is None:
+        return Staged(None)
+    displaced = refined.displaced
+    skin = None if displaced is None else part_of(refined.mesh_world, displaced.observed)
+    return Staged(finished(fused, depth.votes, skin))
+
+
+@stage("bust")
+def colour_bust(
+    context: ReconstructionContext, views: Views, surface: BustSurface | None, coloured: Capture
+) -> Staged[Bust | None]:
+    """Colours the bust from the photographs of ``coloured``."""
+    if surface is None:
+        return Staged(None)
+    settings, rig, mesh = context.settings, context.rig, surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
     colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
-    return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm), surface.warnings)
+    return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm))

@@ -1,13 +1,18 @@
 """How stages are run: the one place that collects warnings and seconds and tells progress."""
 
+import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Concatenate, Generic, ParamSpec, TypeVar
 
+from pipeline.compute.threads import thread_count
 from pipeline.compute.trace import span
 from pipeline.stages.context import ReconstructionContext
 from pipeline.warnings import ReportWarning
+from rig.errors import Cancelled
 from rig.progress import Progress
 
 T = TypeVar("T")
@@ -45,11 +50,18 @@ def stage(name: str) -> Callable[[StageFunction[P, T]], Stage[P, T]]:
     return named
 
 
+class Pending(Generic[T]):
+    """Holds what a stage that runs beside others makes; ``product`` may be read once their block has ended."""
+
+    product: T
+
+
 class Recorder:
-    """Runs stages one after the other and records their seconds and warnings.
+    """Runs stages one after the other, or one beside others, and records their seconds and warnings.
 
     ``progress`` is called when a stage begins, and by the stage as it advances; if it raises Cancelled, the stage does
-    too.
+    too. A stage that runs beside others tells no progress, and its seconds are those that were waited for it: so all
+    seconds add up to the job's.
     """
 
     def __init__(self, progress: Progress) -> None:
@@ -61,9 +73,45 @@ class Recorder:
     def __call__(self, stage: Stage[P, T], context: ReconstructionContext, *products: P.args, **options: P.kwargs) -> T:
         self._progress(stage.name, 0.0)
         began = time.perf_counter()
-        with span("stage", stage.name):
-            staged = stage(context.within_stage(stage.name), *products, **options)
-        self._seconds[stage.name] = self._seconds.get(stage.name, 0.0) + time.perf_counter() - began
+        staged = _run(stage, context.within_stage(stage.name), *products, **options)
+        return self._record(stage.name, began, staged)
+
+    @contextmanager
+    def beside(
+        self, stage: Stage[P, T], context: ReconstructionContext, *products: P.args, **options: P.kwargs
+    ) -> Iterator[Pending[T]]:
+        """Runs a stage in a thread of its own while the block runs others; waits for it at the block's end. It may use
+        nothing that belongs to the calling thread, as the renderer does. Where one thread is allowed it runs before
+        the block.
+
+        If the block fails, the stage is stopped when it next tells its progress. Raises what the stage raises.
+        """
+        pending, abandoned = Pending[T](), threading.Event()
+
+        def go_on(_: str, __: float) -> None:
+            if abandoned.is_set():
+                raise Cancelled
+
+        quiet = replace(context, progress=go_on)
+        if thread_count() == 1:
+            began = time.perf_counter()
+            pending.product = self._record(stage.name, began, _run_behind(stage, quiet, *products, **options))
+            with span("foreground", stage.name):
+                yield pending
+            return
+        with ThreadPoolExecutor(1, thread_name_prefix=stage.name) as pool:
+            future: Future[Staged[T]] = pool.submit(_run_behind, stage, quiet, *products, **options)
+            try:
+                with span("foreground", stage.name):
+                    yield pending
+            except BaseException:
+                abandoned.set()
+                raise
+            began = time.perf_counter()
+            pending.product = self._record(stage.name, began, future.result())
+
+    def _record(self, name: str, began: float, staged: Staged[T]) -> T:
+        self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - began
         self._warnings += staged.warnings
         return staged.product
 
@@ -74,3 +122,15 @@ class Recorder:
     def seconds(self) -> dict[str, float]:
         """Returns the seconds of every stage, and ``total`` since the recorder was made."""
         return self._seconds | {"total": time.perf_counter() - self._started}
+
+
+def _run(stage: Stage[P, T], context: ReconstructionContext, /, *products: P.args, **options: P.kwargs) -> Staged[T]:
+    with span("stage", stage.name):
+        return stage(context, *products, **options)
+
+
+def _run_behind(
+    stage: Stage[P, T], context: ReconstructionContext, /, *products: P.args, **options: P.kwargs
+) -> Staged[T]:
+    with span("background", stage.name):
+        return _run(stage, context, *products, **options)

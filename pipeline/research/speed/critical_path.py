@@ -3,7 +3,8 @@
 What is in no shared loop stays as it is: it takes one core. A loop's slices are scheduled as
 ``pipeline.compute.threads`` does it, the next one to whoever is free first. Cores are all alike and do not hold each
 other up (no memory that is too slow, no interpreter lock), so that the seconds are a bound from below; nested loops
-have the cores that the slices around them leave.
+have the cores that the slices around them leave. A stage in the background takes no longer than the stages before it
+where there are cores for both.
 """
 
 import heapq
@@ -14,8 +15,6 @@ from typing import Any
 
 from pipeline.compute.threads import cut, slice_count
 from pipeline.compute.trace import FORMAT
-
-WHOLE = ("job", "stage", "part")
 
 
 @dataclass(slots=True, eq=False)
@@ -85,6 +84,7 @@ class JobWork:
 
     stages: tuple[Section, ...]
     parts: tuple[Section, ...]
+    beside: tuple[tuple[Section, Section], ...] = ()  # of stages: in the background, and those before it
 
     @property
     def cpu_s(self) -> float:
@@ -92,10 +92,17 @@ class JobWork:
 
     @property
     def serial_s(self) -> float:
-        return sum(stage.serial_s for stage in self.stages)
+        """Returns the processor seconds that no other core can take over."""
+        hidden = sum(min(behind.serial_s, before.serial_s) for behind, before in self.beside)
+        return sum(stage.serial_s for stage in self.stages) - hidden
 
     def seconds(self, cores: int) -> float:
-        return sum(stage.seconds(cores) for stage in self.stages)
+        """Returns how long the job takes on so many cores."""
+        saved = 0.0
+        for behind, before in self.beside:
+            apart = behind.seconds(cores), before.seconds(cores)
+            saved += sum(apart) - max(*apart, (behind.cpu_s + before.cpu_s) / cores)
+        return sum(stage.seconds(cores) for stage in self.stages) - saved
 
     def loops(self) -> dict[str, list[Loop]]:
         """Returns the outer loops by name."""
@@ -120,6 +127,8 @@ def work_of(document: Mapping[str, Any]) -> JobWork:
     spans = [event for event in document["traceEvents"] if event["ph"] == "X"]
     stages = {"start": Section("start", document["before_cpu_s"])}
     parts: dict[str, Section] = {}
+    beside: dict[str, list[Section]] = {"background": [], "foreground": []}
+    regions: dict[int, Section] = {}
     loops = {span["args"]["loop"]: _loop(span) for span in spans if span["cat"] == "loop"}
     slices: dict[int, Slice] = {}
     between_s = 0.0
@@ -131,6 +140,9 @@ def work_of(document: Mapping[str, Any]) -> JobWork:
         elif kind == "stage":
             stages.setdefault(name, Section(name)).cpu_s += arguments["process_cpu_s"]
             between_s -= arguments["process_cpu_s"]
+        elif kind in beside:
+            regions[id(span)] = Section(name, arguments["process_cpu_s"])
+            beside[kind].append(regions[id(span)])
         elif kind == "part":
             if not any(outer["cat"] == "slice" for outer in around):
                 parts.setdefault(f"{stage}: {name}", Section(f"{stage}: {name}")).cpu_s += arguments["process_cpu_s"]
@@ -151,7 +163,10 @@ def work_of(document: Mapping[str, Any]) -> JobWork:
             for outer in around:
                 if outer["cat"] == "part":
                     parts[f"{stage}: {outer['name']}"].loops.append(loop)
-    return JobWork((*stages.values(), Section("between", max(0.0, between_s))), tuple(parts.values()))
+                elif id(outer) in regions:
+                    regions[id(outer)].loops.append(loop)
+    pairs = tuple(zip(beside["background"], beside["foreground"], strict=True))
+    return JobWork((*stages.values(), Section("between", max(0.0, between_s))), tuple(parts.values()), pairs)
 
 
 def _loop(span: Mapping[str, Any]) -> Loop:

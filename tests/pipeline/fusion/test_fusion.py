@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.fusion.fusion import BustSurface, NoSurface, fuse
+from pipeline.fusion.fusion import BustSurface, NoSurface, finished, fuse
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import BustSettings
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.window_bias import WindowBias
 from rig.mesh import Mesh, face_normals
+from rig.progress import discard_progress
 from rig.rig import Rig
 from tests.support.closed_meshes import check_closed
 from tests.support.ellipsoid_depths import Ellipsoid, Scene, pinhole_fan, scene
@@ -22,16 +23,10 @@ SPACING = BustSettings(spacing_mm=3.0)
 
 
 def fused(made: Scene, head: Mesh | None = None, settings: BustSettings = SPACING) -> BustSurface:
-    return fuse(
-        made.maps,
-        made.silhouettes,
-        made.rig,
-        head,
-        votes=None,
-        bias=WindowBias(),
-        settings=settings,
-        report=lambda stage, share: None,
+    surface = fuse(
+        made.maps, made.silhouettes, made.rig, head, bias=WindowBias(), settings=settings, report=discard_progress
     )
+    return finished(surface, None, None)
 
 
 def seen_errors(surface: BustSurface, made: Scene) -> np.ndarray:

@@ -15,7 +15,7 @@ from pipeline.head_model.model import load_model
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import BustSettings, OutputSettings, Settings, settings_from_document
-from pipeline.stages.bust import Bust, fuse_bust
+from pipeline.stages.bust import Bust, colour_bust, fuse_depth, shape_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.refined_head import RefinedHead
@@ -57,7 +57,10 @@ def photographed(renderer: Renderer) -> tuple[Bust, Capture, dict]:
     bias = WindowBias()
     depth = Depth(made.maps, images, None, nothing, points_on_face(nothing, head, np.zeros(0, bool)), bias)
     refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", verbatim("planted")))
-    bust = fuse_bust(context, Views(capture, made.silhouettes, {}), depth, refined, capture).product
+    views = Views(capture, made.silhouettes, {})
+    fused = fuse_depth(context, views, head, depth).product
+    surface = shape_bust(context, depth, refined, fused).product
+    bust = colour_bust(context, views, surface, capture).product
     assert bust is not None
     return bust, capture, made.silhouettes
 

@@ -15,7 +15,7 @@ from rig.render.renderer import Renderer
 from tests.support.scenes import fan
 
 PAUSE_S = 0.02
-DIM = compose("view", remark="cam00: dim")
+DIM, BESIDE = compose("view", remark="cam00: dim"), compose("view", remark="cam01: dim")
 
 
 @stage("measure")
@@ -71,3 +71,52 @@ def _told_to(context: ReconstructionContext, progress) -> ReconstructionContext:
     return ReconstructionContext(
         context.capture, context.rig, context.model, context.settings, context.renderer, progress
     )
+
+
+@stage("slowly")
+def slowly(context: ReconstructionContext, pauses: int, done: list[int]) -> Staged[int]:
+    for pause in range(pauses):
+        context.progress("within", pause / pauses)
+        time.sleep(PAUSE_S)
+        done.append(pause)
+    return Staged(pauses, [BESIDE])
+
+
+def test_a_stage_beside_others_has_the_seconds_that_were_waited_for_it(
+    context: ReconstructionContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EIGENHEAD_THREADS", "2")
+    reported: list[str] = []
+    run, done = Recorder(lambda name, fraction: reported.append(name)), list[int]()
+    with run.beside(slowly, context, 5, done) as pending:
+        run(measure, context, 1)
+    assert pending.product == 5
+    assert done == [*range(5)]
+    assert reported == ["measure"], "only what the job waits for tells how far it is"
+    assert run.warnings == (DIM, BESIDE)
+    seconds = run.seconds()
+    assert seconds["slowly"] + seconds["measure"] <= seconds["total"] + 1e-3
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_a_failed_block_stops_the_stage_beside_it(
+    context: ReconstructionContext, monkeypatch: pytest.MonkeyPatch, threads: str
+) -> None:
+    monkeypatch.setenv("EIGENHEAD_THREADS", threads)
+    run, done = Recorder(lambda name, fraction: None), list[int]()
+    with pytest.raises(Cancelled), run.beside(slowly, context, 200 if threads == "2" else 2, done):
+        raise Cancelled
+    assert len(done) < 100
+    held = len(done)
+    time.sleep(3 * PAUSE_S)
+    assert len(done) == held, "nothing works on when the job has ended"
+
+
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_what_fails_beside_fails_the_job(
+    context: ReconstructionContext, monkeypatch: pytest.MonkeyPatch, threads: str
+) -> None:
+    monkeypatch.setenv("EIGENHEAD_THREADS", threads)
+    run = Recorder(lambda name, fraction: None)
+    with pytest.raises(TypeError), run.beside(double, context, 1, times=None):  # pyright: ignore[reportArgumentType]
+        pass

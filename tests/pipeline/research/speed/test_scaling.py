@@ -53,6 +53,22 @@ def test_slices_go_to_the_core_that_is_free_first() -> None:
     assert schedule([], 4) == 0
 
 
+def test_a_stage_in_the_background_hides_behind_the_others() -> None:
+    """6 s, 4 of them shared out, behind 3 s that are serial: one core 9, two 4.5, four 3 s."""
+    spans = [
+        span("job", "job", 0, 10),
+        span("background", "b", 0, 6),
+        span("stage", "b", 0, 6),
+        *loop(0, 1, [0.25] * 16),
+        span("foreground", "b", 6, 9),
+        span("stage", "a", 6, 9),
+    ]
+    work = work_of(document(*spans))
+    assert [work.seconds(cores) for cores in (1, 2, 4)] == pytest.approx([10.0, 1.0 + 4.5, 1.0 + 3.0])
+    assert work.cpu_s == pytest.approx(10.0)
+    assert work.serial_s == pytest.approx(1.0 + 3.0), "2 s of the background are serial, but another core's"
+
+
 def test_what_no_loop_shares_stays_as_it_is() -> None:
     work = work_of(
         document(
