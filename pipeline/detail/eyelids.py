@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.sparse.linalg import splu
 
 from pipeline.compute.trace import traced
 from pipeline.detail.smooth_field import smooth_field
+from pipeline.detail.sparse_factor import factorised
 from pipeline.head_model.model import HeadModel
 from rig.mesh import vertex_normals
 from rig.rig import Rig
@@ -244,7 +244,7 @@ def _smoothest(
     weight = sparse.diags_array(1.0 / field.mass[complete])
     matrix = sparse.csr_array(laplacian.T @ weight @ laplacian)
     right = -(matrix[free][:, ~free] @ values[part][~free])
-    solved = splu(sparse.csc_array(matrix[free][:, free]), permc_spec="MMD_AT_PLUS_A").solve(right)
+    solved = factorised(sparse.csc_array(matrix[free][:, free])).solve(right)
     order = np.empty(len(part), int)
     order[free] = np.arange(free.sum())
     return solved[order[place[rows]]]

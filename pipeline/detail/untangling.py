@@ -14,8 +14,8 @@ from functools import lru_cache
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.linalg import splu
 
+from pipeline.detail.sparse_factor import factorised
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.net_kernels import component_of
 from pipeline.head_model.model import HeadModel
@@ -164,5 +164,4 @@ def _membrane(
     free[rows] = True
     count = np.asarray(beside.sum(axis=1)).ravel()
     matrix = sparse.csc_array(sparse.diags_array(count) - beside[:, rows])
-    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return factor.solve(beside @ np.where(free[:, None], 0.0, vertices))
+    return factorised(matrix).solve(beside @ np.where(free[:, None], 0.0, vertices))
