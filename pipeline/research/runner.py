@@ -26,6 +26,7 @@ from pipeline.research.paper.robustness import robustness
 from pipeline.research.paper.views import views
 from pipeline.research.people.expressions import expressions
 from pipeline.research.people.people import people
+from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
@@ -62,8 +63,8 @@ class Options:
 
     ``simplex``: how many subjects of a table the simplex fits too; ``captures``: whether those of the shared folder
     count beside the studio's heads; ``openmvs``: that peer's programs. Of people and
-    relief ``folders`` are the captures, of people ``only`` says which of its rows, ``detail`` how deep; scaling runs
-    ``job`` on the ``folders``.
+    relief ``folders`` are the captures, of people and growth ``only`` says which of their rows, of
+    people ``detail`` how deep; scaling runs ``job`` on the ``folders``.
     """
 
     simplex: int | None = None
@@ -260,6 +261,20 @@ def _scaling(task: Task) -> Outcome:
     return scaling(captures, command=task.options.job, report=task.report, folder=task.folder)
 
 
+def _growth(task: Task) -> Outcome:
+    if task.options.job is None:
+        raise InputError("growth", ["runs jobs of the command line, and there is none"])
+    with Renderer.create() as renderer:
+        return growth(
+            task.head,
+            sizes(task.options.only),
+            command=task.options.job,
+            renderer=renderer,
+            report=task.report,
+            folder=task.folder,
+        )
+
+
 def _templates(task: Task) -> Outcome:
     count = {"draws": task.subjects} if task.subjects else {}
     facekit = _facekit(task.shared)
@@ -301,6 +316,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "light": _drawn(light),
     "templates": _templates,
     "scaling": _scaling,
+    "growth": _growth,
 }
 
 

@@ -65,7 +65,7 @@ def scaling(
             report(f"{capture.name}, threads: {count}", (done + share / 2) / len(captures))
             row[str(count)] = records.row(
                 f"{capture.resolve()} {count}",
-                lambda count=count, capture=capture: _run(capture, command, count, folder),
+                lambda count=count, capture=capture: run_job(capture, command, count, folder),
             )
         rows.append(row)
     report("done", 1.0)
@@ -107,8 +107,9 @@ def _by_cores(seconds) -> dict[str, float]:
     return {str(cores): seconds(cores) for cores in CORES}
 
 
-def _run(capture: Path, command: JobCommand, threads: int, folder: Path | None) -> Row:
-    """One job in a child: its seconds by the clock, processor seconds, peak memory and what its trace says."""
+def run_job(capture: Path, command: JobCommand, threads: int, folder: Path | None) -> Row:
+    """Runs a job in a child. Returns its seconds by the clock, processor seconds, peak memory (MB) and what its trace
+    says, as ``row_of`` has it. The trace is left in ``folder``. Raises JobFailed."""
     with tempfile.TemporaryDirectory() as scratch:
         kept = Path(scratch) if folder is None else folder
         kept.mkdir(parents=True, exist_ok=True)
