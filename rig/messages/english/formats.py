@@ -105,6 +105,7 @@ TEMPLATES = {
     "no-picture-folder": "is no folder; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)",
     "camera-with-double-shot": "{camera} holds two pictures of one shot",
     "no-pictures": "holds no pictures; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)",
+    "board-filed-by-shot": "the folders of board pictures are shots, and the files in them cameras (IMAGES/<shot>/<camera>): they were read so",
     "board-found-with": "the board was found with {keys}: say so in board.toml",
     "pictures-of-two-sizes": "{picture} is {size}, the camera's first is {first}",
     "no-file-read": "cannot be read ({reason})",

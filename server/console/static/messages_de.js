@@ -729,6 +729,7 @@ export default {
   "no-picture-folder": "ist kein Ordner; verlangt ist IMAGES/<Kamera>/<Aufnahme>.png (oder jpg, tif, webp)",
   "camera-with-double-shot": "{camera} enthält zwei Bilder einer Aufnahme",
   "no-pictures": "enthält keine Bilder; verlangt ist IMAGES/<Kamera>/<Aufnahme>.png (oder jpg, tif, webp)",
+  "board-filed-by-shot": "die Ordner der Tafelbilder sind Aufnahmen und die Dateien darin Kameras (IMAGES/<Aufnahme>/<Kamera>): so wurden sie gelesen",
   "board-found-with": "die Tafel wurde mit {keys} gefunden: in board.toml eintragen",
   "pictures-of-two-sizes": "{picture} hat {size}, das erste Bild der Kamera {first}",
   "no-file-read": "lässt sich nicht lesen ({reason})",
