@@ -35,6 +35,7 @@ WARNING_CODES = (
     "outlines-unexplained",
     "picture-duplicated",
     "picture-levels",
+    "pictures-grey",
     "plates-exchanged",
     "pose-doubtful",
     "scale-assumed",

@@ -40,7 +40,7 @@ from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.rig_toml import ShotConfig
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
-from rig.image import ImageRgb
+from rig.image import ImageRgb, plates_for
 from rig.messages.message import Message, compose
 from rig.plausibility import rig_faults
 from rig.progress import Progress
@@ -272,7 +272,7 @@ def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
     image = shot.images.get(name)
     if image is None:
         return {}
-    plates = shot.backgrounds.get(name, ())
+    plates = plates_for(image, shot.backgrounds.get(name, ()))
     return {name: check_view(image, plates[0] if plates else None, shot.masks.get(name), place_only=measured)}
 
 

@@ -622,6 +622,7 @@ export default {
   "cameras-scaled": "die Kameras wurden mit {factor:.4g} skaliert: {scale}",
   "mask-undecided": "{remark}",
   "mask-inverted": "{remark}",
+  "pictures-grey": "die Bilder von {cameras} sind grau, die anderen farbig: sie werden grau mit ihren leeren Aufnahmen verglichen und geben dem Kopf keine Farbe; alle in Farbe aufnehmen",
   "picture-levels": "kein Pixel in {folders} liegt über {most} von 65535: als {bits} Bit gelesen; beim Schreiben um {shift} verschieben",
   "same-of-more": "{fault}; ebenso {count} weitere ({names})",
   "names-and-more": "{names} und {more} weitere",
