@@ -171,8 +171,9 @@ def test_metres_are_recognised():
             lambda pose: RigidTransform(pose.rotation.T @ GL, pose.inverse().translation),
             "world_from_camera with y up and z backwards",
         ),
+        (lambda pose: RigidTransform(pose.rotation, -pose.translation), "translations of the wrong sign"),
     ],
-    ids=["inverse", "centres", "GL", "inverse GL"],
+    ids=["inverse", "centres", "GL", "inverse GL", "negated"],
 )
 def test_another_convention_is_recognised_by_trying_it(written, word):
     rng = np.random.default_rng(3)

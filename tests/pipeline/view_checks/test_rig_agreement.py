@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipeline.head_model.model import load_model
-from pipeline.imaging.silhouette import silhouette_from_mask
+from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.research.subjects import off_by
 from pipeline.view_checks.rig_agreement import misplaced_camera, wrong_rig
 from rig.geometry import RigidTransform, rotation_from_vector
@@ -56,6 +58,31 @@ def test_a_mirrored_rig_is_named(seen, axis):
     assert found is not None
     assert found.text.startswith("the rig is mirrored")
     assert "write it right-handed" in found.text
+
+
+@pytest.mark.parametrize("loose_px", [0, 6])
+def test_a_mirrored_rig_is_named_where_some_outlines_are_loose(seen, loose_px):
+    rig, masks, _ = seen
+    spread = {name: cv2.dilate(mask.astype(np.uint8), np.ones((loose_px + 1, 1))) > 0 for name, mask in masks.items()}
+    loose = {name: spread[name] if k % 3 == 0 else masks[name] for k, name in enumerate(masks)}
+    found = wrong_rig(silhouettes(loose), reflected(rig, 1))
+    assert found is not None
+    assert found.code == "rig-mirrored"
+
+
+def test_quaternions_with_the_real_part_last_are_named_though_the_views_that_they_spoil_are_left_out(seen):
+    _, _, of_all = seen
+
+    def pose(of):
+        x, y, z, w = Rotation.from_matrix(of.rotation).as_quat()
+        return RigidTransform(Rotation.from_quat([y, z, w, x]).as_matrix(), of.translation)
+
+    written = [replace(c, camera_from_world=pose(c.camera_from_world)) for c in default_layout().scaled(0.5)]
+    contradicted = ViewQuality(usable=False, figures={"strange_share": 0.04})
+    spoilt = {name: replace(s, quality=contradicted) if k % 2 else s for k, (name, s) in enumerate(of_all.items())}
+    found = wrong_rig(spoilt, Rig(tuple(written)))
+    assert found is not None
+    assert "quaternions whose real part came last" in found.text
 
 
 def test_rotations_that_are_transposed_are_named_where_the_cameras_look_at_the_origin(seen):
