@@ -30,11 +30,12 @@ MIN_CAMERAS = 4  # three have six planes at most: too few to refuse a capture by
 MIN_PLANES = 4  # of a camera whose word counts
 MIN_WRONG = 0.35  # median over the cameras of their mean misfit: 0.07 in a good capture, 0.62 and more in other rigs
 MAX_RIGHT = 0.25  # of a reading that is believed
-MAX_CLEAR, CLEARLY = 0.32, 0.45  # of one by which the others are worse, and its share of theirs: 0.28 and 0.34 where the
-# wrong rig has spoilt the outlines, which are found with each other's help
+MAX_CLEAR = 0.32  # of one by which the others are worse: 0.28 where the wrong rig has spoilt the outlines, which are
+# found with each other's help ...
+CLEARLY = 0.45  # ... and its share of theirs: 0.34 there
 MANY_LOST = (
-    1 / 3
-)  # of the views, for their contradicting the others, so that these are asked too: 6 of 11 of a wrong rig
+    0.33  # share of the views that only the others contradict, so that they are asked too: 6 of 11 of a wrong rig
+)
 JUDGED_BY_OTHERS = "strange_share"  # a figure of views that were of use before the others were asked
 MAX_LENSES = 0.2  # of one in which focal lengths and principal points were sought: 0.01 to 0.15 where they are wrong
 LOOSE_QUARTER = 22e-4  # of the picture's width, that the better quarter of all planes misses at most in a right rig
