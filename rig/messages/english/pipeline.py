@@ -93,6 +93,7 @@ TEMPLATES = {
     "features-transposed": "the points agree once rows and columns are exchanged: write each as [column, row], x before y",
     "features-of-other-pictures": "{count} of {all} points contradict themselves in their views: they were picked in other pictures than these, or in pictures of another size. Pick them again, or remove features.json to let the silhouettes decide",
     "features-sides-exchanged": "the points fit a head once right and left are exchanged: they are the subject's, not the viewer's",
+    "features-beside-face": "the points lie beside the face that the photographs show, {distance_mm:.0f} mm in the median ({right_px:+.0f} px to the right, {down_px:+.0f} px down): they were picked in pictures of another size, in a crop, or on another face. Pick them again, or remove features.json to let the face decide",
     "feature-unknown": "features.json: {name} is no landmark (docs/models.md lists them: {known} ...)",
     "feature-view-missing": "feature {name} is picked in {count} view, two are needed: left out",
     "feature-left-out": "feature {name} is left out: {reason}",

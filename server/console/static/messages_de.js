@@ -429,6 +429,7 @@ export default {
   "features-transposed": "die Punkte stimmen überein, sobald Zeilen und Spalten vertauscht werden: jeden als [Spalte, Zeile] schreiben, x vor y",
   "features-of-other-pictures": "{count} von {all} Punkten widersprechen sich selbst in ihren Ansichten: Sie wurden in anderen Bildern als diesen gesetzt oder in Bildern anderer Größe. Neu setzen, oder features.json entfernen und die Silhouetten entscheiden lassen",
   "features-sides-exchanged": "die Punkte passen zu einem Kopf, sobald rechts und links vertauscht werden: Es sind die der Person, nicht des Betrachters",
+  "features-beside-face": "die Punkte liegen neben dem Gesicht, das die Fotografien zeigen, im Mittel {distance_mm:.0f} mm ({right_px:+.0f} px nach rechts, {down_px:+.0f} px nach unten): sie wurden in Bildern anderer Größe, in einem Ausschnitt oder auf einem anderen Gesicht gewählt. Neu wählen, oder features.json entfernen, damit das Gesicht entscheidet",
   "feature-unknown": "features.json: {name} ist keine Landmarke (docs/models.md nennt sie: {known} ...)",
   "feature-view-missing": "Merkmal {name} ist in {count} Ansicht gesetzt, nötig sind zwei: weggelassen",
   "feature-left-out": "Merkmal {name} wird weggelassen: {reason}",
