@@ -16,6 +16,7 @@ from jaxtyping import UInt8
 
 from rig.errors import InputError
 from rig.formats.cameras_json import name_fault
+from rig.formats.fault_groups import say_once
 from rig.formats.picture_names import PLAIN_SUFFIXES, WORD
 from rig.messages.message import Message, compose
 
@@ -47,7 +48,7 @@ def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
     if not cameras:
         faults.append(compose("no-pictures"))
     if faults:
-        raise InputError(str(folder.name), faults)
+        raise InputError(str(folder.name), say_once(faults, cameras))
     return cameras
 
 

@@ -57,6 +57,14 @@ def test_folders_of_shots_are_said(tmp_path: Path) -> None:
     assert [remark.code for remark in detect_folder(tmp_path, CHARUCO).remarks] == ["board-filed-by-shot"]
 
 
+def test_names_that_are_no_cameras_are_said_once(tmp_path: Path) -> None:
+    write(tmp_path, ("1", "2"), by_shot=False, cameras=("links ä", "größe", "日本"))
+    with pytest.raises(InputError) as refused:
+        list_pictures(tmp_path)
+    (fault,) = refused.value.faults
+    assert fault.text.endswith("the same is true of 2 more (links ä, 日本)")
+
+
 def test_a_folder_without_pictures_is_refused(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "absent"):
         with pytest.raises(InputError, match="wanted IMAGES"):
