@@ -15,6 +15,7 @@ WARNING_CODES = (
     "face-elsewhere",
     "features",
     "file-unread",
+    "lens-doubtful",
     "mask-contradicted",
     "mask-doubtful",
     "mask-inverted",

@@ -71,6 +71,8 @@ def _principal_point_faults(rig: Rig) -> list[Message]:
     focal = np.array([(camera.intrinsics.fx, camera.intrinsics.fy) for camera in rig])
     if (np.abs(points) <= CORNER_PX).all() and (focal > FOCAL_LEAST_PX).all():  # else shares of the picture's size
         return [compose("principal-points-missing")]
+    if (focal < FOCAL_LEAST_PX).all() and (points > 0.0).all() and (points < 1.0).all():
+        return [compose("intrinsics-are-shares")]
     shares = (2.0 * points + 1.0) / sizes
     share = float(np.median(shares))
     if share <= 0.0 or abs(np.log(share)) < OTHER_SIZE or np.abs(shares / share - 1.0).max() > SIZE_SPREAD:

@@ -24,7 +24,7 @@ from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture, Features
 from rig.errors import InputError
-from rig.formats.cameras_file import NO_RIG, read_cameras, rig_file_parts, rig_files
+from rig.formats.cameras_file import no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
 from rig.formats.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.fault_groups import say_once, some_of
@@ -60,7 +60,7 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     folder = capture_root(folder)
     rigs = [*rig_files(folder)]
     if not rigs:
-        raise InputError(folder.name, [NO_RIG])
+        raise InputError(folder.name, [no_rig_fault(folder)])
     rig_file = rigs[0]
     read = read_rig_of(rig_file)
     rig = read.rig

@@ -23,7 +23,7 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
+from rig.formats.cameras_file import NO_RIG, find_rig_file, no_rig_fault, read_cameras, rig_file_parts
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import (
     SCALE,
@@ -202,7 +202,7 @@ def check_capture(
     ``networks`` the subject's face is looked for. Raises InputError naming every fault."""
     rig_file = find_rig_file(root)
     if rig_file is None:
-        raise InputError("capture", [NO_RIG])
+        raise InputError("capture", [no_rig_fault(root)])
     read = read_rig_of(rig_file)
     rig = read.rig
     check_folders(root, rig)

@@ -92,11 +92,10 @@ def test_principal_points_that_nobody_gave_are_named_once():
     assert fault.code == "principal-points-missing"
 
 
-def test_intrinsics_as_shares_of_the_picture_are_not_told_to_lack_a_principal_point():
+def test_intrinsics_as_shares_of_the_picture_are_named_once():
     shares = [replace(c, intrinsics=replace(c.intrinsics, fx=1.2, fy=1.6, cx=0.5, cy=0.5)) for c in default_layout()]
-    codes = {fault.code for fault in rig_faults(Rig(tuple(shares)))}
-    assert codes
-    assert "principal-points-missing" not in codes
+    (fault,) = rig_faults(Rig(tuple(shares)))
+    assert fault.code == "intrinsics-are-shares"
 
 
 @pytest.mark.parametrize(("factor", "size_share"), [(2.0, "2.00 times"), (0.5, "0.50 times"), (0.25, "0.25 times")])
