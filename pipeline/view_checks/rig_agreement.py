@@ -13,6 +13,7 @@ Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothin
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +22,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import outer_hull
 from pipeline.view_checks.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
 from pipeline.view_checks.lens_reading import find_lens_reading
-from rig.camera import Intrinsics
+from rig.camera import Camera, Intrinsics
 from rig.messages.message import Message, compose
 from rig.plausibility import alternative_conventions
 from rig.rig import Rig
@@ -82,6 +83,7 @@ def _contradiction(silhouettes: Mapping[str, Silhouette], seen: Rig) -> Message 
     for other, read, remedy in alternative_conventions(seen):
         message = compose("other-convention", convention=other, remedy=remedy)
         found.append((_judged_misfit(hulls, read), message))
+    found.append((_judged_misfit(hulls, _counted_from_below(seen)), compose("principal-points-from-below")))
     (best, message), *others = sorted(found, key=lambda one: one[0])
     next_best = min(as_written, *(misfit for misfit, other in others if other != message))
     if best <= MAX_RIGHT or (best <= MAX_CLEAR and best <= CLEARLY * next_best):
@@ -138,6 +140,16 @@ def _are_loose(hulls: Sequence[Pixels], rig: Rig) -> bool:
     shares = np.abs(errors_px) / (np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0))[..., None]
     quarter, half = np.nanquantile(shares, (0.25, 0.5))
     return bool(quarter <= LOOSE_QUARTER or quarter <= min(LOOSE_BIMODAL * half, MAX_LOOSE_QUARTER))
+
+
+def _counted_from_below(rig: Rig) -> Rig:
+    """Returns the rig with principal points whose rows were counted upwards from the picture's bottom."""
+
+    def read(camera: Camera) -> Camera:
+        k = camera.intrinsics
+        return replace(camera, intrinsics=replace(k, cy=k.height - 1.0 - k.cy))
+
+    return Rig(tuple(map(read, rig)))
 
 
 def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:

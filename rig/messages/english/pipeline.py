@@ -59,6 +59,7 @@ TEMPLATES = {
     "focal-lengths-times": "focal lengths (fx, fy) are taken {factor:.2f} times as long",
     "principal-points-moved": "principal points (cx, cy) are moved by {right_px:.0f} and {down_px:.0f} px",
     "other-convention": "camera_from_world holds {convention}: the outlines agree once it is read so; {remedy}",
+    "principal-points-from-below": "the outlines agree once cy is counted from the pictures' bottom: write height - 1 - cy, for rows are counted from the top",
     "rig-mirrored": "the rig is mirrored: the outlines agree once its poses are reflected. cameras.json was written in a left-handed world or with one axis negated; write it right-handed (x right, y down, z forward in each camera)",
     "pictures-flipped": "the pictures are flipped left to right against the calibration: the outlines agree once they are flipped back; switch the mirror image off in the cameras",
     "pictures-turned": "the pictures are turned by {turn} against the calibration: the outlines agree once they are turned back; turn them, or calibrate with pictures that are turned alike",

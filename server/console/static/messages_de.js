@@ -395,6 +395,7 @@ export default {
   "focal-lengths-times": "Brennweiten (fx, fy) {factor:.2f}-mal so lang genommen werden",
   "principal-points-moved": "Hauptpunkte (cx, cy) um {right_px:.0f} und {down_px:.0f} px verschoben werden",
   "other-convention": "camera_from_world enthält {convention}: so gelesen passen die Konturen zusammen; {remedy}",
+  "principal-points-from-below": "die Umrisse stimmen überein, sobald cy vom unteren Bildrand gezählt wird: height - 1 - cy schreiben, denn Zeilen zählen von oben",
   "rig-mirrored": "das Rig ist gespiegelt: Die Konturen passen zusammen, sobald seine Lagen gespiegelt werden. cameras.json wurde in einer linkshändigen Welt oder mit einer umgekehrten Achse geschrieben; rechtshändig schreiben (x nach rechts, y nach unten, z nach vorn in jeder Kamera)",
   "pictures-flipped": "die Bilder sind gegen die Kalibrierung links-rechts gespiegelt: Zurückgespiegelt passen die Konturen zusammen; das Spiegelbild in den Kameras abschalten",
   "pictures-turned": "die Bilder sind gegen die Kalibrierung um {turn} gedreht: Zurückgedreht passen die Konturen zusammen; sie drehen oder mit ebenso gedrehten Bildern kalibrieren",

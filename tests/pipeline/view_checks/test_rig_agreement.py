@@ -164,5 +164,27 @@ def test_principal_points_of_the_whole_picture_are_named_where_it_was_cropped(se
     assert (moved.parameters["right_px"], moved.parameters["down_px"]) == pytest.approx((-60, -40), abs=12)
 
 
+def test_principal_points_counted_from_below_are_named(seen):
+    _, _, of_all = seen
+    rows = np.random.default_rng(3).normal(0.0, 14.0, 11)  # px, off the middle
+
+    def rig_of(sign):
+        middle = HEIGHT / 4 - 0.5
+        cameras = zip(default_layout().scaled(0.5), rows, strict=True)
+        return Rig(tuple(lensed(c, cy=middle + sign * row) for c, row in cameras))
+
+    with_masks_moved = {}
+    for camera in rig_of(1.0):
+        was = default_layout().scaled(0.5)[camera.name].intrinsics.cy
+        shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, camera.intrinsics.cy - was]])
+        mask = of_all[camera.name].mask.astype(np.uint8)
+        with_masks_moved[camera.name] = (
+            cv2.warpAffine(mask, shift, mask.shape[::-1], borderMode=cv2.BORDER_REPLICATE) > 0
+        )
+    found = wrong_rig(silhouettes(with_masks_moved), rig_of(-1.0))
+    assert found is not None
+    assert found.code == "principal-points-from-below"
+
+
 def lensed(camera, **changes):
     return replace(camera, intrinsics=replace(camera.intrinsics, **changes))
