@@ -56,9 +56,11 @@ def find_tracks(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhou
     seen = map_in_threads(lambda k: _keypoints(images[names[k]], silhouettes[names[k]]), len(rig))
     numbers = {name: k for k, name in enumerate(names)}
     pairs = [(numbers[a], numbers[b]) for a, b in neighbouring_pairs(rig)]
-    matched = map_in_threads(
-        lambda k: _matches(*(part for i in pairs[k] for part in (rig.cameras[i], seen[i]))), len(pairs)
-    )
+
+    def match(a: int, b: int) -> Int[np.ndarray, "_ 2"]:
+        return _matches(rig.cameras[a], seen[a], rig.cameras[b], seen[b])
+
+    matched = map_in_threads(lambda k: match(*pairs[k]), len(pairs))
     tracks = _joined(pairs, matched, seen)
     widths = np.array([camera.intrinsics.width for camera in rig], float)
     for factor in (2.0, 1.0):  # wrong matches move the point of right ones

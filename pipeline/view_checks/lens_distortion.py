@@ -80,7 +80,7 @@ def _around_front(rig: Rig) -> Rig:
 
 def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence[float] | np.ndarray) -> Estimate:
     """Estimates the number with which ``read`` gives the rig whose rays miss least, searched from ``values`` on."""
-    from scipy.optimize import minimize_scalar  # a quarter of a second
+    from scipy.optimize import fminbound  # a quarter of a second
 
     def missed(value: float) -> Float[np.ndarray, "n 2"]:
         return np.nan_to_num(misses_px(tracks, read(value)), nan=100.0)
@@ -91,7 +91,7 @@ def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence
 
     step = float(values[1] - values[0])
     start = min(values, key=cost)
-    best = float(minimize_scalar(cost, bounds=(start - step, start + step), method="bounded").x)
+    best = float(np.asarray(fminbound(cost, start - step, start + step)))
     misses = missed(best)
     slopes = (missed(best + 0.1 * step) - missed(best - 0.1 * step)) / (0.2 * step)
     weights = 1.0 / (1.0 + (misses**2).sum(axis=1, keepdims=True) / ROBUST_PX**2) ** 2

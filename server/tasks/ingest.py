@@ -228,9 +228,7 @@ def check_capture(
                 small[camera.name] = reduce_picture(image, camera, GLANCE_PX)
         faults += [*of_sizes, *of_files]
     if (root / "features.json").is_file():
-        of_file: list[Message] = []
-        features = features_from_bytes((root / "features.json").read_bytes(), rig, of_file)
-        faults += [*of_file, *feature_faults(features, rig)]
+        faults += _features_file_faults(root / "features.json", rig)
         digests["features.json"] = _sha256(root / "features.json")
     if len(empty) == len(rig):
         faults.append(compose("every-picture-its-plate"))
@@ -250,6 +248,13 @@ def check_capture(
         checks={name: view.document() for name, view in views.items()},
         face=_face_of(small, rig, networks, is_metric=_is_metric(root)) if networks is not None and small else None,
     )
+
+
+def _features_file_faults(path: Path, rig: Rig) -> list[Message]:
+    """What is wrong with a features.json, as a file and as points."""
+    of_file: list[Message] = []
+    features = features_from_bytes(path.read_bytes(), rig, of_file)
+    return [*of_file, *feature_faults(features, rig)]
 
 
 def _face_of(
