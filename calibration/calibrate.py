@@ -25,14 +25,8 @@ from calibration.adjustment.state import (
 from calibration.adjustment.timing import TimeOffsets, board_velocities, estimate_offsets
 from calibration.adjustment.world import in_world_frame
 from calibration.board.board import Board
-from calibration.board.detection import (
-    Detections,
-    View,
-    WrongBoard,
-    detect_folder,
-    ignore_progress,
-    list_pictures,
-)
+from calibration.board.detection import Detections, View, WrongBoard, detect_folder, ignore_progress
+from calibration.board.picture_files import list_pictures
 from calibration.quality.checks import (
     check_against_previous,
     check_cheirality,

@@ -1,7 +1,31 @@
 """What a picture is between its file and the pixels' owner."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import UInt8
 
 ImageRgb = UInt8[np.ndarray, "h w 3"]
 """A picture as sRGB, row by row from the top; h and w are those of the call's other pictures."""
+
+GREY_WEIGHTS = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue: ITU-R BT.601, as JPEG has it
+SPARSE = (slice(None, None, 16), slice(None, None, 16))  # pixels that tell most colour pictures from grey ones
+
+
+def is_grey(image: UInt8[np.ndarray, "_ _ 3"]) -> bool:
+    """Tells whether a picture has no colour in any pixel."""
+    return all(bool((part == part[..., :1]).all()) for part in (image[SPARSE], image))
+
+
+def plates_for(
+    image: UInt8[np.ndarray, "_ _ 3"], plates: Sequence[UInt8[np.ndarray, "_ _ 3"]]
+) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
+    """Returns clean plates as a picture can be compared with them: in grey where it is grey."""
+    if not plates or not is_grey(image):
+        return tuple(plates)
+    return tuple(plate if is_grey(plate) else _in_grey(plate) for plate in plates)
+
+
+def _in_grey(image: UInt8[np.ndarray, "_ _ 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+    grey = np.rint(image @ GREY_WEIGHTS).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.camera import Camera
-from rig.geometry import RigidTransform
+from rig.geometry import RigidTransform, rotation_from_vector, vector_from_rotation
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
@@ -71,6 +71,8 @@ def _principal_point_faults(rig: Rig) -> list[Message]:
     focal = np.array([(camera.intrinsics.fx, camera.intrinsics.fy) for camera in rig])
     if (np.abs(points) <= CORNER_PX).all() and (focal > FOCAL_LEAST_PX).all():  # else shares of the picture's size
         return [compose("principal-points-missing")]
+    if (focal < FOCAL_LEAST_PX).all() and (points > 0.0).all() and (points < 1.0).all():
+        return [compose("intrinsics-are-shares")]
     shares = (2.0 * points + 1.0) / sizes
     share = float(np.median(shares))
     if share <= 0.0 or abs(np.log(share)) < OTHER_SIZE or np.abs(shares / share - 1.0).max() > SIZE_SPREAD:
@@ -152,10 +154,18 @@ def _convention_fault(rig: Rig) -> Message | None:
     """Poses that look at no common point as they are written, and all at one when read in another convention."""
     if _share_looking_at_one_point(rig) > DIVERGING_MOST:
         return None
-    for other, read, remedy in alternative_conventions(rig):
-        if _share_looking_at_one_point(read) >= CONVERGING_LEAST:
-            return compose("pose-convention", held=other, remedy=remedy)
-    return None
+    fitting = [
+        (other, remedy)
+        for other, read, remedy in alternative_conventions(rig)
+        if _share_looking_at_one_point(read) >= CONVERGING_LEAST
+    ]
+    if not fitting:
+        return None
+    (held, remedy), *others = fitting
+    fault = compose("pose-convention", held=held, remedy=remedy)
+    for other, its_remedy in others[:1]:  # y up and z backwards looks like translations of the wrong sign
+        fault = compose("pose-convention-or", fault=fault, held=other, remedy=its_remedy)
+    return fault
 
 
 def alternative_conventions(rig: Rig) -> list[tuple[Message, Rig, Message]]:
@@ -177,6 +187,15 @@ def _share_looking_at_one_point(rig: Rig) -> float:
     return seen / len(rig)
 
 
+def _of_shifted_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Returns the rotation whose quaternion x, y, z, w was read as w, x, y, z."""
+    vector = vector_from_rotation(rotation)
+    half = float(np.linalg.norm(vector)) / 2.0
+    x, y, z, w = np.cos(half), *(vector / 2.0 * np.sinc(half / np.pi))
+    axis = np.array([x, y, z])
+    return rotation_from_vector(2.0 * np.arctan2(np.linalg.norm(axis), w) * axis / max(np.linalg.norm(axis), 1e-12))
+
+
 _GL = np.diag([1.0, -1.0, -1.0])
 _CONVENTIONS = {
     compose("held-inverse"): (lambda pose: pose.inverse(), compose("write-inverse")),
@@ -195,5 +214,13 @@ _CONVENTIONS = {
     compose("held-inverse-axes-up"): (
         lambda pose: RigidTransform(_GL @ pose.inverse().rotation, _GL @ pose.inverse().translation),
         compose("write-inverse-negated"),
+    ),
+    compose("held-negated"): (
+        lambda pose: RigidTransform(pose.rotation, -pose.translation),
+        compose("negate-translations"),
+    ),
+    compose("held-quaternion"): (
+        lambda pose: RigidTransform(_of_shifted_quaternion(pose.rotation), pose.translation),
+        compose("write-real-part-first"),
     ),
 }

@@ -17,17 +17,13 @@ from calibration.board.board import Board
 from calibration.board.corners import Found, detect
 from calibration.board.markers import RATIO_OFF, board_of, find_layout, find_markers
 from calibration.board.missing import explain, explain_markers
+from calibration.board.picture_files import filed_by_shot, list_pictures
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
-from rig.formats.cameras_json import name_fault
-from rig.formats.picture_names import PLAIN_SUFFIXES
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 
 VERSION = 2  # of the detector: part of the cache's key
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES)
-
-
 EXPLAINED = 4  # pictures of a blind camera that are looked at twice
 MEASURED = 24  # pictures whose markers are measured where the board is not found as it was described ...
 FEW_FOUND = 0.2  # ... that is in less than this share of them
@@ -100,28 +96,6 @@ def ignore_progress(stage: str, fraction: float) -> None:
     """Does nothing; the progress hook of callers that want none."""
 
 
-def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
-    """Lists the pictures ``IMAGES/<camera>/<shot>.<ext>`` of a folder as {camera: {shot: path}}. Raises InputError
-    naming every fault."""
-    if not folder.is_dir():
-        raise InputError(str(folder), [compose("no-picture-folder")])
-    faults, cameras = list[Message](), {}
-    for inner in sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")):
-        paths = sorted(path for path in inner.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
-        if not paths:
-            continue
-        fault = name_fault(inner.name)
-        shots = {path.stem: path for path in paths}
-        faults += [compose("camera-rename", fault=fault)] if fault else []
-        faults += [compose("camera-with-double-shot", camera=inner.name)] if len(shots) < len(paths) else []
-        cameras[inner.name] = shots
-    if not cameras:
-        faults.append(compose("no-pictures"))
-    if faults:
-        raise InputError(str(folder.name), faults)
-    return cameras
-
-
 def detect_folder(
     folder: Path, board: Board, *, cache: Path | None = None, workers: int = 2, report: Progress = ignore_progress
 ) -> Detections:
@@ -137,6 +111,8 @@ def detect_folder(
         detections = _with_measured_pattern(folder, pictures, detections, cache, workers, report)
     if detections.notes and not detections.views:
         raise WrongBoard(reasons_of(detections.notes))
+    if filed_by_shot(pictures):
+        return replace(detections, remarks=(*detections.remarks, compose("board-filed-by-shot")))
     return detections
 
 

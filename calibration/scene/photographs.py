@@ -15,6 +15,7 @@ from rig.errors import InputError
 from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
 from rig.formats.capture_folder import capture_root, size_fault
 from rig.formats.capture_masks import mask_subjects
+from rig.formats.fault_groups import say_once
 from rig.formats.images import decode_image_file, is_picture
 from rig.formats.shot_files import BESIDE_PICTURES, find_files
 from rig.messages.message import Message, compose
@@ -60,7 +61,7 @@ def find_photographs(folder: Path) -> Photographs:
         twice = sorted({stem for stem in stems if stems.count(stem) > 1})
         faults += [compose("photograph-repeated", folder=name, name=stem, count=stems.count(stem)) for stem in twice]
     if faults:
-        raise InputError(folder.name, faults)
+        raise InputError(folder.name, say_once(faults, files))
     if folders:
         return Photographs({name: {path.stem: path for path in paths} for name, paths in folders.items()})
     return Photographs({path.stem: {ONE_SHOT: path} for path in flat})

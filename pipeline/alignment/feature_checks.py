@@ -1,15 +1,22 @@
-"""What can be said against feature points before a fit: names, views, and whether they span a triangle."""
+"""What can be said against feature points before a fit: names, views, whether they span a triangle, and whether they
+lie on the face that the photographs show."""
 
 import numpy as np
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
 from pipeline.alignment.landmarks import MIN_POINTS, MIN_TRIANGLE_MM, flatness
+from pipeline.alignment.suggested_points import locate_landmarks
+from pipeline.faces.landmark_map import LandmarkMap
+from pipeline.faces.matching import MatchedFaces
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
+from pipeline.head_model.model import HeadModel
+from pipeline.multiview.tangency import pixel_mm
 from rig.capture import Features
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 CLICK_PX = 1.5
+BESIDE_MM = 20.0  # of the median point: the finder is 1 to 12 mm off where points were picked well; 70 px are 38 mm
 NAMES_TOLD = 8
 
 
@@ -33,6 +40,29 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
     elif flatness(np.stack(points)) < MIN_TRIANGLE_MM:
         faults.append(compose("features-on-line"))
     return faults
+
+
+def features_beside_face(
+    features: Features, face: MatchedFaces, rig: Rig, model: HeadModel, places: LandmarkMap
+) -> Message | None:
+    """Returns the fault of points that lie beside the face in the photographs, most of them by more than ``BESIDE_MM``.
+    Points that were picked in a crop, or in pictures of another size, agree with each other and not with the face."""
+    marks = model.levels["full"].landmarks
+    names = [name for name in features if name in marks]
+    if not names:
+        return None
+    positions, _ = locate_landmarks(face, model, places, [marks[name] for name in names])
+    offsets_px, distances_mm = [], []
+    for name, position in zip(names, positions, strict=True):
+        for camera in (rig[view] for view in features[name] if view in rig):
+            offset_px = features[name][camera.name] - camera.project(position[None])[0]
+            offsets_px.append(offset_px)
+            distances_mm.append(float(np.linalg.norm(offset_px)) * pixel_mm(camera, position))
+    if not np.median(distances_mm or [0.0]) > BESIDE_MM:
+        return None
+    right_px, down_px = np.median(offsets_px, axis=0).tolist()
+    distance_mm = float(np.median(distances_mm))
+    return compose("features-beside-face", distance_mm=distance_mm, right_px=right_px, down_px=down_px)
 
 
 def unknown_landmarks(features: Features) -> list[Message]:

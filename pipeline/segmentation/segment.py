@@ -28,7 +28,7 @@ from pipeline.segmentation.without_plates.head_seed import HeadSeed, find_head_s
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.image import ImageRgb
+from rig.image import ImageRgb, plates_for
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
@@ -61,7 +61,7 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
             for name in rig.names & capture.masks.keys()
         }
         jobs = {
-            name: pool.submit(decide, capture.images[name], capture.backgrounds[name], settings)
+            name: pool.submit(_decided, capture.images[name], capture.backgrounds[name], settings)
             for name in rig.names
             if name not in from_masks
         }
@@ -165,7 +165,11 @@ def _operators(
 
 def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Silhouette:
     """Returns the silhouette of one image from its clean plates alone, without other cameras."""
-    return _refined(image, decide(image, plates, settings), settings)
+    return _refined(image, _decided(image, plates, settings), settings)
+
+
+def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Decision:
+    return decide(image, plates_for(image, plates), settings)
 
 
 def _refined(image: ImageRgb, decision: Decision, settings: SegmentationSettings) -> Silhouette:

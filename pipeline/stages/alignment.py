@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pipeline.alignment.face_alignment import align_to_face, frontmost_camera
-from pipeline.alignment.landmarks import feature_alignment
+from pipeline.alignment.feature_checks import features_beside_face
+from pipeline.alignment.landmarks import WrongFeatures, feature_alignment
 from pipeline.alignment.silhouette_search import moved_to_hull, search_alignment
 from pipeline.contour_fit.problem import LandmarkObservations
 from pipeline.faces.landmark_map import landmark_map
@@ -51,9 +52,14 @@ def front_camera(rig: Rig, settings: Settings) -> str:
 @stage("alignment")
 def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> Staged[Alignment]:
     """Aligns the mean head to the capture's feature points or, without any, to the face in the photographs or, without
-    a face, to the silhouettes. Raises TooFewFeatures, NoSubject."""
+    a face, to the silhouettes. Raises TooFewFeatures, WrongFeatures, NoSubject."""
     model, rig, settings = model_basis(context.model, context.settings), context.rig, context.settings
     face = None if faces.subject is None else faces.subject.matched
+    if views.capture.features and face is not None:
+        places = landmark_map(context.model)
+        beside = features_beside_face(views.capture.features, face, rig, context.model, places)
+        if beside is not None:
+            raise WrongFeatures(beside)
     if views.capture.features or face is None:
         return align_to_views(model, views, rig, settings, progress=context.progress)
     found = align_to_face(model, face, landmark_map(context.model))

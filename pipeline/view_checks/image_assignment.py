@@ -144,10 +144,10 @@ def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
     fits its new picture clearly better.
     """
     named = [name for name in rig.names if name in capture.images and capture.backgrounds.get(name)]
-    pictures = {name: _thumbnail(capture.images[name]) for name in named}
-    plates = {name: _thumbnail(capture.backgrounds[name][0]) for name in named}
-    doubtful = [name for name in named if _common_share(pictures[name], plates[name]) < PLATE_SEEN]
-    share = np.array([[_common_share(pictures[name], plates[other]) for other in doubtful] for name in doubtful])
+    pictures = {name: thumbnail(capture.images[name]) for name in named}
+    plates = {name: thumbnail(capture.backgrounds[name][0]) for name in named}
+    doubtful = [name for name in named if common_share(pictures[name], plates[name]) < PLATE_SEEN]
+    share = np.array([[common_share(pictures[name], plates[other]) for other in doubtful] for name in doubtful])
     if len(doubtful) < 2:
         return {}
     from scipy.optimize import linear_sum_assignment  # loads all of scipy.optimize, and plates are rarely exchanged
@@ -158,14 +158,14 @@ def misplaced_plates(capture: Capture, rig: Rig) -> dict[str, str]:
     return {doubtful[i]: doubtful[best[i]] for i in moved.tolist()} if clear.all() else {}
 
 
-def _thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]:
+def thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]:
     """Returns the logarithm of the image's levels, reduced to ``PLATE_COLUMNS`` columns."""
     rows = max(1, round(image.shape[0] * PLATE_COLUMNS / image.shape[1]))
     small = cv2.resize(image, (PLATE_COLUMNS, rows), interpolation=cv2.INTER_AREA)
     return np.log(small.astype(np.float32) + 1.0)
 
 
-def _common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarray, "_ _ 3"]) -> float:
+def common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarray, "_ _ 3"]) -> float:
     """Returns the share of the picture's pixels that show the plate, apart from a difference in exposure."""
     if picture.shape != plate.shape:
         return 0.0

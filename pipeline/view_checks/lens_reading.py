@@ -40,7 +40,7 @@ class LensReading:
     def is_other(self) -> bool:
         """Tells whether the intrinsics differ from the calibrated ones by more than loose outlines alone would
         cause."""
-        return abs(np.log(self.factor)) >= OTHER_FACTOR or max(map(abs, self.shift)) >= OTHER_SHIFT
+        return bool(abs(np.log(self.factor)) >= OTHER_FACTOR or max(map(abs, self.shift)) >= OTHER_SHIFT)
 
     def message(self) -> Message:
         """Returns the message that refuses the rig and names the differences of its lenses."""

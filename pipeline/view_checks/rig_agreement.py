@@ -13,6 +13,7 @@ Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothin
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +22,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import outer_hull
 from pipeline.view_checks.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
 from pipeline.view_checks.lens_reading import find_lens_reading
-from rig.camera import Intrinsics
+from rig.camera import Camera, Intrinsics
 from rig.messages.message import Message, compose
 from rig.plausibility import alternative_conventions
 from rig.rig import Rig
@@ -30,6 +31,13 @@ MIN_CAMERAS = 4  # three have six planes at most: too few to refuse a capture by
 MIN_PLANES = 4  # of a camera whose word counts
 MIN_WRONG = 0.35  # median over the cameras of their mean misfit: 0.07 in a good capture, 0.62 and more in other rigs
 MAX_RIGHT = 0.25  # of a reading that is believed
+MAX_CLEAR = 0.32  # of one by which the others are worse: 0.28 where the wrong rig has spoilt the outlines, which are
+# found with each other's help ...
+CLEARLY = 0.45  # ... and its share of theirs: 0.34 there
+MANY_LOST = (
+    0.33  # share of the views that only the others contradict, so that they are asked too: 6 of 11 of a wrong rig
+)
+JUDGED_BY_OTHERS = "strange_share"  # a figure of views that were of use before the others were asked
 MAX_LENSES = 0.2  # of one in which focal lengths and principal points were sought: 0.01 to 0.15 where they are wrong
 LOOSE_QUARTER = 22e-4  # of the picture's width, that the better quarter of all planes misses at most in a right rig
 # whose masks are loose: 20e-4 with long hair in 8 to 24 views; 24e-4 and more in rigs of another arrangement
@@ -51,21 +59,35 @@ def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None
         silhouettes: by camera; views without a usable mask are left out of the question.
         rig: the cameras as calibrated.
     """
-    seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
+    usable = {name for name, s in silhouettes.items() if s.quality.usable}
+    found = _contradiction(silhouettes, with_masks({name: silhouettes[name] for name in usable}, rig))
+    lost = {name for name, s in silhouettes.items() if JUDGED_BY_OTHERS in s.quality.figures} - usable
+    if found is not None or len(lost) < MANY_LOST * len(silhouettes):
+        return found
+    among_all = with_masks({name: silhouettes[name] for name in usable | lost}, rig)
+    named = _contradiction(silhouettes, among_all)  # views that a wrong rig alone makes contradict each other
+    return None if named is None or named.code == "other-rig" else named
+
+
+def _contradiction(silhouettes: Mapping[str, Silhouette], seen: Rig) -> Message | None:
+    """Returns why most of the cameras ``seen`` contradict each other, as ``wrong_rig`` does."""
     if len(seen) < MIN_CAMERAS:
         return None
     hulls = [outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen]
-    if not _median_misfit(hulls, seen) >= MIN_WRONG:
+    as_written = _median_misfit(hulls, seen)
+    if not as_written >= MIN_WRONG:
         return None
     square = all(camera.intrinsics.width == camera.intrinsics.height for camera in seen)
     conventions = (*_CONVENTIONS, *(_SQUARE_CONVENTIONS if square else ()))
-    found = [(_median_misfit(_read(hulls, seen, turn), seen), message) for message, turn in conventions]
+    found = [(_judged_misfit(_read(hulls, seen, turn), seen), message) for message, turn in conventions]
     for other, read, remedy in alternative_conventions(seen):
         message = compose("other-convention", convention=other, remedy=remedy)
-        found.append((_median_misfit(hulls, read), message))
-    believed = [(misfit, message) for misfit, message in found if misfit <= MAX_RIGHT]
-    if believed:
-        return min(believed, key=lambda one: one[0])[1]
+        found.append((_judged_misfit(hulls, read), message))
+    found.append((_judged_misfit(hulls, _counted_from_below(seen)), compose("principal-points-from-below")))
+    (best, message), *others = sorted(found, key=lambda one: one[0])
+    next_best = min(as_written, *(misfit for misfit, other in others if other != message))
+    if best <= MAX_RIGHT or (best <= MAX_CLEAR and best <= CLEARLY * next_best):
+        return message
     lenses = find_lens_reading(hulls, seen, lambda read: _judged_misfit(hulls, read))
     if lenses.is_other and _judged_misfit(hulls, lenses.rig) <= MAX_LENSES:
         return lenses.message()
@@ -118,6 +140,16 @@ def _are_loose(hulls: Sequence[Pixels], rig: Rig) -> bool:
     shares = np.abs(errors_px) / (np.hypot(widths[:, None], widths[None, :]) / np.sqrt(2.0))[..., None]
     quarter, half = np.nanquantile(shares, (0.25, 0.5))
     return bool(quarter <= LOOSE_QUARTER or quarter <= min(LOOSE_BIMODAL * half, MAX_LOOSE_QUARTER))
+
+
+def _counted_from_below(rig: Rig) -> Rig:
+    """Returns the rig with principal points whose rows were counted upwards from the picture's bottom."""
+
+    def read(camera: Camera) -> Camera:
+        k = camera.intrinsics
+        return replace(camera, intrinsics=replace(k, cy=k.height - 1.0 - k.cy))
+
+    return Rig(tuple(map(read, rig)))
 
 
 def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:

@@ -13,7 +13,9 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.view_checks.camera_drift import find_drift
 from pipeline.view_checks.head_size import judge_head_size
 from pipeline.view_checks.image_assignment import assign_images
+from pipeline.view_checks.lens_distortion import judge_distortion
 from pipeline.view_checks.mask_edges import masks_off_edges
+from pipeline.view_checks.picture_faults import with_picture_faults
 from pipeline.view_checks.rig_agreement import misplaced_camera
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
@@ -81,31 +83,38 @@ def usable_views(
         TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are of use.
     """
     assigned = assign_images(capture, rig, segmented, exchanged=exchanged)
-    if sum(silhouette.quality.usable for silhouette in assigned.silhouettes.values()) < MIN_VIEWS:
-        raise TooFewViews(assigned.silhouettes, capture)
-    silhouettes, moved = without_moved_cameras(assigned.silhouettes, rig)
+    doubted = [name for name, s in assigned.silhouettes.items() if s.quality.warnings or not s.quality.usable]
+    silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted)
+    if sum(silhouette.quality.usable for silhouette in silhouettes.values()) < MIN_VIEWS:
+        raise TooFewViews(silhouettes, capture)
+    silhouettes, moved = without_moved_cameras(silhouettes, rig)
+    unexplained = silhouettes
+    silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys())
+    moved_warnings = [warning for name, warning in moved.items() if silhouettes[name] is unexplained[name]]
     size = judge_head_size(silhouettes, rig, masks_given=bool(assigned.capture.masks))
     given_masks = [name for name in rig.names if name in assigned.capture.masks]
     beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
-    warnings = (*assigned.warnings, *view_warnings(silhouettes), *moved, *size, *beside, *capture.remarks)
+    lenses = judge_distortion(assigned.capture.images, silhouettes, rig)
+    of_views = (*view_warnings(silhouettes), *moved_warnings)
+    warnings = (*assigned.warnings, *of_views, *size, *beside, *lenses, *capture.remarks)
     return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
 
 
 def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
-) -> tuple[dict[str, Silhouette], list[ReportWarning]]:
+) -> tuple[dict[str, Silhouette], dict[str, ReportWarning]]:
     """Marks the views of cameras that moved since the calibration as unusable. Also returns a warning for each of them,
-    and for each camera whose mask may be loose instead."""
-    kept, warnings = dict(silhouettes), []
+    and for each camera whose mask may be loose instead, by camera."""
+    kept, warnings = dict(silhouettes), dict[str, ReportWarning]()
     for drift in find_drift(silhouettes, rig):
         if drift.moved:
             quality = replace(silhouettes[drift.camera].quality, usable=False)
             kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
-        warnings.append(drift.warning())
+        warnings[drift.camera] = drift.warning()
     misplaced = misplaced_camera(kept, rig)
     if misplaced is not None:
         kept[misplaced] = replace(kept[misplaced], quality=replace(kept[misplaced].quality, usable=False))
-        warnings.append(compose("camera-moved", finding=compose("camera-misplaced", camera=misplaced)))
+        warnings[misplaced] = compose("camera-moved", finding=compose("camera-misplaced", camera=misplaced))
     return kept, warnings
 
 

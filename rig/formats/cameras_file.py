@@ -16,14 +16,16 @@ from rig.errors import InputError
 from rig.formats.blender_script import write_blender
 from rig.formats.cameras_json import read_rig, write_rig
 from rig.formats.colmap import read_colmap, write_colmap
+from rig.formats.fault_groups import some_of
 from rig.formats.metashape import read_metashape, write_metashape
 from rig.formats.opencv_toml import looks_like_aniposelib, read_toml, write_aniposelib, write_caliscope
 from rig.formats.opencv_yaml import read_yaml, write_yaml
+from rig.formats.picture_names import is_junk
 from rig.formats.reading import CamerasRead
 from rig.formats.realitycapture import COLUMNS, read_csv, read_xmp, write_csv, write_xmp
 from rig.formats.transforms_json import read_transforms, write_transforms
 from rig.formats.unread_keys import unread_keys
-from rig.messages.message import compose
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 WRITERS: dict[str, Callable[[Rig, Path], None]] = {
@@ -44,6 +46,13 @@ FOLDER_FORMATS = ("colmap", "colmap-text", "realitycapture", "opencv-yaml")  # o
 NO_RIG = compose("no-rig-file")
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
 HEAD_BYTES = 1 << 16  # of an XMP file that other programs wrote to, the names of their formats come first
+
+
+def no_rig_fault(folder: Path) -> Message:
+    """Describes a folder without a rig's file, by the captures in it where there are some."""
+    inner = sorted(path for path in folder.iterdir() if path.is_dir() and not is_junk(path.name))
+    captures = [path.name for path in inner if find_rig_file(path) is not None]
+    return compose("captures-inside", captures=some_of(captures)) if len(captures) > 1 else NO_RIG
 
 
 def find_rig_file(folder: Path) -> Path | None:

@@ -51,7 +51,7 @@ class CamerasDocument(TypedDict):
 def read_rig(path: Path) -> Rig:
     """Reads ``cameras.json``. Raises InputError naming every fault in it."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        document = json.loads(path.read_bytes())  # of 8, 16 or 32 bits, as its first bytes tell
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
     return rig_from_document(document, path.name)

@@ -24,10 +24,10 @@ from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture, Features
 from rig.errors import InputError
-from rig.formats.cameras_file import NO_RIG, read_cameras, rig_file_parts, rig_files
+from rig.formats.cameras_file import no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras_json import write_rig
 from rig.formats.capture_masks import MaskSubjects, mask_subjects
-from rig.formats.fault_groups import say_once
+from rig.formats.fault_groups import say_once, some_of
 from rig.formats.features_json import document_from_features, features_from_bytes
 from rig.formats.images import cut_out_alpha, decode_image_file, picture_size, write_image
 from rig.formats.picture_names import is_junk
@@ -41,6 +41,7 @@ from rig.formats.shot_files import (
     stray_sentence,
 )
 from rig.formats.work_size import work_features, work_rig, work_share
+from rig.image import is_grey
 from rig.messages.message import Message, compose
 from rig.plausibility import rig_faults
 from rig.rig import Rig
@@ -59,7 +60,7 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     folder = capture_root(folder)
     rigs = [*rig_files(folder)]
     if not rigs:
-        raise InputError(folder.name, [NO_RIG])
+        raise InputError(folder.name, [no_rig_fault(folder)])
     rig_file = rigs[0]
     read = read_rig_of(rig_file)
     rig = read.rig
@@ -210,7 +211,7 @@ def read_shot(
         subjects.masks,
         features,
         digests,
-        (*levels, *subjects.remarks),
+        (*levels, *_grey_remarks(images), *subjects.remarks),
         subjects.soft,
     )
 
@@ -246,6 +247,12 @@ def _sample_bits(
         folders = [f"{kind}/" for kind in kinds if bits[kind] == used]
         remarks.append(compose("picture-levels", folders=folders, most=2**used - 1, bits=used, shift=WHOLE_BITS - used))
     return bits, remarks
+
+
+def _grey_remarks(images: Mapping[str, np.ndarray]) -> list[Message]:
+    """Returns a remark that names the grey pictures among some in colour."""
+    grey = [name for name, image in images.items() if is_grey(image)]
+    return [compose("pictures-grey", cameras=some_of(grey))] if 0 < len(grey) < len(images) else []
 
 
 def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:

@@ -40,6 +40,10 @@ NETPBM = re.compile(
 PNG_COLOUR_TYPE, PNG_WITH_ALPHA = 25, (4, 6)  # where the header holds it, and which values have an alpha
 CUT_AWAY_LEAST = 0.25  # of a picture from which the subject was cut out; an undistorted one has a rim of 0.1 at most
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+FTYP = slice(4, 12)  # of files whose kind stands behind their first box's length
+HEIC_BRANDS = (b"ftypheic", b"ftypheix", b"ftypmif1")  # in telephones' .jpg files, too
+OTHER_BRANDS = {b"ftypavif": "AVIF", b"ftypisom": "video", b"ftypmp42": "video", b"ftypqt  ": "video"}
+OTHER_BEGINNINGS = {b"GIF8": "GIF", b"%PDF": "PDF", b"8BPS": "Photoshop", b"\xff\x0a": "JPEG XL"}
 GREY_FLAGS = (
     cv2.IMREAD_GRAYSCALE,
     cv2.IMREAD_REDUCED_GRAYSCALE_2,
@@ -181,9 +185,12 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
             return (raw.sizes.width, raw.sizes.height), b""
-    if suffix in HEIC_SUFFIXES:
+    if suffix in HEIC_SUFFIXES or data[FTYP] in HEIC_BRANDS:
         header = heif_header(data)
         return header.size, header.info.get("icc_profile") or b""
+    if data[FTYP] in OTHER_BRANDS or data.startswith(tuple(OTHER_BEGINNINGS)):
+        kind = OTHER_BRANDS.get(data[FTYP]) or next(k for b, k in OTHER_BEGINNINGS.items() if data.startswith(b))
+        raise InputError("picture", [compose("picture-of-kind", kind=kind)])
     with Image.open(BytesIO(data), formats=IMAGE_FORMATS) as header:  # reads the header only
         return header.size, header.info.get("icc_profile") or b""
 
@@ -194,7 +201,7 @@ def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: 
         with _raw(data) as raw:
             # As the camera balanced it, no brightness of each picture's own: eleven cameras must stay comparable.
             pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8, user_flip=0)
-    elif suffix in HEIC_SUFFIXES:
+    elif suffix in HEIC_SUFFIXES or data[FTYP] in HEIC_BRANDS:
         pixels = np.asarray(heif_header(data).to_pillow().convert("RGB"))
     else:
         white = NETPBM.match(data, 0, 1 << 12)

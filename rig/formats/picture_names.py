@@ -29,15 +29,15 @@ UNREAD_PICTURES = {
     ".svg": "SVG",
     ".pdf": "PDF",
     ".npy": "NumPy",
-    ".raw": "raw pixels",
+    ".raw": "raw-pixel",
     ".iiq": "Phase One RAW",
     ".3fr": "Hasselblad RAW",
     ".fff": "Hasselblad RAW",
     ".nrw": "Nikon NRW",
     ".x3f": "Sigma RAW",
-    ".mp4": "a video",
-    ".mov": "a video",
-    ".avi": "a video",
+    ".mp4": "video",
+    ".mov": "video",
+    ".avi": "video",
 }
 """What pictures are kept in and nobody here reads, by ending: such a file is called what it is, not missing."""
 JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")  # what file managers add

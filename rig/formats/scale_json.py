@@ -53,7 +53,7 @@ KnownLength = PointDistance | TagSize | CameraDistance
 def read_scale(path: Path, cameras: Collection[str]) -> KnownLength:
     """Reads ``scale.json`` for photographs of ``cameras``. Raises InputError naming every fault."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        document = json.loads(path.read_bytes())  # of 8, 16 or 32 bits, as its first bytes tell
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
     return scale_from_document(document, cameras, path.name)

@@ -171,6 +171,9 @@ def _missing(
                 where = other.relative_to(folder).as_posix()
                 kind = UNREAD_PICTURES[other.suffix.lower()]
                 faults.append(compose("picture-kind-unread", picture=where, kind=kind))
+            elif link := _broken_link(places["images"], name):
+                where, target = link.relative_to(folder).as_posix(), link.readlink().as_posix()
+                faults.append(compose("picture-link-broken", picture=where, target=target))
             else:
                 faults.append(compose("picture-missing", picture=f"{inside}{name}.png"))
     lacking = [] if alone else [name for name in rig.names if name not in plates and name not in masks]
@@ -183,6 +186,12 @@ def _missing(
 
 def _of_other_kind(name: str, strays: Sequence[Path]) -> Path | None:
     return next((p for p in strays if picture_stem(p.name) == name and p.suffix.lower() in UNREAD_PICTURES), None)
+
+
+def _broken_link(place: Path, name: str) -> Path | None:
+    """A link of the camera's name that leads nowhere."""
+    links = (path for path in sorted(place.iterdir()) if path.is_symlink() and not path.exists())
+    return next((path for path in links if picture_stem(path.name) == name), None)
 
 
 def _cause(

@@ -80,7 +80,7 @@ def ingest_board_pictures(
 ) -> None:
     """Unpacks an archive of board.toml and IMAGES/ into ``folder`` and checks both. Raises InputError."""
     from calibration.board.board import read_board
-    from calibration.board.detection import list_pictures
+    from calibration.board.picture_files import list_pictures
 
     target = Path(folder)
     unpacked = target.with_name(target.name + ".unpacked")
@@ -92,8 +92,8 @@ def ingest_board_pictures(
     pictures = next((root / name for name in ("IMAGES", "images") if (root / name).is_dir()), root)
     for camera, shots in list_pictures(pictures).items():
         (target / "images" / camera).mkdir(parents=True)
-        for path in shots.values():
-            path.rename(target / "images" / camera / path.name)
+        for shot, path in shots.items():
+            path.rename(target / "images" / camera / f"{shot}{path.suffix}")
     (root / BOARD).rename(target / BOARD)
     shutil.rmtree(unpacked)
 

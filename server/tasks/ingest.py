@@ -23,7 +23,7 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
+from rig.formats.cameras_file import NO_RIG, find_rig_file, no_rig_fault, read_cameras, rig_file_parts
 from rig.formats.cameras_json import read_rig
 from rig.formats.capture_folder import (
     SCALE,
@@ -40,7 +40,7 @@ from rig.formats.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.rig_toml import ShotConfig
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
-from rig.image import ImageRgb
+from rig.image import ImageRgb, plates_for
 from rig.messages.message import Message, compose
 from rig.plausibility import rig_faults
 from rig.progress import Progress
@@ -202,7 +202,7 @@ def check_capture(
     ``networks`` the subject's face is looked for. Raises InputError naming every fault."""
     rig_file = find_rig_file(root)
     if rig_file is None:
-        raise InputError("capture", [NO_RIG])
+        raise InputError("capture", [no_rig_fault(root)])
     read = read_rig_of(rig_file)
     rig = read.rig
     check_folders(root, rig)
@@ -228,9 +228,7 @@ def check_capture(
                 small[camera.name] = reduce_picture(image, camera, GLANCE_PX)
         faults += [*of_sizes, *of_files]
     if (root / "features.json").is_file():
-        of_file: list[Message] = []
-        features = features_from_bytes((root / "features.json").read_bytes(), rig, of_file)
-        faults += [*of_file, *feature_faults(features, rig)]
+        faults += _features_file_faults(root / "features.json", rig)
         digests["features.json"] = _sha256(root / "features.json")
     if len(empty) == len(rig):
         faults.append(compose("every-picture-its-plate"))
@@ -250,6 +248,13 @@ def check_capture(
         checks={name: view.document() for name, view in views.items()},
         face=_face_of(small, rig, networks, is_metric=_is_metric(root)) if networks is not None and small else None,
     )
+
+
+def _features_file_faults(path: Path, rig: Rig) -> list[Message]:
+    """What is wrong with a features.json, as a file and as points."""
+    of_file: list[Message] = []
+    features = features_from_bytes(path.read_bytes(), rig, of_file)
+    return [*of_file, *feature_faults(features, rig)]
 
 
 def _face_of(
@@ -272,7 +277,7 @@ def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
     image = shot.images.get(name)
     if image is None:
         return {}
-    plates = shot.backgrounds.get(name, ())
+    plates = plates_for(image, shot.backgrounds.get(name, ()))
     return {name: check_view(image, plates[0] if plates else None, shot.masks.get(name), place_only=measured)}
 
 

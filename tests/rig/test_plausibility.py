@@ -92,11 +92,10 @@ def test_principal_points_that_nobody_gave_are_named_once():
     assert fault.code == "principal-points-missing"
 
 
-def test_intrinsics_as_shares_of_the_picture_are_not_told_to_lack_a_principal_point():
+def test_intrinsics_as_shares_of_the_picture_are_named_once():
     shares = [replace(c, intrinsics=replace(c.intrinsics, fx=1.2, fy=1.6, cx=0.5, cy=0.5)) for c in default_layout()]
-    codes = {fault.code for fault in rig_faults(Rig(tuple(shares)))}
-    assert codes
-    assert "principal-points-missing" not in codes
+    (fault,) = rig_faults(Rig(tuple(shares)))
+    assert fault.code == "intrinsics-are-shares"
 
 
 @pytest.mark.parametrize(("factor", "size_share"), [(2.0, "2.00 times"), (0.5, "0.50 times"), (0.25, "0.25 times")])
@@ -171,8 +170,9 @@ def test_metres_are_recognised():
             lambda pose: RigidTransform(pose.rotation.T @ GL, pose.inverse().translation),
             "world_from_camera with y up and z backwards",
         ),
+        (lambda pose: RigidTransform(pose.rotation, -pose.translation), "translations of the wrong sign"),
     ],
-    ids=["inverse", "centres", "GL", "inverse GL"],
+    ids=["inverse", "centres", "GL", "inverse GL", "negated"],
 )
 def test_another_convention_is_recognised_by_trying_it(written, word):
     rng = np.random.default_rng(3)

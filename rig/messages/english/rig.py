@@ -100,6 +100,7 @@ TEMPLATES = {
     "file-unread": "{remark}",
     "mask-undecided": "{remark}",
     "mask-inverted": "{remark}",
+    "pictures-grey": "the pictures of {cameras} are grey and the others in colour: they are compared with their plates in grey, and give the head no colour; take all in colour",
     "picture-levels": "no pixel of {folders} is above {most} of 65535: read as {bits} bits; shift them by {shift} when writing",
     "same-of-more": "{fault}; the same is true of {count} more ({names})",
     "names-and-more": "{names} and {more} more",

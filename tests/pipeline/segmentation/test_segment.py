@@ -97,6 +97,14 @@ def test_noise_is_measured() -> None:
         assert figures["noise_levels"] == pytest.approx(255 * noise * np.sqrt(2), rel=0.08)
 
 
+def test_a_grey_picture_is_compared_with_plates_in_colour() -> None:
+    image, plates, truth = compose(Scene(backdrop=(0.9, 0.6, 0.05), pattern=0.1))
+    grey = np.repeat(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
+    iou, off = errors(segment_view(grey, plates, SETTINGS), truth)
+    assert iou > 0.99
+    assert abs(np.median(off)) < 0.2
+
+
 FAULTS = [
     pytest.param(Scene(hair=BACKDROP), id="hair like the backdrop"),
     pytest.param(Scene(hair=BACKDROP, pattern=0.0), id="hair like a flat backdrop"),

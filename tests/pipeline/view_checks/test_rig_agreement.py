@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipeline.head_model.model import load_model
-from pipeline.imaging.silhouette import silhouette_from_mask
+from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.research.subjects import off_by
 from pipeline.view_checks.rig_agreement import misplaced_camera, wrong_rig
 from rig.geometry import RigidTransform, rotation_from_vector
@@ -56,6 +58,31 @@ def test_a_mirrored_rig_is_named(seen, axis):
     assert found is not None
     assert found.text.startswith("the rig is mirrored")
     assert "write it right-handed" in found.text
+
+
+@pytest.mark.parametrize("loose_px", [0, 6])
+def test_a_mirrored_rig_is_named_where_some_outlines_are_loose(seen, loose_px):
+    rig, masks, _ = seen
+    spread = {name: cv2.dilate(mask.astype(np.uint8), np.ones((loose_px + 1, 1))) > 0 for name, mask in masks.items()}
+    loose = {name: spread[name] if k % 3 == 0 else masks[name] for k, name in enumerate(masks)}
+    found = wrong_rig(silhouettes(loose), reflected(rig, 1))
+    assert found is not None
+    assert found.code == "rig-mirrored"
+
+
+def test_quaternions_with_the_real_part_last_are_named_though_the_views_that_they_spoil_are_left_out(seen):
+    _, _, of_all = seen
+
+    def pose(of):
+        x, y, z, w = Rotation.from_matrix(of.rotation).as_quat()
+        return RigidTransform(Rotation.from_quat([y, z, w, x]).as_matrix(), of.translation)
+
+    written = [replace(c, camera_from_world=pose(c.camera_from_world)) for c in default_layout().scaled(0.5)]
+    contradicted = ViewQuality(usable=False, figures={"strange_share": 0.04})
+    spoilt = {name: replace(s, quality=contradicted) if k % 2 else s for k, (name, s) in enumerate(of_all.items())}
+    found = wrong_rig(spoilt, Rig(tuple(written)))
+    assert found is not None
+    assert "quaternions whose real part came last" in found.text
 
 
 def test_rotations_that_are_transposed_are_named_where_the_cameras_look_at_the_origin(seen):
@@ -135,6 +162,28 @@ def test_principal_points_of_the_whole_picture_are_named_where_it_was_cropped(se
     assert isinstance(changes, tuple)
     moved = next(change for change in changes if change.code == "principal-points-moved")
     assert (moved.parameters["right_px"], moved.parameters["down_px"]) == pytest.approx((-60, -40), abs=12)
+
+
+def test_principal_points_counted_from_below_are_named(seen):
+    _, _, of_all = seen
+    rows = np.random.default_rng(3).normal(0.0, 14.0, 11)  # px, off the middle
+
+    def rig_of(sign):
+        middle = HEIGHT / 4 - 0.5
+        cameras = zip(default_layout().scaled(0.5), rows, strict=True)
+        return Rig(tuple(lensed(c, cy=middle + sign * row) for c, row in cameras))
+
+    with_masks_moved = {}
+    for camera in rig_of(1.0):
+        was = default_layout().scaled(0.5)[camera.name].intrinsics.cy
+        shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, camera.intrinsics.cy - was]])
+        mask = of_all[camera.name].mask.astype(np.uint8)
+        with_masks_moved[camera.name] = (
+            cv2.warpAffine(mask, shift, mask.shape[::-1], borderMode=cv2.BORDER_REPLICATE) > 0
+        )
+    found = wrong_rig(silhouettes(with_masks_moved), rig_of(-1.0))
+    assert found is not None
+    assert found.code == "principal-points-from-below"
 
 
 def lensed(camera, **changes):

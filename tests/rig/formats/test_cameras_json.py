@@ -15,6 +15,7 @@ from rig.errors import InputError
 from rig.formats.cameras_json import document_from_rig, read_rig, rig_from_document, write_rig
 from rig.geometry import RigidTransform, look_at, rotation_from_vector
 from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
 
 CENTRE = np.array([30.0, -20.0, 50.0])
 
@@ -160,6 +161,13 @@ def test_no_text_escapes_as_another_error(text: str, tmp_path: Path) -> None:
     (tmp_path / "cameras.json").write_text(text)
     with pytest.raises(InputError):
         read_rig(tmp_path / "cameras.json")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
+def test_cameras_are_read_in_the_encodings_of_windows(tmp_path: Path, encoding: str) -> None:
+    text = json.dumps(document_from_rig(default_layout()))
+    (tmp_path / "cameras.json").write_text(text, encoding=encoding)
+    assert read_rig(tmp_path / "cameras.json").names == default_layout().names
 
 
 def test_bytes_that_are_no_text_and_a_missing_file(tmp_path: Path) -> None:

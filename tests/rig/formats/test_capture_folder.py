@@ -241,6 +241,20 @@ def test_a_fault_is_named(folder: Path, harm: Callable[[Path], None], words: str
     assert words in caught.value.faults[0].text
 
 
+def test_a_link_that_leads_nowhere_is_no_missing_picture(folder: Path) -> None:
+    (folder / "images" / "a.png").unlink()
+    (folder / "images" / "a.png").symlink_to("/mnt/away/a.png")
+    with pytest.raises(InputError, match=r"images/a\.png is a link to a file that is not there: /mnt/away/a\.png"):
+        read_capture(folder)
+
+
+def test_captures_in_a_folder_are_named(folder: Path) -> None:
+    for name in ("monday", "tuesday"):
+        write_capture(folder.parent / "week" / name, small_capture(), small_rig())
+    with pytest.raises(InputError, match="but monday, tuesday do: give one of these"):
+        read_capture(folder.parent / "week")
+
+
 def test_names_that_are_all_others_are_one_fault(folder: Path) -> None:
     names = read_capture(folder)[1].names
     for number, path in enumerate(sorted((folder / "images").iterdir())):

@@ -72,6 +72,22 @@ def test_a_dng_is_developed_in_its_own_rows(tmp_path: Path) -> None:
     assert open_picture(tmp_path / "a.dng").size == (160, 120)
 
 
+def test_a_heic_is_read_under_another_kind_s_name(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(HEIC.read_bytes())
+    np.testing.assert_array_equal(read_image(tmp_path / "a.jpg"), read_image(HEIC))
+
+
+@pytest.mark.parametrize(
+    ("begins", "kind"), [(b"\0\0\0\x20ftypavif", "AVIF"), (b"\0\0\0\x18ftypmp42", "video"), (b"GIF89a", "GIF")]
+)
+def test_a_file_of_another_kind_than_its_name_says_is_called_what_it_is(
+    tmp_path: Path, begins: bytes, kind: str
+) -> None:
+    (tmp_path / "a.png").write_bytes(begins + bytes(100))
+    with pytest.raises(InputError, match=f"is of the kind {kind}"):
+        read_image(tmp_path / "a.png")
+
+
 def test_a_heic_is_read(tmp_path: Path) -> None:
     assert picture_size(HEIC) == (64, 48)
     pixels = read_image(HEIC).astype(int)

@@ -45,6 +45,18 @@ def test_a_mosaic_is_told_from_a_grey_picture() -> None:
     assert not is_mosaic(np.full((48, 64), 90, np.uint8))
 
 
+def test_grey_pictures_among_others_are_named(tmp_path: Path) -> None:
+    capture = Capture(dict.fromkeys("abc", PICTURE), dict.fromkeys("abc", (PICTURE,)))
+    write_capture(tmp_path, capture, small_rig())
+    cv2.imwrite(str(tmp_path / "images" / "b.png"), cv2.cvtColor(PICTURE, cv2.COLOR_RGB2GRAY))
+    (remark,) = read_capture(tmp_path)[0].remarks
+    assert remark.code == "pictures-grey"
+    assert "pictures of b are grey" in remark.text
+    for name in "ac":
+        cv2.imwrite(str(tmp_path / "images" / f"{name}.png"), cv2.cvtColor(PICTURE, cv2.COLOR_RGB2GRAY))
+    assert read_capture(tmp_path)[0].remarks == ()
+
+
 @pytest.mark.parametrize("shift", [2, 4])
 def test_a_capture_of_10_or_12_bits_in_16_is_read_as_one_of_8(tmp_path: Path, shift: int) -> None:
     write_capture(tmp_path, Capture(dict.fromkeys("abc", PICTURE), dict.fromkeys("abc", (PICTURE,))), small_rig())

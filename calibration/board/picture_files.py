@@ -1,0 +1,104 @@
+"""Which files of a folder are board pictures of which camera and shot: ``IMAGES/<camera>/<shot>.<ext>``.
+
+Enters: a folder. Leaves: files by camera, then by shot. Many programs save a folder a shot instead, with a file
+for each camera in it; that is told by the names or, where they say nothing, by the pictures: a camera that stands still
+sees the same room in every shot.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from rig.errors import InputError
+from rig.formats.cameras_json import name_fault
+from rig.formats.fault_groups import say_once
+from rig.formats.picture_names import PLAIN_SUFFIXES, WORD
+from rig.messages.message import Message, compose
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES)
+CAMERA_WORDS = ("cam", "camera", "kamera", "left", "right")  # with which names of cameras begin
+COMPARED = 4  # folders, and files of each, whose pictures are compared
+UNLIKE = 4.0  # times as much between files of a folder as between those of one name: 27 in a rig that stands still, 2.5
+# where people held the cameras; 1 / 27 where folders are cameras
+MIN_DIFFERENCE = 1.0  # levels: less is a picture's noise
+
+Filed = Mapping[str, Mapping[str, Path]]
+_Thing = TypeVar("_Thing")
+
+
+def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
+    """Returns the pictures of a folder as {camera: {shot: path}}. Raises InputError naming every fault."""
+    if not folder.is_dir():
+        raise InputError(str(folder), [compose("no-picture-folder")])
+    faults, filed = list[Message](), dict[str, dict[str, Path]]()
+    for inner in sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith(".")):
+        paths = sorted(path for path in inner.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+        if not paths:
+            continue
+        filed[inner.name] = {path.stem: path for path in paths}
+        doubled = len(filed[inner.name]) < len(paths)
+        faults += [compose("camera-with-double-shot", camera=inner.name)] if doubled else []
+    cameras = _turned(filed) if _are_shots(filed) else filed
+    faults += [compose("camera-rename", fault=fault) for name in cameras if (fault := name_fault(name))]
+    if not cameras:
+        faults.append(compose("no-pictures"))
+    if faults:
+        raise InputError(str(folder.name), say_once(faults, cameras))
+    return cameras
+
+
+def filed_by_shot(pictures: Filed) -> bool:
+    """Tells whether the pictures that ``list_pictures`` returned lie in folders of shots."""
+    return any(path.parent.name != camera for camera, shots in pictures.items() for path in shots.values())
+
+
+def _turned(filed: Filed) -> dict[str, dict[str, Path]]:
+    turned: dict[str, dict[str, Path]] = {}
+    for outer, files in filed.items():
+        for inner, path in files.items():
+            turned.setdefault(inner, {})[outer] = path
+    return dict(sorted(turned.items()))
+
+
+def _are_shots(filed: Filed) -> bool:
+    """Tells whether folders are shots and the files in them cameras."""
+    shared = set.intersection(*(set(files) for files in filed.values())) if filed else set()
+    if len(filed) < 2 or len(shared) < 2:
+        return False
+    if any(map(_names_camera, filed)):
+        return False
+    if all(map(_names_camera, shared)):
+        return True
+    return _difference(filed) > UNLIKE * _difference(_turned(filed))
+
+
+def _names_camera(name: str) -> bool:
+    words = WORD.findall(name.casefold())
+    return bool(words) and words[0] in CAMERA_WORDS
+
+
+def _difference(filed: Filed) -> float:
+    """Returns how far apart (levels, in the median) the pictures of a group are; infinite where their sizes differ."""
+    differences = []
+    for files in _spread([*filed.values()]):
+        pictures = [picture for path in _spread([*files.values()]) if (picture := _small(path)) is not None]
+        for one, other in combinations(pictures, 2):
+            differences.append(float(np.median(cv2.absdiff(one, other))) if one.shape == other.shape else np.inf)
+    return max(float(np.median(differences)), MIN_DIFFERENCE) if differences else MIN_DIFFERENCE
+
+
+def _spread(things: Sequence[_Thing]) -> list[_Thing]:
+    """Returns some of the things, from the first to the last."""
+    return [things[k] for k in np.unique(np.linspace(0, len(things) - 1, COMPARED).round().astype(int))]
+
+
+def _small(path: Path) -> UInt8[np.ndarray, "h w"] | None:
+    try:
+        return cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    except (OSError, cv2.error):
+        return None

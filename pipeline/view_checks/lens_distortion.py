@@ -1,0 +1,127 @@
+"""Were the pictures undistorted, and the coefficients left in the file, or the other way round? Outlines hardly tell:
+the tops of heads lie equally far from the middle in all views, and where planes touch them all move alike.
+
+Points of the subject in three views or more tell by how much their rays miss. All coefficients times one share (1 where
+they are the pictures', 0 where these were undistorted), or where there are none one radial coefficient of all cameras,
+is estimated with its standard deviation.
+
+Enters: photographs, silhouettes and the rig. Leaves: a warning, or none.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.scene_tracks import SceneTracks, find_tracks, misses_px
+from pipeline.warnings import ReportWarning
+from rig.camera import Camera, Distortion
+from rig.image import ImageRgb
+from rig.messages.message import compose
+from rig.rig import Rig
+
+MIN_VIEWS, MAX_VIEWS, MIN_TRACKS = 3, 12, 60  # 12 views take 4 s of one core
+MIN_EFFECT = 1e-3  # of the picture's width, at the subject's farthest pixels: less does not matter to a head
+ROBUST_PX = 1.0  # of a miss (Geman and McClure)
+SHARES = np.linspace(-0.5, 1.5, 9)
+RADIAL = np.linspace(-0.4, 0.4, 9)  # k1: -0.3 is a wide lens
+MIN_SIGMAS = 5.0  # of a radial coefficient from 0: 11 in scan-a at -0.2; right captures have 0 to 1.6
+MIN_SHARE_SIGMAS = 3.5  # of the share from 1, for it must also be near 0: 3.8 to 12 in five captures of undistorted
+# pictures, at most 1 in right ones
+MAX_SHARE, NEAR_SIGMAS = 0.3, 3.0  # of the coefficients, of pictures without distortion: -0.56 +- 0.21 in one
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Holds a number that was estimated, and its standard deviation."""
+
+    value: float
+    deviation: float
+
+
+def judge_distortion(
+    images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig
+) -> list[ReportWarning]:
+    """Returns a warning if the pictures have no distortion though the rig has, or have one and the rig has none."""
+    usable = [name for name in rig.names if name in images and silhouettes[name].quality.usable]
+    seen = _around_front(rig.subset(usable))
+    if len(seen) < MIN_VIEWS or any(camera.recorded is not None for camera in seen):
+        return []
+    flat = all(camera.intrinsics.distortion.is_zero for camera in seen)
+    if not flat and _effect(seen, silhouettes) < MIN_EFFECT:
+        return []
+    tracks = find_tracks(images, silhouettes, seen)
+    if tracks.count < MIN_TRACKS:
+        return []
+    if flat:
+        radial = estimate(tracks, lambda k1: _with(seen, lambda _: Distortion(k1=k1)), RADIAL)
+        distorted = _with(seen, lambda _: Distortion(k1=radial.value))
+        if abs(radial.value) < MIN_SIGMAS * radial.deviation or _effect(distorted, silhouettes) < MIN_EFFECT:
+            return []
+        return [compose("lens-doubtful", finding=compose("pictures-distorted", k1=radial.value))]
+    share = estimate(tracks, lambda share: _with(seen, lambda lens: _times(lens, share)), SHARES)
+    beside_none = abs(share.value) > max(MAX_SHARE, NEAR_SIGMAS * share.deviation)
+    if 1.0 - share.value < MIN_SHARE_SIGMAS * share.deviation or beside_none:
+        return []
+    return [compose("lens-doubtful", finding=compose("pictures-undistorted"))]
+
+
+def _around_front(rig: Rig) -> Rig:
+    """Returns the cameras nearest to the front one, neighbours of each other, where there are more than
+    ``MAX_VIEWS``."""
+    if len(rig) <= MAX_VIEWS:
+        return rig
+    front = rig[rig.front_camera()].centre_world
+    apart = {camera.name: float(np.linalg.norm(camera.centre_world - front)) for camera in rig}
+    return rig.subset(sorted(apart, key=lambda name: apart[name])[:MAX_VIEWS])
+
+
+def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence[float] | np.ndarray) -> Estimate:
+    """Estimates the number with which ``read`` gives the rig whose rays miss least, searched from ``values`` on."""
+    from scipy.optimize import fminbound  # a quarter of a second
+
+    def missed(value: float) -> Float[np.ndarray, "n 2"]:
+        return np.nan_to_num(misses_px(tracks, read(value)), nan=100.0)
+
+    def cost(value: float) -> float:
+        squared = (missed(value) ** 2).sum(axis=1) / ROBUST_PX**2
+        return float((squared / (1.0 + squared)).mean())
+
+    step = float(values[1] - values[0])
+    start = min(values, key=cost)
+    best = float(np.asarray(fminbound(cost, start - step, start + step)))
+    misses = missed(best)
+    slopes = (missed(best + 0.1 * step) - missed(best - 0.1 * step)) / (0.2 * step)
+    weights = 1.0 / (1.0 + (misses**2).sum(axis=1, keepdims=True) / ROBUST_PX**2) ** 2
+    equations = misses.size - 3 * tracks.count
+    variance = float((weights * misses**2).sum() / weights.mean() / equations)
+    return Estimate(best, float(np.sqrt(variance / max(float((weights * slopes**2).sum()), 1e-12))))
+
+
+def _with(rig: Rig, lens: Callable[[Distortion], Distortion]) -> Rig:
+    def read(camera: Camera) -> Camera:
+        k = camera.intrinsics
+        return replace(camera, intrinsics=replace(k, distortion=lens(k.distortion)))
+
+    return Rig(tuple(map(read, rig)))
+
+
+def _times(lens: Distortion, share: float) -> Distortion:
+    return Distortion(*(share * lens.opencv()).tolist())
+
+
+def _effect(rig: Rig, silhouettes: Mapping[str, Silhouette]) -> float:
+    """Returns by how much the lenses move the subject's farthest pixels, in shares of the picture's width: the median
+    over the cameras."""
+    moved = []
+    for camera in rig:
+        k = camera.intrinsics
+        rows, columns = np.nonzero(silhouettes[camera.name].mask)
+        if len(rows):
+            ends = np.array([(x, y) for x in (columns.min(), columns.max()) for y in (rows.min(), rows.max())], float)
+            straight = camera.undistort(ends)
+            off = (k.distortion.apply(straight) - straight) * (k.fx, k.fy)
+            moved.append(float(np.nanmax(np.linalg.norm(off, axis=1))) / k.width)
+    return float(np.median(moved)) if moved else 0.0
