@@ -37,25 +37,25 @@ void main() {
     bool known = best >= 0.0;
     if (best_z <= 0.0 || (known && !is_beside_fresh(pixel))) return;
     load_window(pixel);
-    if (!known) best = cost_of(best_z, best_slope, vec2(pixel));
-    for (int s = 0; s < step_count; s++)
-        for (int side = 0; side < 4; side++) {
-            ivec2 offset = steps[s] * SIDES[side], there = pixel + offset;
-            if (!is_inside(there)) continue;
-            int q = there.y * size.x + there.x;
+    for (int candidate = known ? 1 : 0; candidate <= 4 * step_count; candidate++) {  // the first is the pixel's own
+        ivec2 offset = ivec2(0);
+        if (candidate > 0) offset = steps[(candidate - 1) / 4] * SIDES[(candidate - 1) % 4];
+        ivec2 there = pixel + offset;
+        if (!is_inside(there)) continue;
+        int q = there.y * size.x + there.x;
+        vec2 slope = candidate > 0 ? slopes[q] : best_slope, change = abs(slope - best_slope);
+        float z = candidate > 0 ? depths[q] - dot(vec2(offset), slope) : best_z;
+        if (candidate > 0) {
             if (depths[q] <= 0.0 || (known && fresh[q] == 0u)) continue;
-            vec2 slope = slopes[q];
-            float z = depths[q] - dot(vec2(offset), slope);
-            vec2 change = abs(slope - best_slope);
             if (abs(z - best_z) < same_mm && change.x + change.y < same_mm) continue;
-            float value = cost_of(z, slope, vec2(pixel));
-            if (value < best) {
-                best = value;
-                best_z = z;
-                best_slope = slope;
-                fresh[p] = 1u;
-            }
         }
+        float value = cost_of(z, slope, vec2(pixel));  // called once: a driver writes it out wherever it stands
+        if (candidate > 0 && value >= best) continue;
+        best = value;
+        best_z = z;
+        best_slope = slope;
+        if (candidate > 0) fresh[p] = 1u;
+    }
     costs[p] = best;
     depths[p] = best_z;
     slopes[p] = best_slope;

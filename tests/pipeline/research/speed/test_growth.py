@@ -59,4 +59,5 @@ def test_jobs_run_in_children_and_their_rows_are_kept(tmp_path: Path, renderer: 
     )
     assert (tmp_path / "runs").read_text() == "3 6 12 "
     assert found["figures"]["exponent_of_views"] == pytest.approx(1.0)
+    assert isinstance(found["rows"], list)
     assert [row["cpu_s"] for row in found["rows"]] == pytest.approx([3, 6, 12])
