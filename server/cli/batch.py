@@ -1,4 +1,4 @@
-"""``eigenhead batch``: many captures, one result folder each, and a table of all."""
+"""Implements ``eigenhead batch``: reconstructs many captures, one result folder each, and makes a table of all."""
 
 import signal
 import sys
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from server.batch.shards import Shard
 
 app = typer.Typer(rich_markup_mode=None)
-NAMED_MOST = 10  # captures that failed, in the last line; the table has all
+NAMED_MOST = 10  # failed captures that the last line names; the table lists all
 
 
 class CapturesFailed(EigenheadError):
-    """Some captures of a batch failed; the others are done."""
+    """Reports at the end of a batch that some captures failed; the results of the others are complete."""
 
     def __init__(self, failed: Sequence[str], count: int) -> None:
         names = [*failed[:NAMED_MOST], *(["..."] if len(failed) > NAMED_MOST else [])]
@@ -110,7 +110,8 @@ def _share(text: str | None) -> "Shard":
 
 
 def _found(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
-    """The captures of a folder or list. Raises InputError, also where the results would lie within one."""
+    """Returns the captures of a folder or list. Raises InputError for a wrong list, and if ``out`` lies within a
+    capture."""
     from server.batch.captures import find_captures, is_archive, read_list
 
     if captures.is_file() and is_archive(captures):
@@ -154,7 +155,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
 
 
 def _given_threads() -> dict[str, str]:
-    """EIGENHEAD_THREADS as somebody set it, who knows better."""
+    """Returns EIGENHEAD_THREADS if it is set in the environment: the user's choice goes before our own."""
     import os
 
     from pipeline.compute.threads import THREADS
@@ -197,7 +198,7 @@ def _document(
 
 @contextmanager
 def _terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM, which a scheduler sends some seconds before SIGKILL, ends the batch as Ctrl-C does."""
+    """Makes SIGTERM end the batch as Ctrl-C does. Schedulers send it some seconds before SIGKILL."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
