@@ -1,4 +1,4 @@
-"""``create_app``: the API as an ASGI app."""
+"""Composes the API as an ASGI app: routers, middleware, and the tasks that run beside the requests."""
 
 import asyncio
 import time
@@ -33,8 +33,9 @@ log = structlog.get_logger()
 
 
 def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None) -> FastAPI:
-    """The service's ASGI app, perhaps with pages for operators. Opens the data folder and the database at startup, not
-    on import."""
+    """Builds the service's ASGI app. ``mount_pages`` adds the operator's pages to it.
+
+    Data folder and database are opened when the app starts, not when this function is called."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -77,13 +78,13 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
             expose_headers=EXPOSED,
         )
     app.add_middleware(Watch, metrics=metrics)
-    app.add_middleware(DrainRequestBody)  # outside Watch, which times the answer and not the client
+    app.add_middleware(DrainRequestBody)  # outside Watch, so that Watch does not time a slow client
     describe(app)
     return app
 
 
 class Watch:
-    """Gives every request an id, logs it, and counts it."""
+    """Gives every request an id (header X-Request-Id), logs it, and counts it in the metrics."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app, self._metrics = app, metrics
@@ -117,7 +118,8 @@ async def _look_around(service: Service) -> None:
 
 
 async def _sweep_forever(service: Service) -> None:
-    """A sweep now and every ``sweep_s``; a failing one is logged and tried again."""
+    """Removes expired data at once and then every ``sweep_s`` seconds. A sweep that fails is logged; the next one
+    runs."""
     while True:
         try:
             await service.threads.disk(sweep, service)

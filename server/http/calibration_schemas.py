@@ -1,4 +1,4 @@
-"""Documents on the wire: calibrations."""
+"""Defines the JSON documents about calibrations."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Documents on the wire: lists that come in pages, and what is done to many things at once."""
+"""Defines the JSON documents of lists that come in pages, and of actions on many things at once."""
 
 from typing import Annotated, Literal
 

@@ -1,4 +1,4 @@
-"""Messages on the wire: as text where text always stood, and as data beside it."""
+"""Defines how messages appear in JSON documents: as English text, and beside it as code and parameters."""
 
 from typing import Annotated, Any
 

@@ -1,4 +1,4 @@
-"""Documents on the wire of what the rig's pictures are worth."""
+"""Defines the JSON documents about the rig's pictures: their checks, what a capture holds, and clean plates."""
 
 from typing import Annotated
 

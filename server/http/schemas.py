@@ -1,4 +1,4 @@
-"""Documents on the wire."""
+"""Defines the JSON documents of requests and answers."""
 
 import base64
 import binascii

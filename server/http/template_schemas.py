@@ -1,4 +1,4 @@
-"""Documents on the wire: templates, in whose vertex order heads are written."""
+"""Defines the JSON documents about templates, meshes in whose vertex order heads are written."""
 
 from pydantic import ConfigDict, Field
 

@@ -1,4 +1,4 @@
-"""Calibrations: from an archive of board pictures or from shots that the rig took; looked at, fetched, removed."""
+"""Declares the routes of calibrations, made from an archive of board pictures or from shots that the rig took."""
 
 import json
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Captures: taken with the rig or uploaded, looked at, given feature points, removed."""
+"""Declares the routes of captures: taking or uploading them, viewing them, setting feature points, removing them."""
 
 import json
 from collections.abc import Callable
@@ -217,7 +217,7 @@ async def reconstruct_upload(
     except BaseException:
         service.store.remove_capture(record.id)
         raise
-    if job.capture_id != record.id:  # the key's first call made the job; this upload is not needed
+    if job.capture_id != record.id:  # an earlier call with this key made the job, so this upload is removed
         service.store.remove_capture(record.id)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return JobOut.model_validate(job)

@@ -1,4 +1,5 @@
-"""Jobs: submitted, watched, cancelled, restarted; and the files that they made."""
+"""Declares the routes of jobs: submitting, watching, cancelling and restarting them, and fetching the files they
+made."""
 
 from collections.abc import AsyncIterator, Callable
 from typing import Annotated
@@ -112,7 +113,9 @@ async def job_events(
     """
     seq = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
     while True:
-        state = await service.threads.disk(service.jobs.state, job)  # asked first: the last events are already there
+        state = await service.threads.disk(
+            service.jobs.state, job
+        )  # read before the events, so that none of an ended job is missed
         for event in await service.threads.disk(service.jobs.events.since, job, min(seq, 2**31 - 1)):
             seq = event.seq
             yield ServerSentEvent(event="progress", id=str(seq), data=event.document)

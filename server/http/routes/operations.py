@@ -1,4 +1,4 @@
-"""Health, readiness, metrics, models, templates, keys, webhooks; the page that shows the API."""
+"""Declares the routes of health, readiness, metrics, models, templates, keys and webhooks, and the page of the API."""
 
 from importlib.metadata import version
 from pathlib import Path

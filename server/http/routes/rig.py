@@ -1,4 +1,5 @@
-"""The rig: its state, a live view, settings of cameras and lamps, clean plates, the calibration in use."""
+"""Declares the routes of the rig: its state, live view, settings of cameras and lamps, clean plates, calibration in
+use."""
 
 from collections.abc import AsyncIterator
 from contextlib import suppress
@@ -58,7 +59,7 @@ async def rig_preview_stream(
     seconds: Annotated[float, Query(gt=0, le=3600, description="after which it ends")] = 600.0,
 ) -> Response:
     """What the camera sees, four times a second, as motion JPEG: for a page's ``<img>`` or a video player."""
-    first = await service.threads.disk(service.rig.preview, name)  # a 404 or 503 comes before the first picture
+    first = await service.threads.disk(service.rig.preview, name)  # raises its 404 or 503 before the stream begins
     return StreamingResponse(_pictures(service, name, first, seconds), media_type=PARTS, headers=UNKEPT)
 
 
@@ -67,7 +68,7 @@ async def _pictures(service: Service, name: str, picture: bytes, seconds: float)
     while True:
         began = anyio.current_time()
         yield b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(picture), picture)
-        with suppress(Unavailable):  # a camera that is away for a moment: the last picture stands
+        with suppress(Unavailable):  # of a camera that is gone for a moment the last picture stays
             picture = await service.threads.disk(service.rig.preview, name)
         await anyio.sleep(max(0.0, began + PICTURE_EVERY_S - anyio.current_time()))
         if anyio.current_time() >= until:

@@ -1,4 +1,4 @@
-"""Sessions: one subject's captures, and their erasure."""
+"""Declares the routes of sessions, the captures of one subject, and of their erasure."""
 
 from typing import Annotated
 

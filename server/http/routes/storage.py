@@ -1,4 +1,4 @@
-"""What lies in the data folder, and what retention takes of it."""
+"""Declares the routes that show what the data folder holds and what retention removes from it."""
 
 from typing import Annotated
 

@@ -1,4 +1,5 @@
-"""Resumable uploads, tus 1.0 (https://tus.io/protocols/resumable-upload): creation, termination, checksum, expiration.
+"""Declares the routes of resumable uploads, tus 1.0 (https://tus.io/protocols/resumable-upload), with its extensions
+creation, termination, checksum and expiration.
 
 The PATCH that brings the last byte answers with the capture's ``Location``, or with a 422 that names every fault.
 """
@@ -99,7 +100,7 @@ async def tus_patch(
         raise Problem(415, "unsupported-media-type", compose("offset-stream-wanted"))
     record = await service.threads.disk(_owned_upload, service, caller, upload_id)
     with service.uploads.lock(record.id):
-        # read again: the request that held the lock before may have made the capture
+        # read again under the lock: another request may have made the capture meanwhile
         record = await service.threads.disk(_owned_upload, service, caller, upload_id)
         return await _append(service, record, upload_offset, request.stream(), upload_checksum)
 
@@ -134,7 +135,7 @@ def _finish(service: Service, record: UploadRecord) -> UploadRecord:
         with service.store.incoming() as folder:
             data = service.uploads.data(record)
             capture = service.captures.accept(data, folder, CaptureMetadata.of(record.fields))
-    except (Unavailable, DiskFull):  # these may go well another time
+    except (Unavailable, DiskFull):  # the client may try again: keep the upload
         raise
     except (InputError, Refused):
         service.uploads.remove(record.id)
