@@ -91,9 +91,8 @@ def _told_by_files(root: Path) -> list[MessageDocument]:
     if read is None:
         return []
     files = find_files(root, read.rig, read.left_out)
-    strays = (
-        () if files.faults else unread_pictures(root, files, read.rig)
-    )  # a fault of a missing picture names the strays already
+    # Where a picture is missing, that fault names the strays already.
+    strays = () if files.faults else unread_pictures(root, files, read.rig)
     return documents_of([*read.remarks, *unread_files(root, rigs), *strays])
 
 

@@ -80,9 +80,8 @@ def _check_apart(out: Path, capture: Path, option: str = "--out") -> None:
     place, whole, root = out.resolve(), capture.resolve(), capture_root(capture).resolve()
     pictures = [root / kind for kind in ("images", *BESIDE_PICTURES)]
     pictures += [picture_folder(root)] if photographs_alone(root) else []  # there every folder counts as a camera's
-    beside_root = place.is_relative_to(whole) and not place.is_relative_to(
-        root
-    )  # the root is recognised as the only folder there
+    # The root is recognised as the only folder within ``whole``: a result beside it would hide it.
+    beside_root = place.is_relative_to(whole) and not place.is_relative_to(root)
     if place == root or beside_root or any(place.is_relative_to(folder) for folder in pictures):
         raise SpoilsCapture(out, option)
 

@@ -59,9 +59,7 @@ def send_archive(
     if request.headers.get("if-none-match") == headers["ETag"]:
         return Response(status_code=304, headers=headers)
     blocks = () if request.method == "HEAD" else _zipped(folder, list(files))
-    return StreamingResponse(
-        blocks, headers=headers, media_type="application/zip"
-    )  # without Content-Length, which is not known yet
+    return StreamingResponse(blocks, headers=headers, media_type="application/zip")  # its length is not known yet
 
 
 def _zipped(folder: Path, names: list[str]) -> Iterator[bytes]:

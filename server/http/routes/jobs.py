@@ -113,9 +113,8 @@ async def job_events(
     """
     seq = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
     while True:
-        state = await service.threads.disk(
-            service.jobs.state, job
-        )  # read before the events, so that none of an ended job is missed
+        # The state is read before the events, so that no event of an ended job is missed.
+        state = await service.threads.disk(service.jobs.state, job)
         for event in await service.threads.disk(service.jobs.events.since, job, min(seq, 2**31 - 1)):
             seq = event.seq
             yield ServerSentEvent(event="progress", id=str(seq), data=event.document)
