@@ -1,4 +1,4 @@
-"""The compiled loops of Cholesky's factor and of the systems that it solves."""
+"""Contains the compiled loops of ``calibration.adjustment.cholesky``."""
 
 import numpy as np
 
@@ -7,6 +7,8 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True)
 def factor_lower(a: np.ndarray) -> bool:
+    """Replaces the lower triangle of ``a`` by its Cholesky factor; returns False if the matrix is not positive
+    definite."""
     n = a.shape[0]
     for i in range(n):
         for j in range(i + 1):

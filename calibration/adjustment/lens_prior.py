@@ -1,7 +1,6 @@
-"""What is known of lenses before, or beside, the corners: Gaussian priors of the intrinsics.
+"""Defines Gaussian priors of the intrinsics: what is known of lenses independently of the corners.
 
-The priors are weak; they only keep what the views do not determine where lenses are.
-"""
+The default priors are weak; they only hold parameters that the views do not determine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ class LensPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedLensPrior:
-    """Holds the prior at the distance ``away`` from its mean."""
+    """Holds the prior and the difference ``away`` of the present intrinsics from its mean."""
 
     prior: LensPrior
     away: Float[np.ndarray, "c 9"]
@@ -54,7 +53,8 @@ class LinearisedLensPrior:
 
 
 class AspectTerm:
-    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` of each camera: pixels are nearly square."""
+    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` of each camera, since pixels are nearly
+    square."""
 
     def at(self, state: BundleState) -> "LinearisedAspectPrior":
         return LinearisedAspectPrior(*state.intrinsics[:, :2].T)
@@ -62,7 +62,7 @@ class AspectTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedAspectPrior:
-    """Holds the focal lengths (px) of all cameras."""
+    """Holds the focal lengths (px) of all cameras at one state."""
 
     fx: Float[np.ndarray, " c"]
     fy: Float[np.ndarray, " c"]
@@ -87,7 +87,7 @@ class LinearisedAspectPrior:
 
 
 def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
-    """Returns wide priors that hold for any lens, from the image sizes alone."""
+    """Returns wide priors that hold for any lens; they depend on the image sizes alone."""
     mean, sigma = [], []
     for width, height in sizes:
         long = max(width, height)
@@ -99,5 +99,5 @@ def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
 
 
 def fixed_prior(intrinsics: Float[np.ndarray, "c 9"]) -> LensPrior:
-    """Returns a prior without information, for lenses that are held fixed by ``Free(intrinsics=False)``."""
+    """Returns a prior with zero information, for lenses that ``Free(intrinsics=False)`` keeps fixed."""
     return LensPrior(intrinsics, np.zeros((len(intrinsics), 9, 9)))
