@@ -21,9 +21,11 @@ class RigidTransform:
         return RigidTransform(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def inverse(self) -> "RigidTransform":
+        """Returns a_from_b."""
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
     def apply(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        """Returns the points (mm) in frame b."""
         return points @ self.rotation.T + self.translation
 
 
@@ -51,10 +53,12 @@ class Similarity:
         return Similarity(self.scale * inner, self.rotation @ other.rotation, self.apply(other.translation))
 
     def inverse(self) -> "Similarity":
+        """Returns a_from_b."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
     def apply(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        """Returns the points (mm) in frame b."""
         return self.scale * (points @ self.rotation.T) + self.translation
 
 

@@ -46,6 +46,7 @@ class Rig:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Returns the cameras' names, in the order of their file."""
         return tuple(camera.name for camera in self.cameras)
 
     def subset(self, names: Iterable[str]) -> "Rig":

@@ -58,6 +58,7 @@ class BundleSolution:
 
     @property
     def cost(self) -> float:
+        """Returns the cost at the solution."""
         return self.evidence.cost
 
     def covariance(self) -> Float[np.ndarray, "q q"]:

@@ -26,6 +26,7 @@ def factor_lower(a: np.ndarray) -> bool:
 
 @njit(cache=True)
 def solve_lower(lower: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Replaces ``x`` by the solution of ``L L^T y = x``, with L the lower triangle ``lower``, and returns it."""
     n, m = x.shape
     for i in range(n):
         for k in range(i):

@@ -37,6 +37,7 @@ class CornerTerm:
     loss: Loss = field(default_factory=LeastSquares)
 
     def at(self, state: BundleState) -> "LinearisedCornerTerm":
+        """Returns the term at a state."""
         noise = self.sigma_px[self.seen.camera[self.seen.view_of]]
         return LinearisedCornerTerm(self, state, residuals(state, self.seen) / noise[:, None], noise)
 
@@ -52,9 +53,11 @@ class LinearisedCornerTerm:
 
     @property
     def cost(self) -> float:
+        """Returns the sum of the robust loss over all corners."""
         return float(self.term.loss.cost((self.residual**2).sum(axis=1)).sum())
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the blocks of all views to the normal equations."""
         seen, cameras = self.term.seen, len(self.state.intrinsics)
         weight = np.sqrt(self.term.loss.weight((self.residual**2).sum(axis=1)))
         blocks = np.concatenate([self.by_view(), self.residual[:, :, None]], axis=2)

@@ -51,6 +51,7 @@ class Lens:
 
     @property
     def sigma(self) -> Float[np.ndarray, " 9"]:
+        """Returns the standard deviations of fx fy cx cy (px) k1 k2 p1 p2 k3."""
         return np.sqrt(np.diag(self.covariance))
 
     @property

@@ -31,6 +31,7 @@ class LensPrior:
         return LensPrior(np.linalg.solve(total, pull[:, :, None])[:, :, 0], total)
 
     def at(self, state: BundleState) -> "LinearisedLensPrior":
+        """Returns the prior at a state."""
         return LinearisedLensPrior(self, state.intrinsics - self.mean)
 
 
@@ -43,9 +44,11 @@ class LinearisedLensPrior:
 
     @property
     def cost(self) -> float:
+        """Returns the squared Mahalanobis distance from the mean, summed over the cameras."""
         return float(np.einsum("ci,cij,cj->", self.away, self.prior.information, self.away))
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the prior to the normal equations."""
         for camera, (information, away) in enumerate(zip(self.prior.information, self.away, strict=True)):
             block = slice(camera * PER_CAMERA, camera * PER_CAMERA + len(INTRINSICS))
             equations.matrix[block, block] += information
@@ -57,6 +60,7 @@ class AspectTerm:
     square."""
 
     def at(self, state: BundleState) -> "LinearisedAspectPrior":
+        """Returns the term at a state."""
         return LinearisedAspectPrior(*state.intrinsics[:, :2].T)
 
 
@@ -69,10 +73,12 @@ class LinearisedAspectPrior:
 
     @property
     def residual(self) -> Float[np.ndarray, " c"]:
+        """Returns the residual of each camera, in standard deviations."""
         return 2.0 * (self.fx - self.fy) / (self.fx + self.fy) / ASPECT_PRIOR
 
     @property
     def cost(self) -> float:
+        """Returns the sum of squared residuals."""
         return float((self.residual**2).sum())
 
     def slopes(self) -> Float[np.ndarray, "c 2"]:
@@ -80,6 +86,7 @@ class LinearisedAspectPrior:
         return np.stack([4.0 * self.fy, -4.0 * self.fx], axis=1) / ((self.fx + self.fy)[:, None] ** 2 * ASPECT_PRIOR)
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the term to the normal equations."""
         for camera, (slope, residual) in enumerate(zip(self.slopes(), self.residual, strict=True)):
             block = slice(camera * PER_CAMERA, camera * PER_CAMERA + 2)
             equations.matrix[block, block] += np.outer(slope, slope)

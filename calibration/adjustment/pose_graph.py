@@ -64,6 +64,7 @@ class Edge:
 
     @property
     def consistent(self) -> bool:
+        """Tells whether the relative pose holds in at least half of the shared shots."""
         return self.support >= max(1, self.shared / 2)
 
 
@@ -81,6 +82,8 @@ class Graph:
     edges: tuple[Edge, ...]
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
+        """Returns the graph as the start of a bundle adjustment, with the intrinsics of ``lenses`` and no time
+        offsets."""
         return BundleState(
             np.stack([lenses[name].intrinsics.values() for name in self.names]),
             np.stack([self.cameras[name].rotation for name in self.names]),

@@ -58,6 +58,7 @@ class BundleState:
     velocities: Float[np.ndarray, "s 6"]
 
     def camera_pose(self, index: int) -> RigidTransform:
+        """Returns camera_from_world of the camera at ``index``."""
         return RigidTransform(self.camera_rotations[index], self.camera_translations[index])
 
 

@@ -51,6 +51,7 @@ class Contour:
 
     @classmethod
     def of(cls, camera: Camera, silhouette: Silhouette) -> "Contour":
+        """Extracts the outline of a silhouette, smoothed by ``SMOOTH_PX``."""
         found, _ = cv2.findContours(silhouette.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         chain = max(found, key=len).reshape(-1, 2).astype(float)
         pixels = gaussian_filter1d(on_contour(chain, silhouette.distance), SMOOTH_PX, axis=0, mode="wrap")

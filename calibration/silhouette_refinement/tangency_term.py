@@ -65,6 +65,7 @@ class TangencyTerm:
     noise_px: float
 
     def at(self, correction: Float[np.ndarray, " p"]) -> Residuals:
+        """Returns the residuals, in standard deviations, and their derivatives at a correction."""
         rig = corrected(self.start, correction, focal=self.focal)
         residual_px = tangency_residuals(self.seen, rig)
         return Residuals(

@@ -1,7 +1,6 @@
-"""Is a capture worth reconstructing? Said while the subject still sits there, of shots and uploads alike.
+"""Judges whether a capture is worth reconstructing, for shots (while the subject is still there) and uploads alike.
 
-Measures one camera at a time, so that a large rig is judged in the memory of one camera.
-"""
+Cameras are measured one at a time, so that judging a large rig takes the memory of one camera."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass

@@ -28,7 +28,8 @@ class PoseDocument(TypedDict):
 
 
 class CameraDocument(TypedDict):
-    """``covariance``: 6 x 6, rotation (rad) then translation (mm); ``serial``: of the body, as EXIF has it."""
+    """Holds one camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm); ``serial`` is the body's serial
+    number as EXIF has it."""
 
     name: str
     width: int
@@ -41,7 +42,7 @@ class CameraDocument(TypedDict):
 
 
 class CamerasDocument(TypedDict):
-    """``cameras.json``."""
+    """Holds the content of ``cameras.json``."""
 
     format: str
     unit: str

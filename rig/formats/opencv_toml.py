@@ -141,6 +141,7 @@ def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]
 
 
 def looks_like_aniposelib(path: Path) -> bool:
+    """Tells whether a TOML file consists of aniposelib's camera tables."""
     try:
         document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
     except InputError:

@@ -1,14 +1,14 @@
-"""Who works on what, by files alone: a claim is a symbolic link of the claimed name to its owner's file.
+"""Decides through files alone which process works on what: a claim is a symbolic link of the claimed name to its
+owner's file.
 
-Making a link is atomic and refused where one is, on local disks and on NFS and Lustre, where ``flock`` may not reach
-other machines; and it says at once whose it is. An owner is one process. Its file is touched every ``BEAT_S`` seconds;
-whoever is silent for ``HEARTBEAT_TIMEOUT_S``, whose process is gone (same machine), or whose file is gone, has lost its
-claims.
+Making a link is atomic and fails where one exists, on local disks as on NFS and Lustre, where ``flock`` may not reach
+other machines; and the link names its owner. An owner is one process. It touches its file every ``BEAT_S`` seconds. An
+owner loses its claims if its file is untouched for ``HEARTBEAT_TIMEOUT_S``, if its process is gone (same machine), or
+if its file is gone.
 
-A lost claim is taken away by one process alone: that which claims the claim (its name and the loser's token) first.
-Nobody else removes the link, so that what is removed is never a newer one. A process that was stopped for longer than
-``HEARTBEAT_TIMEOUT_S`` and goes on asks ``Claims.holds`` before it lays a result down.
-"""
+A lost claim is removed by one process only: the one that first claims the removal (a claim named by the claim and the
+loser's token). So a newer claim is never removed by mistake. A process that was suspended for longer than
+``HEARTBEAT_TIMEOUT_S`` and continues asks ``Claims.holds`` before it publishes a result."""
 
 import json
 import os
@@ -141,7 +141,7 @@ class Claims:
 
 
 def _holder(path: Path) -> str | None:
-    """The token of who has a claim; None where nobody has."""
+    """Returns the token of the process that has a claim; None if none has it."""
     try:
         return path.readlink().name.removesuffix(SUFFIX)
     except OSError:

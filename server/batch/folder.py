@@ -1,4 +1,4 @@
-"""The folder that a batch fills: results by name, each complete or absent, and beside them what is at work.
+"""Manages the folder that a batch fills: results by name, each complete or absent, and records of work in progress.
 
 NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it follows from
 heads.csv heads.parquet sheet.html
@@ -23,7 +23,7 @@ from server.storage.result_folder import RESULT_FILE
 RECORD = "batch.json"
 RECORD_FORMAT, FAILURE_FORMAT = "eigenhead-batch-result/1", "eigenhead-batch-failure/1"
 REPORT = "report.json"
-FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks")  # of captures of photographs alone
+FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks")  # kept for captures without cameras
 
 
 class ForeignFiles(EigenheadError):
@@ -73,6 +73,7 @@ class BatchFolder:
         self.claims, self.attempts = self.work / "claims", self.work / "attempts"
 
     def result(self, name: str) -> Path:
+        """Returns the folder of a capture's result."""
         return self.out / name
 
     def origin(self, name: str) -> Origin | None:
@@ -161,6 +162,7 @@ class BatchFolder:
         write_atomically(self.failure_file(name), json.dumps(document, indent=1).encode())
 
     def failure_file(self, name: str) -> Path:
+        """Returns the path of a capture's failure record."""
         return self.work / "failures" / f"{file_name(name)}.json"
 
     def forget_failures_but_of(self, names: set[str]) -> None:

@@ -1,4 +1,4 @@
-"""How far a batch is, and how long it takes yet."""
+"""Measures how far a batch is, and estimates its remaining time."""
 
 import time
 from collections.abc import Callable
@@ -23,6 +23,7 @@ class BatchProgress:
         self.ended = self.failed = 0
 
     def start(self, name: str) -> None:
+        """Records that work on a capture begins."""
         self._running[name] = self._clock(), 0.0
 
     def report(self, name: str, share: float) -> None:

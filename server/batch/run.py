@@ -1,8 +1,7 @@
-"""A batch at work: each worker takes one capture after the other, in a child process that keeps models and loops.
+"""Runs a batch: each worker takes one capture after the other, in a child process that keeps models and compiled loops.
 
-Whatever happens to a child or a capture is that capture's failure alone. Whatever happens to this process leaves
-results complete or absent; what it had begun is swept by whoever comes next.
-"""
+A crash of a child, or a fault of a capture, is a failure of that capture only. If this process ends at any moment,
+every result is complete or absent, and the next run removes what was left unfinished."""
 
 import os
 import shutil
@@ -29,9 +28,9 @@ from server.tasks.reconstruct_folder import reconstruct_beside
 if TYPE_CHECKING:
     from server.batch.plan import BatchTask
 
-POLL_S = 0.5  # between two questions whether a capture that another process has is done
+POLL_S = 0.5  # interval of checks whether another process has finished a capture
 EXAMINERS = 4  # captures whose files are compared at once: hashing releases the interpreter lock
-TABLE = "table"  # the claim of who writes the tables
+TABLE = "table"  # name of the claim on writing the table
 
 
 class FolderWork(Protocol):
@@ -63,7 +62,10 @@ class Outcome:
 
 
 class Observer(Protocol):
-    """Declares what is called as a batch goes on, from several threads but never two at a time."""
+    """Declares the methods that are called as a batch proceeds, from several threads but never two at a time.
+
+    ``begin`` gets the number of captures to make; ``start``, ``report`` (share done, 0 to 1) and ``end`` follow each
+    capture; ``leave`` tells that another process has it."""
 
     def begin(self, pending: int) -> None: ...
     def start(self, name: str) -> None: ...
@@ -115,7 +117,7 @@ class BatchRun:
         return [self._outcomes[task.capture.name] for task in self._tasks if task.capture.name in self._outcomes]
 
     def _examine(self) -> None:
-        """Tells what is there from what is missing."""
+        """Separates the captures whose results exist from those to be made."""
 
         def kept(task: "BatchTask") -> bool:
             try:
@@ -172,7 +174,8 @@ class BatchRun:
                     self._stopped.wait(POLL_S)
 
     def _take(self, task: "BatchTask", child: Child) -> bool:
-        """Whether a capture has ended: False where another process has it, or where this one is to stop."""
+        """Works on a capture and tells whether it has ended. Returns False if another process has it, or if this one is
+        to stop."""
         name = task.capture.name
         claim = file_name(name)
         if not self._claims.take(claim):

@@ -1,4 +1,4 @@
-"""Table and contact sheet of all that a batch has in its folder, whoever made it."""
+"""Writes table and contact sheet of all results in a batch's folder, whichever process made them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -46,7 +46,8 @@ def _row_and_card(folder: BatchFolder, task: BatchTask, columns: Sequence[Column
 
 
 def _result(folder: BatchFolder, task: BatchTask) -> tuple[Origin | None, dict[str, Any] | None]:
-    """A result of these settings and this model; one of others is to be made again."""
+    """Returns origin and report of a capture's result if it was made with these settings and this model; otherwise
+    None, None."""
     origin = folder.origin(task.capture.name)
     wanted = task.settings_sha256, task.model_sha256
     if origin is None or (origin.settings_sha256, origin.model_sha256) != wanted:
@@ -64,7 +65,7 @@ def _why(failure: FailureRecord | None) -> tuple[MessageDocument, ...]:
 
 
 def _expressions(tasks: Sequence[BatchTask]) -> list[str]:
-    """Of all models in use, each name once."""
+    """Returns the names of the expressions of all models in use, each once."""
     names = [name for model in dict.fromkeys(task.model for task in tasks) for name in _of_model(model)]
     return list(dict.fromkeys(names))
 

@@ -48,21 +48,26 @@ class BatchDisplay:
             prepare_kernels(self._prepared, settings_from_document(settings))
 
     def begin(self, pending: int) -> None:
+        """Begins to show progress of ``pending`` captures."""
         self._count, self._progress = pending, BatchProgress(pending, self._workers, self._expected_s)
         self._show()
 
     def start(self, name: str) -> None:
+        """Notes that work on a capture begins."""
         self._progress.start(name)
 
     def report(self, name: str, share: float) -> None:
+        """Shows that ``share`` (0 to 1) of a capture is done."""
         self._progress.report(name, share)
         self._show()
 
     def leave(self, name: str) -> None:
+        """Shows that another process has the capture."""
         self._progress.leave(name)
         self._show()
 
     def end(self, outcome: Outcome) -> None:
+        """Shows how a capture ended, and why if it failed."""
         self._progress.end(outcome.name, failed=outcome.state == "failed")
         self._show()
         if outcome.failure is not None:
@@ -72,6 +77,7 @@ class BatchDisplay:
             self._say(f"{ended} of {self._count}: {outcome.name} in {outcome.seconds:.0f} s, about {left} left")
 
     def seconds(self) -> float:
+        """Returns the seconds since the display was made."""
         return time.monotonic() - self._began
 
     def _prepared(self, stage: str, share: float) -> None:

@@ -36,6 +36,7 @@ class OpenStudio:
 
     @classmethod
     def of(cls, devices: StudioDevices, truth: Path) -> "OpenStudio":
+        """Collects the addresses of devices that run. ``truth`` is the folder of the subject's truth."""
         link = devices.port_link
         cameras = {name: devices.streams.url(name) for name in devices.names}
         return cls(devices.streams.address, cameras, link, str(link.readlink()), devices.folder / "rig.toml", truth)
