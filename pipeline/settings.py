@@ -258,7 +258,9 @@ class Settings:
     front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
     unexplained_outlines: Literal["refuse", "warn"] = "refuse"  # of a head that explains hardly any of them
-    device: Literal["auto", "cpu", "gl"] = "auto"  # what compares photographs: a GPU where there is one, or any OpenGL
+    device: Literal["auto", "cpu", "gl"] = (
+        "auto"  # what compares photographs; auto: a GPU where there is one and the processor is small; gl: any OpenGL
+    )
     fail_on: tuple[str, ...] = ()  # codes of warnings (pipeline.warnings.WARNING_CODES) that are failures here
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
     faces: FaceSettings = field(default_factory=FaceSettings)
