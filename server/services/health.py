@@ -23,6 +23,7 @@ def readiness(service: Service) -> dict[str, Check]:
         "database": _database(service),
         "disk": _disk(service),
         "worker": _workers(service),
+        "queues": _queues(service),
         "egl": _egl(service),
         "rig": _rig(service),
         "records": _records(service),
@@ -57,6 +58,20 @@ def _workers(service: Service) -> Check:
     if service.jobs.worker_may_start():
         return Check(ok=False, detail=compose("worker-loading"), starting=True)
     return Check(ok=False, detail=compose("no-worker-alive"))
+
+
+def _queues(service: Service) -> Check:
+    """Queues whose jobs wait for a worker that nobody has started. The service can take other work, so that this is no
+    reason to send it none."""
+    try:
+        idle = {
+            queue: count for queue, count in service.jobs.index.queued().items() if service.jobs.queue_notice(queue)
+        }
+    except SQLAlchemyError:
+        return Check(ok=True, detail=compose("queues-unknown"))
+    if not idle:
+        return Check(ok=True, detail=compose("queues-served"))
+    return Check(ok=True, detail=compose("queues-unserved", queues=sorted(idle), count=sum(idle.values())))
 
 
 def check_egl(service: Service) -> None:

@@ -81,6 +81,41 @@ session_index = sa.Table(
     sa.Column("changed", sa.BigInteger, nullable=False),
 )
 
+batches = sa.Table(
+    "eigenhead_batches",
+    metadata,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("created", sa.BigInteger, nullable=False),  # ms since 1970
+    sa.Column("label", sa.Text, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),  # what a search compares
+    sa.Column("key", sa.String(64), nullable=False, index=True),
+    sa.Column("digest", sa.String(64), nullable=False),  # of the request, for a key that repeats it
+    sa.Column("wish", sa.String(16), nullable=False),  # what its owner wants: running, paused, cancelled
+    sa.Column("finished", sa.BigInteger, nullable=True, index=True),  # ms; NULL while something is to be done
+    sa.Column("rounds", sa.Integer, nullable=False),  # how often it finished
+    sa.Column("queue", sa.String(64), nullable=False),
+    sa.Column("priority", sa.Integer, nullable=False),
+    sa.Column("model", sa.Text, nullable=True),
+    sa.Column("settings", sa.Text, nullable=False),  # JSON
+)
+
+batch_items = sa.Table(  # a capture of a batch; its job, once it has one, is the engine's row
+    "eigenhead_batch_items",
+    metadata,
+    sa.Column("batch_id", sa.String(64), primary_key=True),
+    sa.Column("position", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("capture_id", sa.String(64), nullable=True, index=True),  # NULL: erased
+    sa.Column("job_id", sa.String(64), nullable=True, index=True),  # NULL: waits
+    sa.Column("recalled", sa.Boolean, nullable=False, default=False),  # its job is being taken back
+    sa.Index("eigenhead_batch_items_waiting", "batch_id", "job_id"),
+)
+sa.Index(
+    "eigenhead_batch_items_recalled",
+    batch_items.c.batch_id,
+    sqlite_where=batch_items.c.recalled.is_(sa.true()),
+    postgresql_where=batch_items.c.recalled.is_(sa.true()),
+)
+
 workers = sa.Table(
     "eigenhead_workers",
     metadata,
