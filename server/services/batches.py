@@ -130,6 +130,10 @@ class Batches:
         page = self._index.page(sought, state, limit, cursor)
         return Found(tuple(self._batches(self._index.of(page.ids))), page.next, page.total)
 
+    def of(self, ids: Sequence[str]) -> list[Batch]:
+        """Returns the batches with these ids, in their order; ids of no batch are left out."""
+        return self._batches(self._index.of(ids))
+
     def pause(self, identity: str) -> Batch:
         """Lets no further job of a batch begin; those that run go on. Raises NotFound, and Conflict for a batch that
         ended."""

@@ -45,6 +45,7 @@ TEMPLATES = {
     "batch-none-failed": "No job of the batch failed.",
     "too-many-batches": "{count} batches of this key have not ended, which is the most; wait for one to end.",
     "batch-parquet-missing": "This service lacks pyarrow: take the table as CSV, or install the extra parquet.",
+    "batch-begun": "Batch begun: {count} capture. | Batch begun: {count} captures.",
     "queues-served": "workers serve all in which jobs wait",
     "queues-unserved": "{count} jobs wait where no worker is: {queues}",
     "queues-unknown": "unknown: the database does not answer",

@@ -1003,6 +1003,7 @@ export default {
   "batch-none-failed": "Kein Auftrag des Stapels ist gescheitert.",
   "too-many-batches": "{count} Stapel dieses Schlüssels sind nicht zu Ende, mehr dürfen es nicht sein; warten, bis einer endet.",
   "batch-parquet-missing": "Diesem Dienst fehlt pyarrow: die Tabelle als CSV nehmen oder das Extra parquet installieren.",
+  "batch-begun": "Stapel begonnen: {count} Aufnahme. | Stapel begonnen: {count} Aufnahmen.",
   "queues-served": "alle, in denen Aufträge warten, haben Worker",
   "queues-unserved": "{count} Aufträge warten, wo kein Worker ist: {queues}",
   "queues-unknown": "unbekannt: Die Datenbank antwortet nicht",
