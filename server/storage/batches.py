@@ -144,12 +144,15 @@ class BatchIndex:
     def active(self) -> dict[str, dict[str, str]]:
         """Returns the engine's status of every queued or running job of a batch, by batch and job."""
         item, job = batch_items.c, self._status.c
-        joined = self._status.join(batch_items, job.workflow_uuid == item.job_id)
-        query = sa.select(item.batch_id, item.job_id, job.status).select_from(joined).where(job.status.in_(ACTIVE))
+        query = sa.select(item.batch_id, item.job_id)
         found: dict[str, dict[str, str]] = {}
         with self._engine.connect() as connection:
-            for row in connection.execute(query):
-                found.setdefault(row.batch_id, {})[row.job_id] = row.status
+            rows = connection.execute(sa.select(job.workflow_uuid, job.status).where(job.status.in_(ACTIVE)))
+            active = {row.workflow_uuid: row.status for row in rows}  # few; joined, all items would be gone through
+            ids = list(active)
+            for start in range(0, len(ids), AT_ONCE):
+                for row in connection.execute(query.where(item.job_id.in_(ids[start : start + AT_ONCE]))):
+                    found.setdefault(row.batch_id, {})[row.job_id] = active[row.job_id]
         return found
 
     def waiting_within(self, connection: sa.Connection, identity: str, limit: int) -> list[BatchItem]:
