@@ -28,7 +28,7 @@ from server.services.webhooks import Webhooks
 from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
 from server.storage.batches import ENQUEUED, GONE, WAITING, BatchItem, BatchRow, BatchState, Tally
-from server.storage.database import alive_workers, workers
+from server.storage.database import slots_by_queue
 from server.storage.library import Library
 from server.storage.records import CaptureRecord, JobRequest
 from server.storage.store import Store, is_id, new_id, repeatable_id
@@ -36,7 +36,7 @@ from server.storage.store import Store, is_id, new_id, repeatable_id
 FED_MOST = 100  # jobs of batches that are queued or run in one queue: more than its workers end between two calls
 FAULTS_MOST = 100  # of one refusal: ten thousand wrong ids need not all come back
 PRIORITY = 500  # of a batch; a job has 100, and the lower number goes first
-ITEM_STATES = ("waiting", "queued", "running", "succeeded", "failed", "cancelled", "removed")
+ITEM_STATES: tuple[str, ...] = ("waiting", "queued", "running", "succeeded", "failed", "cancelled", "removed")
 UNDONE = ("waiting", "queued", "running")
 
 log = structlog.get_logger()
@@ -282,18 +282,12 @@ class Batches:
             self._index.settle_recall(identity, job_id, taken=taken)
 
     def _batches(self, rows: Sequence[BatchRow]) -> list[Batch]:
-        tallies, slots = self._index.tallies([row.id for row in rows]), self._slots()
+        tallies = self._index.tallies([row.id for row in rows])
+        slots = slots_by_queue(self._engine, self._settings.silent_s)
         return [self._batch(row, tallies[row.id], slots.get(row.queue, 0)) for row in rows]
 
-    def _slots(self) -> dict[str, int]:
-        """How many jobs the live workers of each queue run at once."""
-        columns = (workers.c.queue, sa.func.sum(workers.c.concurrency))
-        with self._engine.connect() as connection:
-            alive = alive_workers(connection, self._settings.silent_s)
-            return {row[0]: row[1] for row in connection.execute(sa.select(*columns).where(alive).group_by(columns[0]))}
-
     def _batch(self, row: BatchRow, tally: Tally, slots: int) -> Batch:
-        counts = dict.fromkeys(ITEM_STATES, 0)
+        counts: dict[str, int] = dict.fromkeys(ITEM_STATES, 0)
         special = {GONE: "removed", WAITING: "cancelled" if row.wish == "cancelled" else "waiting"}
         for status, count in tally.statuses.items():
             counts[special[status] if status in special else STATES[status]] += count

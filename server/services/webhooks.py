@@ -130,7 +130,7 @@ def _delivery(identity: str) -> EnqueueOptions:
 
 def _signed(message: WebhookMessage, secret: str | None) -> tuple[bytes, dict[str, str]]:
     """The body and headers of a message; without a secret it is not signed."""
-    data = {name: message[name] for name in ("job_id", "batch_id") if name in message}
+    data = {name: value for name, value in message.items() if name in ("job_id", "batch_id")}
     body = json.dumps({"type": message["type"], "data": data}).encode()
     signed = {} if secret is None else signed_headers(message["id"], int(time.time()), body, secret)
     return body, signed | {"content-type": "application/json"}

@@ -117,13 +117,13 @@ class BatchIndex:
         status = sa.case((waits, WAITING), else_=sa.func.coalesce(job.status, GONE)).label("status")
         took = sa.func.avg(sa.cast(job.completed_at - job.started_at_epoch_ms, sa.Float)).label("took")
         joined = batch_items.outerjoin(self._status, job.workflow_uuid == item.job_id)
-        query = sa.select(item.batch_id, status, sa.func.count().label("count"), took).select_from(joined)
+        query = sa.select(item.batch_id, status, sa.func.count().label("number"), took).select_from(joined)
         query = query.where(item.batch_id.in_(ids)).group_by(item.batch_id, status)
         counts: dict[str, dict[str, int]] = {identity: {} for identity in ids}
         means: dict[str, float] = {}
         with self._engine.connect() as connection:
             for row in connection.execute(query):
-                counts[row.batch_id][row.status] = row.count
+                counts[row.batch_id][row.status] = row.number
                 if row.status == "SUCCESS" and row.took is not None:
                     means[row.batch_id] = row.took / 1000
         return {identity: Tally(counts[identity], means.get(identity)) for identity in ids}

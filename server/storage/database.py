@@ -116,6 +116,13 @@ sa.Index(
     postgresql_where=batch_items.c.recalled.is_(sa.true()),
 )
 
+failures = sa.Table(  # how many jobs failed, by kind, since the database was made
+    "eigenhead_failures",
+    metadata,
+    sa.Column("kind", sa.String(64), primary_key=True),
+    sa.Column("count", sa.BigInteger, nullable=False),
+)
+
 workers = sa.Table(
     "eigenhead_workers",
     metadata,
@@ -208,6 +215,13 @@ def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElemen
     """Returns the SQL condition that a worker has not stopped and sent a heartbeat within the last
     ``silent_s`` seconds."""
     return sa.and_(workers.c.stopped.is_(None), workers.c.seen > now_sql(connection) - silent_s)
+
+
+def slots_by_queue(engine: sa.Engine, silent_s: float) -> dict[str, int]:
+    """Returns how many jobs the live workers of each queue run at once."""
+    slots = sa.select(workers.c.queue, sa.func.sum(workers.c.concurrency)).group_by(workers.c.queue)
+    with engine.connect() as connection:
+        return {row[0]: row[1] for row in connection.execute(slots.where(alive_workers(connection, silent_s)))}
 
 
 def now_sql(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:

@@ -44,6 +44,14 @@ class JobOfCapture:
     status: str
 
 
+@dataclass(frozen=True, slots=True)
+class Queued:
+    """Holds how many jobs wait in a queue, and since when the oldest does (seconds since 1970)."""
+
+    jobs: int
+    since: float
+
+
 class JobIndex:
     """Finds jobs of one of the engine's workflows. Methods block."""
 
@@ -101,13 +109,13 @@ class JobIndex:
         with self._engine.connect() as connection:
             return {row[0]: row[1] for row in connection.execute(query)}
 
-    def queued(self) -> dict[str, int]:
-        """Returns the number of queued jobs by queue."""
+    def queued(self) -> dict[str, Queued]:
+        """Returns how many jobs wait in each queue, and since when the first of them."""
         status = self._status.c
-        query = sa.select(status.queue_name, sa.func.count()).where(status.name == self._workflow)
+        query = sa.select(status.queue_name, sa.func.count(), sa.func.min(status.created_at))
+        query = query.where(status.name == self._workflow, status.status.in_(ENQUEUED)).group_by(status.queue_name)
         with self._engine.connect() as connection:
-            found = connection.execute(query.where(status.status.in_(ENQUEUED)).group_by(status.queue_name))
-            return {row[0]: row[1] for row in found}
+            return {row[0]: Queued(row[1], row[2] / 1000) for row in connection.execute(query)}
 
     def newest_first(self, statuses: Sequence[str]) -> list[str]:
         """Lists the ids of all jobs that have one of the engine's ``statuses``, newest first."""

@@ -2,10 +2,13 @@
 
 import csv
 import io
+import json
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +182,9 @@ def test_a_cancelled_batch_keeps_its_heads_and_ends_for_good(http: httpx.Client,
 def test_failed_captures_are_tried_again_and_no_others(http: httpx.Client, captures: list[str]) -> None:
     batch = begin(http, captures=captures[:2], settings={"front": "fail"})["id"]
     assert counted(awaited(http, batch, finished)) == {"failed": 2}
+    shown = http.get("/metrics").text
+    assert 'eigenhead_failures{kind="invalid-capture"} 2.0' in shown
+    assert 'eigenhead_worker_slots{queue="cpu"} 1.0' in shown
     failed = {job["id"] for job in http.get("/v1/jobs", params={"batch": batch}).json()["jobs"]}
     again = http.post(f"/v1/batches/{batch}/retry").json()
     assert (again["state"], again["finished"]) == ("running", None)
@@ -251,6 +257,39 @@ def test_the_table_and_the_sheet_are_those_of_the_command_line(tmp_path: Path) -
         assert "default-src 'none'" in sheet.headers["content-security-policy"]
         assert "<h1>Study &lt;4&gt;</h1>" in sheet.text
         assert sheet.text.count("data:image/jpeg") == 2
+
+
+def test_webhooks_hear_once_of_each_end_of_a_batch(http: httpx.Client, captures: list[str]) -> None:
+    received: list[dict[str, Any]] = []
+
+    class Receiver(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            received.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    receiver = HTTPServer(("127.0.0.1", 0), Receiver)
+    threading.Thread(target=receiver.serve_forever, daemon=True).start()
+    hook = http.post("/v1/webhooks", json={"url": f"http://127.0.0.1:{receiver.server_port}/"}).json()["id"]
+    try:
+        batch = begin(http, captures=captures[:1], settings={"front": "fail"})["id"]
+        for times in (1, 2):
+            awaited(http, batch, finished)
+            deadline = time.monotonic() + 30
+            while len(heard := [one for one in received if one["type"] == "batch.finished"]) < times:
+                assert time.monotonic() < deadline, received
+                time.sleep(0.05)
+            time.sleep(0.5)
+            assert heard == times * [{"type": "batch.finished", "data": {"batch_id": batch}}]
+            if times == 1:
+                http.post(f"/v1/batches/{batch}/retry")
+    finally:
+        http.delete(f"/v1/webhooks/{hook}")
+        receiver.shutdown()
+        receiver.server_close()
 
 
 def test_an_operators_shot_goes_before_the_batch(http: httpx.Client, captures: list[str]) -> None:
