@@ -56,7 +56,7 @@ class BatchItem:
 @dataclass(frozen=True, slots=True)
 class Tally:
     """Counts the items of a batch: ``statuses`` are the engine's, ``waiting`` and ``gone``. ``mean_s``: mean duration
-    of the jobs that succeeded, None where none did."""
+    of the jobs that succeeded, None where none did; on SQLite the engine notes whole seconds."""
 
     statuses: Mapping[str, int]
     mean_s: float | None

@@ -70,7 +70,7 @@ def test_a_batch_makes_a_job_of_each_capture_and_says_how_far_it_is(http: httpx.
     batch = begin(http, captures=captures[:3], label="walk", settings={"detail": "span"})
     assert (batch["state"], batch["total"], batch["priority"], batch["queue"]) == ("running", 3, 500, "cpu")
     halfway = awaited(http, batch["id"], lambda b: 0 < b["counts"]["succeeded"] < 3)
-    assert 0 < halfway["eta_s"] < 60
+    assert 0 <= halfway["eta_s"] < 60  # on SQLite the engine's moments are whole seconds, and these jobs shorter
     done = awaited(http, batch["id"], finished)
     assert (done["state"], counted(done), done["eta_s"]) == ("finished", {"succeeded": 3}, None)
     jobs = http.get("/v1/jobs", params={"batch": batch["id"], "sort": "created"}).json()
