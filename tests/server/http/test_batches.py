@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import re
 import signal
 import threading
 import time
@@ -357,15 +358,16 @@ def test_a_capture_that_kills_workers_is_set_aside_and_the_others_are_made(tmp_p
     ):
         captures = [uploaded_capture(service, tmp_path, seed) for seed in range(3)]
         batch = begin(http, captures=captures)["id"]
-        deadline = time.monotonic() + 200
+        deadline, kills = time.monotonic() + 200, 0
         while True:
             jobs = http.get("/v1/jobs", params={"batch": batch, "capture": captures[0]}).json()["jobs"]
             if jobs and jobs[0]["state"] in ("failed", "succeeded"):
                 break
-            if jobs and jobs[0]["state"] == "running":
+            if jobs and re.findall(f"{jobs[0]['id']} stage=read", service.log.read_text())[kills:]:
+                kills += 1
                 for pid in worker_pids(service):
                     os.kill(pid, signal.SIGKILL)
             assert time.monotonic() < deadline
-            time.sleep(0.3)
+            time.sleep(0.2)
         assert (jobs[0]["state"], jobs[0]["error"]["type"]) == ("failed", URN + "worker-died")
         assert counted(awaited(http, batch, finished, 120)) == {"failed": 1, "succeeded": 2}
