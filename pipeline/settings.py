@@ -111,7 +111,8 @@ class PhotoSettings:
     centre_mm: float = 3.0  # distance of patches
     views_most: int = 5  # a patch is compared between its most frontal views
     least_seen: float = 0.85  # of a patch's weight: a view that sees less of it does not count
-    least_correlation: float = 0.6  # a lower peak is silence
+    least_correlation: float = 0.6  # a lower peak is silence ...
+    least_texture_correlation: float = 0.35  # ... and without shading, where skin has 0.4 to 0.6
     least_share: float = 0.15  # of the patches that must be found again in other views, or photographs are no use
     floor_mm: float = 0.15  # error of an observation that no correlation shows: highlights, the patch's own relief
     rig_scale_spread: float = 2e-4  # what all distances of a calibrated rig may err alike: 0.05 mm on a board of 250
@@ -134,6 +135,8 @@ class FineSettings:
     coarse_floor_mm: float = 0.3  # the nodes' edges are 4 mm long: relief that they cannot follow
     correlation_mm: float = 4.0  # radius within which points err alike: windows of dense matching overlap
     common_mm: float = 0.1  # what points may err alike beyond that: cameras, shading
+    shared_error: float = 0.25  # share of a point's deviation by which points beyond that err alike: means over 16 mm
+    # are 0.2 to 1 of it off
     views_least: int = 4  # that agree on a point, where eight see it or more: with fewer, beside hair and behind ears,
     # it lies 1 mm too deep. Where fewer see it, half of them; two at least
     hair_off_mm: float = 0.5  # how far beside the skin a point lies that is hair after all
@@ -258,7 +261,9 @@ class Settings:
     front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
     unexplained_outlines: Literal["refuse", "warn"] = "refuse"  # of a head that explains hardly any of them
-    device: Literal["auto", "cpu", "gl"] = "auto"  # what compares photographs: a GPU where there is one, or any OpenGL
+    device: Literal["auto", "cpu", "gl"] = (
+        "auto"  # what compares photographs; auto: a GPU where there is one and the processor is small; gl: any OpenGL
+    )
     fail_on: tuple[str, ...] = ()  # codes of warnings (pipeline.warnings.WARNING_CODES) that are failures here
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
     faces: FaceSettings = field(default_factory=FaceSettings)

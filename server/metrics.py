@@ -3,11 +3,22 @@
 import resource
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 BUCKETS = (0.005, 0.02, 0.1, 0.5, 2.0, 10.0, 60.0)
+
+
+@dataclass(frozen=True, slots=True)
+class QueueFigures:
+    """Holds how many jobs wait in a queue, for how long the oldest has waited (s), and how many its live workers run at
+    once."""
+
+    jobs: int
+    oldest_s: float
+    slots: int
 
 
 class Metrics:
@@ -25,6 +36,13 @@ class Metrics:
             registry=self.registry,
         )
         self.jobs = Gauge("eigenhead_jobs", "Jobs by state", ("state",), registry=self.registry)
+        queue, registry = ("queue",), self.registry
+        self.queued = Gauge("eigenhead_queue_jobs", "Jobs that wait in a queue", queue, registry=registry)
+        waited = "How long the oldest job of a queue has waited"
+        self.oldest = Gauge("eigenhead_queue_oldest_seconds", waited, queue, registry=registry)
+        at_once = "Jobs that the live workers of a queue run at once"
+        self.slots = Gauge("eigenhead_worker_slots", at_once, queue, registry=registry)
+        self.failures = Gauge("eigenhead_failures", "Jobs that failed, by kind", ("kind",), registry=self.registry)
         self.captures = Gauge("eigenhead_captures", "Captures kept", registry=self.registry)
         self.free = Gauge("eigenhead_disk_free_bytes", "Free space of the data folder", registry=self.registry)
         self.memory = Gauge("eigenhead_peak_memory_bytes", "Peak memory of the service process", registry=self.registry)
@@ -40,8 +58,25 @@ class Metrics:
         self.requests.labels(method, route, str(status)).inc()
         self.seconds.labels(route).observe(time.monotonic() - began)
 
-    def exposition(self, jobs: Mapping[str, int], *, captures: int, free: int, damaged: int) -> bytes:
-        """Returns Prometheus' text format. ``jobs`` by state, ``free`` in bytes."""
+    def exposition(
+        self,
+        jobs: Mapping[str, int],
+        *,
+        captures: int,
+        free: int,
+        damaged: int,
+        queues: Mapping[str, QueueFigures],
+        failures: Mapping[str, int],
+    ) -> bytes:
+        """Returns Prometheus' text format. ``jobs`` by state, ``free`` in bytes, ``failures`` by kind."""
+        for gauge in (self.queued, self.oldest, self.slots):
+            gauge.clear()  # of queues that nobody uses any more
+        for name, figures in queues.items():
+            self.queued.labels(name).set(figures.jobs)
+            self.oldest.labels(name).set(figures.oldest_s)
+            self.slots.labels(name).set(figures.slots)
+        for kind, count in failures.items():
+            self.failures.labels(kind).set(count)
         for state, count in jobs.items():
             self.jobs.labels(state).set(count)
         self.captures.set(captures)

@@ -8,6 +8,8 @@ URN = "urn:eigenhead:problem:"
 
 PROBLEM_TYPES = {
     # What a request asks and the service refuses
+    "batch-active": "Batch active",
+    "batch-ended": "Batch ended",
     "board-shot": "Board shot",
     "calibration-active": "Calibration active",
     "calibration-poor": "Calibration poor",
@@ -27,6 +29,7 @@ PROBLEM_TYPES = {
     "no-board": "No board",
     "no-capture": "No capture",
     "no-result": "No result",
+    "no-parquet": "No parquet",
     "none-failed": "None failed",
     "not-calibrated": "Not calibrated",
     "not-found": "Not found",
@@ -44,6 +47,7 @@ PROBLEM_TYPES = {
     "still-writing": "Still writing",
     "too-few-shots": "Too few shots",
     "too-late": "Too late",
+    "too-many-batches": "Too many batches",
     "too-many-jobs": "Too many jobs",
     "upload-busy": "Upload busy",
     "upload-too-large": "Upload too large",

@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 import yaml
 
+from server.metrics import Metrics, QueueFigures
+from server.problem_types import PROBLEM_TYPES
 from server.settings import PREFIX, ServiceSettings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -132,3 +134,28 @@ def test_the_job_of_slurm_says_what_it_needs() -> None:
     done = subprocess.run([DEPLOY / "batch.slurm"], capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode != 0
     assert "name a folder of captures or a list: sbatch" in done.stderr
+
+
+def test_the_alerts_ask_for_metrics_that_there_are() -> None:
+    """By the names alone; promtool, where it is installed, reads the expressions."""
+    text = (DEPLOY / "prometheus-rules.yml").read_text()
+    rules = [rule for group in yaml.safe_load(text)["groups"] for rule in group["rules"]]
+    figures = {"cpu": QueueFigures(3, 10.0, 1)}
+    shown = (
+        Metrics()
+        .exposition({"queued": 3}, captures=1, free=1, damaged=0, queues=figures, failures={"no-subject": 2})
+        .decode()
+    )
+    known = set(re.findall(r"^# TYPE (\w+)", shown, re.M))
+    assert {name for rule in rules for name in re.findall(r"eigenhead_\w+", rule["expr"])} <= known
+    kinds = "|".join(found for rule in rules for found in re.findall(r'kind=~"([^"]+)"', rule["expr"]))
+    assert set(kinds.split("|")) <= set(PROBLEM_TYPES)
+    assert all({"summary", "remedy"} == rule["annotations"].keys() for rule in rules)
+
+
+def test_promtool_accepts_the_alerts() -> None:
+    if (promtool := shutil.which("promtool")) is None:
+        pytest.skip("promtool is not installed (apt-get install prometheus)")
+    command = [promtool, "check", "rules", str(DEPLOY / "prometheus-rules.yml")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr

@@ -65,6 +65,17 @@ PATCH_REACH_MM = 4.0  # about a patch no dense point is asked: a window reaches 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """Holds what points say of the head, and the n of skin among them: their triangles' corners, their places there and
+    their deviations."""
+
+    observed: Observed
+    corner: Int[np.ndarray, "n 3"]
+    blend: Float[np.ndarray, "n 3"]
+    deviation_mm: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class DeformedSurface:
     """Holds the displaced head (world frame, mm), the deviation of each vertex, and how far its eyes are closed."""
 
@@ -171,25 +182,28 @@ def deform_to_points(
     directions = free_directions(nodes.coarse, nodes.coarse.shape @ amplitude)
     for i, each in enumerate(COARSE):
         report("fine", i / (len(COARSE) + 1))
-        observed, _ = observe(
+        shown = observe(
             vertices, now, faces, few, loose, each=each, settings=settings, floor_mm=settings.coarse_floor_mm
         )
-        now = vertices + directions.moved(solve_field(field, directions, observed).mean)
+        now = vertices + directions.moved(solve_field(field, directions, shown.observed).mean)
     base = now = unfolded(vertices, now, faces)
     normals = vertex_normals(base, faces)
     field = _laid_out(nodes.fine, base, settings.length_mm)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
     report("fine", len(COARSE) / (len(COARSE) + 1))
-    observed, seen = observe(base, now, faces, many, loose, each=FINE, settings=settings, floor_mm=settings.floor_mm)
-    posterior = solve_field(field, directions, observed)
+    shown = observe(base, now, faces, many, loose, each=FINE, settings=settings, floor_mm=settings.floor_mm)
+    posterior = solve_field(field, directions, shown.observed)
     now = base + directions.moved(posterior.mean)
     for robust_mm in LOOKS_MM:
         if look is None:
             break
-        both = with_patches(observed, look(now), base, now, faces, robust_mm)
+        both = with_patches(shown.observed, look(now), base, now, faces, robust_mm)
         posterior = solve_field(field, directions, both)
         now = base + directions.moved(posterior.mean)
-    deviation = field_deviation(posterior, base, normals, amplitude, seen, settings)
+    seen = np.zeros(len(vertices), bool)
+    seen[shown.corner] = True
+    common_mm = np.hypot(settings.common_mm, settings.shared_error * typical_deviation(shown, faces, len(vertices)))
+    deviation = field_deviation(posterior, base, normals, amplitude, seen, settings, common_mm=common_mm)
     return DeformedSurface(unfolded(base, now, faces), deviation, seen)
 
 
@@ -207,9 +221,9 @@ def observe(
     each: Round,
     settings: FineSettings,
     floor_mm: float,
-) -> tuple[Observed, Bool[np.ndarray, " v"]]:
-    """Returns what the points say of the head at ``now``: their offsets (mm) from ``base``, and which vertices belong
-    to a triangle that a point of skin shows. Points of hair count only where the head stands out of them.
+) -> Shown:
+    """Returns what the points say of the head at ``now``: their offsets (mm) from ``base``. Points of hair count only
+    where the head stands out of them.
 
     A normal is half the point's, half the head's (Rusinkiewicz 2019, *A symmetric objective function for ICP*): exact
     to second order where both are curved.
@@ -236,11 +250,14 @@ def observe(
     robust = np.where(skin, 1.0 / (1.0 + (off / each.robust_mm) ** 2) ** 2, 1.0)
     shared = _local_density(found, corner, now, faces, settings.correlation_mm)
     offset = ((point - interpolated(base[corner], found.blend)) * between).sum(axis=1)
-    kept = np.flatnonzero(speaks)
-    seen = np.zeros(len(now), bool)
-    seen[corner[speaks & skin]] = True
+    kept, of_skin = np.flatnonzero(speaks), np.flatnonzero(speaks & skin)
     information = robust / (variance * shared)
-    return Observed(corner[kept], found.blend[kept], between[kept], offset[kept], information[kept]), seen
+    return Shown(
+        Observed(corner[kept], found.blend[kept], between[kept], offset[kept], information[kept]),
+        corner[of_skin],
+        found.blend[of_skin],
+        surface.deviation_mm[found.row[of_skin]],
+    )
 
 
 def with_patches(
@@ -271,6 +288,22 @@ def with_patches(
     )
 
 
+def typical_deviation(shown: Shown, faces: Int[np.ndarray, "f 3"], count: int) -> Float[np.ndarray, " v"]:
+    """Returns the mean deviation (mm) of the points of skin about each of ``count`` vertices; 0 without any."""
+    if not len(shown.corner):
+        return np.zeros(count)
+    known = np.bincount(shown.corner.ravel(), shown.blend.ravel(), count)
+    total = np.bincount(shown.corner.ravel(), (shown.blend * shown.deviation_mm[:, None]).ravel(), count)
+    return _pooled(total, faces) / np.maximum(_pooled(known, faces), 1e-9)
+
+
+def _pooled(values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " v"]:
+    """Returns the sum of the values over the triangles about each vertex, twice."""
+    for _ in range(2):
+        values = np.bincount(faces.ravel(), np.repeat(values[faces].sum(axis=1), 3), len(values))
+    return values
+
+
 def _local_density(
     found: Associated,
     corner: Int[np.ndarray, "n 3"],
@@ -283,13 +316,8 @@ def _local_density(
     area = np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]],
                                    vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1) / 6.0  # fmt: skip
     mass = np.bincount(faces.ravel(), np.repeat(area, 3), len(vertices))
-    count = np.bincount(corner.ravel(), found.blend.ravel(), len(vertices))
-    for _ in range(2):  # over the triangles about, twice
-        mass, count = (
-            np.bincount(faces.ravel(), np.repeat(values[faces].sum(axis=1), 3), len(vertices))
-            for values in (mass, count)
-        )
-    density = (count / np.maximum(mass, 1e-9))[corner].mean(axis=1)
+    count = np.bincount(corner.ravel(), found.blend.ravel(), len(vertices)).astype(float)  # of nothing it is integers
+    density = (_pooled(count, faces) / np.maximum(_pooled(mass, faces), 1e-9))[corner].mean(axis=1)
     return np.maximum(1.0, density * np.pi * correlation_mm**2)
 
 
@@ -300,11 +328,14 @@ def field_deviation(
     deviation_mm: Float[np.ndarray, " v"],
     observed: Bool[np.ndarray, " v"],
     settings: FineSettings,
+    *,
+    common_mm: Float[np.ndarray, " v"],
 ) -> Float[np.ndarray, " v"]:
     """Returns the standard deviation (mm) of every vertex along its normal. Near observed vertices it comes from draws
-    of the posterior and from the error that all points share; far from them it is at least ``deviation_mm``."""
+    of the posterior and from the error ``common_mm`` that points share; far from them it is at least
+    ``deviation_mm``."""
     draws = posterior.draws(np.random.default_rng(SEED), settings.draws)
-    square = np.full(len(normals), settings.common_mm**2)
+    square = common_mm**2
     for k in range(settings.draws):
         square += (posterior.directions.moved(draws[:, k]) * normals).sum(axis=1) ** 2 / settings.draws
     if not observed.any():

@@ -1,6 +1,6 @@
 """What the dense stage knows of the surface, as oriented points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -19,6 +19,11 @@ class SurfacePoints:
     def chosen(self, rows: Bool[np.ndarray, " n"] | Int[np.ndarray, " m"]) -> "SurfacePoints":
         """Returns the points of the chosen rows."""
         return SurfacePoints(self.points[rows], self.normals[rows], self.deviation_mm[rows], self.part[rows])
+
+
+def with_scaled_deviation(surface: SurfacePoints, factor: float | Float[np.ndarray, " n"]) -> SurfacePoints:
+    """Returns the points with ``factor`` times their deviation."""
+    return replace(surface, deviation_mm=factor * surface.deviation_mm)
 
 
 def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:

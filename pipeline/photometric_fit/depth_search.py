@@ -7,6 +7,7 @@ The variance of a place is that of a shift between two signals of correlation rh
 so that texture, noise, defocus and grazing views all show in it. Gain and offset of a camera drop out.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,6 +20,7 @@ from pipeline.contour_fit.rim import Views
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import rasterise
+from pipeline.multiview.parallax import depth_factor, parallax
 from pipeline.photometric_fit.camera_term import camera_sensitivity, gram_matrices
 from pipeline.photometric_fit.correlation import choose_views, correlate, sweep
 from pipeline.photometric_fit.correlation_kernels import Pictures, Samples
@@ -47,6 +49,7 @@ class Round:
     blur_mm: float  # of the images, on the head
     reach_mm: float  # to both sides along the normal
     steps: int
+    with_shading: bool = True  # the photographs as they are; else their fine texture alone
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,11 +70,14 @@ def sample_visibility(
     problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"], settings: PhotoSettings
 ) -> SampleVisibility:
     """Finds which samples each camera sees on the head of a state, by drawing the head's depth in every view."""
-    model, pose = problem.model, state.world_from_head
-    cage = model.cage(state.coefficients)
-    head = Mesh(pose.apply(model.levels["full"].operator @ cage), model.levels["full"].faces)
-    coarse = Mesh(pose.apply(model.levels[DEPTH_LEVEL].operator @ cage), model.levels[DEPTH_LEVEL].faces)
+    head, coarse = head_of(problem, state), head_of(problem, state, DEPTH_LEVEL)
     return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks, settings=settings)
+
+
+def head_of(problem: ContourProblem, state: State, level: str = "full") -> Mesh:
+    """Returns the head of a state, world frame, mm."""
+    laid = problem.model.levels[level]
+    return Mesh(state.world_from_head.apply(laid.operator @ problem.model.cage(state.coefficients)), laid.faces)
 
 
 def visibility_of(
@@ -245,9 +251,36 @@ def find_places(
     view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
     peaks = find_peaks(correlate(patches, weights, view, value, seen, grey=grey, noise=noise), steps)
     blur_mm = np.maximum(each.blur_mm, MIN_BLUR_PX / scale).mean()
-    variance = settings.floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
-    clear = peaks.inside & (peaks.height > settings.least_correlation)
+    floor_mm = settings.floor_mm * patch_depth_factor(patches, visibility, view, value)
+    variance = floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
+    least = settings.least_correlation if each.with_shading else settings.least_texture_correlation
+    clear = peaks.inside & (peaks.height > least)
     return Places(peaks.place, peaks.height, variance, view[:, 1] >= 0, clear, view, value, weights, samples, pictures)
+
+
+def patch_depth_factor(
+    patches: Patches, visibility: SampleVisibility, view: Int[np.ndarray, "c n"], value: Float[np.ndarray, "c n"]
+) -> Float[np.ndarray, " c"]:
+    """Returns how many times farther a shift in the images moves each patch than before the usual rig."""
+    centres, at = np.array([camera.centre_world for camera in visibility.cameras]), patches.centre
+    return depth_factor(parallax(visibility.vertices[at], visibility.normals[at], centres, view, value))
+
+
+def head_depth_factor(
+    head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera], views_most: int
+) -> float:
+    """Returns the median of ``depth_factor`` over vertices of a head (mm), each seen by its ``views_most`` most frontal
+    cameras, whatever hides it; 1 if no two face any."""
+    points, normals = head_world.vertices[face], head_world.normals()[face]
+    centres = np.array([camera.centre_world for camera in cameras])
+    towards = centres[None] - points[:, None]
+    cosine = np.einsum("ckx,cx->ck", towards, normals) / np.linalg.norm(towards, axis=2)
+    value = np.where(cosine >= MIN_FACING, cosine, 0.0) ** 2
+    view = np.argsort(-value, axis=1, kind="stable")[:, :views_most]
+    value = np.take_along_axis(value, view, axis=1)
+    several = (value > 0.0).sum(axis=1) > 1
+    found = depth_factor(parallax(points[several], normals[several], centres, view[several], value[several]))
+    return float(np.median(found)) if several.any() else 1.0
 
 
 def metric_rig(

@@ -1,7 +1,13 @@
-"""The photographs as photo-consistency reads them: grey, with their noise, blurred to the size that is asked for."""
+"""The photographs as photo-consistency reads them: grey, with their noise, without shading where that is asked for,
+and blurred to the size that is.
+
+Shading is slow, and its glossy part moves with the camera: matched, it lies behind the surface where that is convex and
+before it where that is concave, 3 to 5 mm on oily skin before cameras 12 degrees apart. Pores, moles and lashes are
+fine, and stay where they are.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,6 +19,8 @@ from pipeline.imaging.grey import LUMINANCE, noise_level
 
 MIN_BLUR_PX = 0.7  # below that a bilinear sample is mostly interpolation error
 INSIDE_PX, TEXTURE_BLUR_PX, TEXTURE_NOISES = 4.0, 2.0, 5.0
+SHADING_MM = 1.5  # standard deviation of the mean that is taken off; three-brows: 0.69 mm with 1.5, 0.81 with 2
+MIN_COVERAGE = 1e-3  # share of a window inside the silhouette
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +46,32 @@ def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Vi
 
     grey, noise, speaks = zip(*map_in_threads(load, len(views.names)), strict=True)
     return Photographs(grey, np.array(noise), np.array(speaks))
+
+
+def fine_texture(photographs: Photographs, views: Views, px_per_mm: Float[np.ndarray, " k"]) -> Photographs:
+    """Returns the photographs without shading. ``px_per_mm``: pixels that a mm on the head covers in each view."""
+
+    def fine(k: int) -> Float32[np.ndarray, "h w"]:
+        return without_shading(photographs.grey[k], distance_of(views, k) < 0.0, SHADING_MM * float(px_per_mm[k]))
+
+    return replace(photographs, grey=tuple(map_in_threads(fine, len(photographs.grey))))
+
+
+def without_shading(
+    grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], sigma_px: float
+) -> Float32[np.ndarray, "h w"]:
+    """Returns the difference of an image from its mean over a Gaussian window, background left out; 0 beyond the
+    silhouette's box."""
+    out = np.zeros_like(grey)
+    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    if not len(rows):
+        return out
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    weight = inside[box].astype(np.float32)
+    mean = cv2.GaussianBlur(grey[box] * weight, (0, 0), sigma_px)
+    mean /= np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma_px), MIN_COVERAGE)
+    out[box] = np.where(inside[box], grey[box] - mean, np.float32(0.0))
+    return out
 
 
 def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:

@@ -9,6 +9,7 @@ observations enter the normal equations beside rims, features and priors (``surf
 silent the kernels carry on smoothly.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -24,16 +25,24 @@ from pipeline.contour_fit.problem import PhotoEvidence, Stage, StageEvidence, St
 from pipeline.contour_fit.surface_term import surface_residual
 from pipeline.head_model.gaussian_process import with_fine_kernel
 from pipeline.head_model.model import HeadModel
-from pipeline.photometric_fit.depth_search import Round, observe, sample_visibility
+from pipeline.photometric_fit.depth_search import (
+    Round,
+    head_depth_factor,
+    head_of,
+    moved_cameras,
+    observe,
+    pixels_per_mm,
+    sample_visibility,
+)
 from pipeline.photometric_fit.hair_mask import HairProbability, under_hair
-from pipeline.photometric_fit.images import load_photographs
+from pipeline.photometric_fit.images import fine_texture, load_photographs
 from pipeline.photometric_fit.patches import Patches, arrays_of, make_patches
 from pipeline.settings import PhotoSettings
 from pipeline.warnings import Detail
 from rig.mesh import vertex_normals
 from rig.messages.message import compose
 
-ROUNDS = (Round(3.0, 0.8, 4.0, 17), Round(2.5, 0.55, 2.0, 13), Round(2.0, 0.45, 1.0, 9))
+ROUNDS = (Round(3.0, 0.8, 4.0, 17, False), Round(2.5, 0.55, 2.0, 13, False), Round(2.0, 0.45, 1.0, 9))
 RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its widest window
 LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is the full level's anyway
 MIN_VIEWS = 3
@@ -64,7 +73,9 @@ def refine_with_photographs(
         The refined solution, or ``solved`` if the photographs show too little; and the level of detail with the reason.
     """
     problem = solved.problem
+    scale = pixels_per_mm(moved_cameras(problem, solved.state), solved.state.world_from_head.translation)
     photographs = load_photographs(images, problem.views)
+    texture = fine_texture(photographs, problem.views, scale)
     speaking = int(np.count_nonzero(photographs.speaks))
     if speaking < MIN_VIEWS:
         why = compose("level-views-without-texture", speaking=speaking, all=len(problem.views.names), needed=MIN_VIEWS)
@@ -76,12 +87,15 @@ def refine_with_photographs(
     evidence = solved.evidence
     centres = model.vertices(np.zeros(0))[patches.centre]
     lost, surface = np.zeros(0, int), None
-    for each in ROUNDS:
+    start = head_of(problem, state)
+    cameras = [camera for camera, speaks in zip(problem.rig, photographs.speaks, strict=True) if speaks]
+    for each in rounds_of_rig(head_depth_factor(start, patches.centre, cameras, settings.views_most)):
         visibility = sample_visibility(problem, state, patches, photographs.speaks, settings)
         seen = visibility.facing > 0
         hidden = under_hair(patches, hair or {}, problem.views.names, visibility.pixel, seen, centres)
+        read = photographs if each.with_shading else texture
         surface, lost = observe(
-            problem, state, photographs, patches, visibility, hidden, basis=basis, each=each, settings=settings
+            problem, state, read, patches, visibility, hidden, basis=basis, each=each, settings=settings
         )
         share = np.count_nonzero(~surface.bound) / max(len(patches.centre), 1)
         if share < settings.least_share:
@@ -95,6 +109,20 @@ def refine_with_photographs(
     misfit = local_misfit_mm(model, surface, state, lost)
     why = compose("level-alike", share=share, photographs=speaking)
     return ContourSolution(problem, evidence, state, stage, evaluations, reason, misfit), Detail("photo", why)
+
+
+def rounds_of_rig(factor: float) -> tuple[Round, ...]:
+    """Returns the rounds before a rig where depth is ``factor`` times less sure than before the usual one: as many
+    steps over a wider reach, and for each time that the factor doubles the last one twice more, once with half of it.
+
+    Outlines of three cameras in front leave the middle of a face 8 mm open, and what is far off settles slowly. There
+    gloss looks like depth to the end, and no round reads it.
+    """
+    more = round(math.log2(factor))
+    wider = [replace(each, reach_mm=factor * each.reach_mm) for each in ROUNDS]
+    wider[-1] = replace(wider[-1], with_shading=not more)
+    half = replace(wider[-1], reach_mm=0.5 * wider[-1].reach_mm)
+    return (*wider, *[wider[-1]] * more, *[half] * more)
 
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model

@@ -10,7 +10,9 @@ from pipeline.detail.depth_bias import without_window_bias
 from pipeline.detail.eyelids import measure_eye_appearance
 from pipeline.detail.patch_points import patch_search
 from pipeline.detail.refine import DeformedSurface, refine_to_surface
+from pipeline.detail.surface_points import with_scaled_deviation
 from pipeline.detail.untangling import untangled_head
+from pipeline.photometric_fit.depth_search import head_depth_factor
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth, is_refined
 from pipeline.stages.faces import Faces
@@ -48,11 +50,13 @@ def refine_head(
     if not is_refined(head, settings):
         return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), head.detail))
     distances = {name: views.silhouettes[name].distance for name, used in fit.used.items() if used}
+    cameras, face = [context.rig[name] for name in distances], np.flatnonzero(model.levels["full"].face_region)
+    factor = head_depth_factor(mesh, face, cameras, settings.photo.views_most)
     hair = labels.hair_probability()
     displaced = refine_to_surface(
         fit,
         model,
-        without_window_bias(depth.points, depth.on_face, depth.window_bias),
+        with_scaled_deviation(without_window_bias(depth.points, depth.on_face, depth.window_bias), factor),
         settings.fine,
         eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
         deviation_mm=deviation_mm,

@@ -135,7 +135,10 @@ class ShaderMatcher:
         stack, others = matching.stack, matching.neighbours[view]
         self._device, (pairs, distances, pattern) = device, matching.uploaded
         self._shared = (pairs, distances, packed_ways(stack, view, others), pattern)
-        self._constants = {"SAMPLES": matching.pattern.shape[1], "VIEWS": max(1, *(len(each) for each in matching.neighbours))}
+        self._constants = {
+            "SAMPLES": matching.pattern.shape[1],
+            "VIEWS": max(1, *(len(each) for each in matching.neighbours)),
+        }
         self._size = int(stack.size[view][0]), int(stack.size[view][1])
         self._uniforms = {
             "start": int(stack.offset[view]),

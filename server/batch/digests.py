@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from rig.formats.picture_names import is_junk
@@ -13,9 +13,14 @@ def capture_sha256(path: Path) -> str:
     Raises OSError."""
     if not path.is_dir():
         return _file_sha256(path)
+    return files_sha256({name: _file_sha256(file) for name, file in _files(path, "", frozenset())})
+
+
+def files_sha256(files: Mapping[str, str]) -> str:
+    """Computes the SHA-256 of a folder from that of each of its files, by name."""
     digest = hashlib.sha256()
-    for name, file in sorted(_files(path, "", frozenset())):
-        digest.update(f"{name}\0{_file_sha256(file)}\n".encode("utf-8", "surrogateescape"))
+    for name, file_digest in sorted(files.items()):
+        digest.update(f"{name}\0{file_digest}\n".encode("utf-8", "surrogateescape"))
     return digest.hexdigest()
 
 

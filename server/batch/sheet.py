@@ -58,15 +58,15 @@ ul { margin: 4px 0 0; padding-left: 1.1em; font-size: 13px; } code { font-size: 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Holds what the sheet shows of one capture. ``messages``: warnings, or why it failed; ``link``: path of its
-    folder, relative to the sheet."""
+    """Holds what the sheet shows of one capture. ``messages``: warnings, or why it failed; ``turntable``: file of its
+    views; ``link``: address of its result, relative to the sheet."""
 
     name: str
     of: str
     state: str
     figures: str
     messages: tuple[MessageDocument, ...]
-    picture: bytes | None
+    turntable: Path | None
     link: str
 
 
@@ -86,18 +86,19 @@ def card_class(card: Card) -> str:
 
 def sheet_html(title: str, cards: Sequence[Card]) -> str:
     """Returns the sheet as HTML. Captures that need attention come first."""
+    return "\n".join(sheet_lines(title, cards))
+
+
+def sheet_lines(title: str, cards: Sequence[Card]) -> Iterator[str]:
+    """Yields the parts of ``sheet_html``, so that the pictures of a thousand heads need not be held at once."""
     order = ("failed", "severe", "warning", "good", "missing")
     ranked = sorted(cards, key=lambda card: (order.index(card_class(card)), card.name))
-    return "\n".join(
-        [
-            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>",
-            f"<h1>{html.escape(title)}</h1><p>{html.escape(summary(cards))}</p><main>",
-            *(_article(card) for card in ranked),
-            "</main></body></html>\n",
-        ]
-    )
+    yield '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+    yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    yield f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>"
+    yield f"<h1>{html.escape(title)}</h1><p>{html.escape(summary(cards))}</p><main>"
+    yield from (_article(card) for card in ranked)
+    yield "</main></body></html>\n"
 
 
 def summary(cards: Iterable[Card]) -> str:
@@ -136,8 +137,9 @@ def _article(card: Card) -> str:
 
 
 def _content(card: Card) -> Iterator[str]:
-    if card.picture is not None:
-        data = base64.b64encode(card.picture).decode()
+    picture = None if card.turntable is None else views_of(card.turntable)
+    if picture is not None:
+        data = base64.b64encode(picture).decode()
         alt = html.escape(f"{card.name}: right, front and left", quote=True)
         width, height = 3 * PANEL_PX[0], PANEL_PX[1]
         yield f'<img width="{width}" height="{height}" alt="{alt}" src="data:image/jpeg;base64,{data}">'

@@ -1,6 +1,7 @@
 """Writes table and contact sheet of all results in a batch's folder, whichever process made them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +9,27 @@ from pipeline.head_model.model_file import expression_names
 from pipeline.head_model.model_names import model_path
 from rig.atomic_write import write_atomically
 from rig.messages.message import MessageDocument, documents_of
+from server.batch.captures import BatchCapture
 from server.batch.folder import BatchFolder, FailureRecord, Origin
 from server.batch.plan import BatchTask
-from server.batch.sheet import Card, figures_of, sheet_html, views_of
+from server.batch.sheet import Card, figures_of, sheet_html
 from server.batch.table import Column, Row, columns_of, row_of
 from server.batch.table_files import write_table
 
 SHEET = "sheet.html"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Holds what became of a capture: its ``report`` and ``origin`` where it is done, its ``failure`` where it failed,
+    neither where it is not made yet. ``result``: folder of the result; ``link``: address of it on the sheet."""
+
+    capture: BatchCapture
+    result: Path
+    link: str
+    report: dict[str, Any] | None = None
+    origin: Origin | None = None
+    failure: FailureRecord | None = None
 
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
@@ -23,26 +38,34 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
     Raises OSError.
     """
     folder.forget_failures_but_of({task.capture.name for task in tasks})
-    columns = columns_of(_expressions(tasks))
-    rows, cards = [], []
-    for task in tasks:
-        row, card = _row_and_card(folder, task, columns)
-        rows.append(row)
-        cards.append(card)
+    columns = columns_of(expressions_of(task.model for task in tasks))
+    outcomes = [_outcome(folder, task) for task in tasks]
+    rows = [table_row(outcome, columns) for outcome in outcomes]
+    cards = [sheet_card(outcome, row) for outcome, row in zip(outcomes, rows, strict=True)]
     files = write_table(folder.out, columns, rows)
     write_atomically(folder.out / SHEET, sheet_html(folder.out.resolve().name, cards).encode("utf-8", "replace"))
     return [*files, folder.out / SHEET]
 
 
-def _row_and_card(folder: BatchFolder, task: BatchTask, columns: Sequence[Column]) -> tuple[Row, Card]:
-    name, capture = task.capture.name, task.capture
+def table_row(outcome: Outcome, columns: Sequence[Column]) -> Row:
+    """Returns the table's row of a capture."""
+    return row_of(outcome.capture, columns, report=outcome.report, origin=outcome.origin, failure=outcome.failure)
+
+
+def sheet_card(outcome: Outcome, row: Row) -> Card:
+    """Returns the sheet's card of a capture from its row of the table."""
+    capture, report = outcome.capture, outcome.report
+    of = " / ".join(text for text in (capture.subject, capture.session) if text)
+    turntable = None if report is None else outcome.result / "turntable.png"
+    messages = tuple(report["warnings"]) if report is not None else _why(outcome.failure)
+    return Card(capture.name, of, str(row["state"]), figures_of(row), messages, turntable, outcome.link)
+
+
+def _outcome(folder: BatchFolder, task: BatchTask) -> Outcome:
+    name = task.capture.name
     origin, report = _result(folder, task)
     failure = None if report is not None else folder.failure(name)
-    row = row_of(capture, columns, report=report, origin=origin, failure=failure)
-    of = " / ".join(text for text in (capture.subject, capture.session) if text)
-    picture = None if report is None else views_of(folder.result(name) / "turntable.png")
-    messages = tuple(report["warnings"]) if report is not None else _why(failure)
-    return row, Card(name, of, str(row["state"]), figures_of(row), messages, picture, f"{name}/")
+    return Outcome(task.capture, folder.result(name), f"{name}/", report, origin, failure)
 
 
 def _result(folder: BatchFolder, task: BatchTask) -> tuple[Origin | None, dict[str, Any] | None]:
@@ -64,9 +87,9 @@ def _why(failure: FailureRecord | None) -> tuple[MessageDocument, ...]:
     return tuple(documents_of(failure.faults or (failure.message,)))
 
 
-def _expressions(tasks: Sequence[BatchTask]) -> list[str]:
-    """Returns the names of the expressions of all models in use, each once."""
-    names = [name for model in dict.fromkeys(task.model for task in tasks) for name in _of_model(model)]
+def expressions_of(models: Iterable[str | None]) -> list[str]:
+    """Returns the names of the expressions of all models, each once. None: the default model. Raises UnknownModel."""
+    names = [name for model in dict.fromkeys(models) for name in _of_model(model)]
     return list(dict.fromkeys(names))
 
 

@@ -2,7 +2,8 @@
 
 import csv
 import io
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from rig.atomic_write import write_atomically
@@ -36,11 +37,16 @@ def has_parquet() -> bool:
 def csv_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
     """Returns the table as CSV (RFC 4180, UTF-8), with all digits of every number. An empty cell
     stands for no value."""
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream)
-    writer.writerow([column.name for column in columns])
-    writer.writerows([_cell(row[column.name]) for column in columns] for row in rows)
-    return stream.getvalue().encode()
+    return b"".join(csv_lines(columns, rows))
+
+
+def csv_lines(columns: Sequence[Column], rows: Iterable[Row]) -> Iterator[bytes]:
+    """Yields the rows of ``csv_bytes`` one by one, the names of the columns first."""
+    cells = ([_cell(row[column.name]) for column in columns] for row in rows)
+    for line in itertools.chain([[column.name for column in columns]], cells):
+        stream = io.StringIO(newline="")
+        csv.writer(stream).writerow(line)
+        yield stream.getvalue().encode()
 
 
 def parquet_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:

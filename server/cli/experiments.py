@@ -68,12 +68,7 @@ def experiments(
     if name == "real":
         _experiment_real(folders or [], model, front, outlines, out, json_out)
         return
-    if folders and name not in ("people", "relief", "scaling"):
-        raise typer.BadParameter("only real, people, relief and scaling take folders", param_hint="FOLDERS")
-    if only and name not in ("people", "growth"):
-        raise typer.BadParameter("only people and growth take it", param_hint="--only")
-    if detail and name != "people":
-        raise typer.BadParameter("only people takes it", param_hint="--detail")
+    _check_options(name, folders, only, detail)
     from pipeline.research.runner import Options, run_experiment
 
     options = Options(simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail, _job_command())
@@ -83,6 +78,15 @@ def experiments(
         )
     lines = found.pop("lines", None)
     answer(found, json_out, lines or [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
+
+
+def _check_options(name: str, folders: list[Path] | None, only: list[str] | None, detail: str | None) -> None:
+    if folders and name not in ("people", "relief", "scaling"):
+        raise typer.BadParameter("only real, people, relief and scaling take folders", param_hint="FOLDERS")
+    if only and name not in ("people", "growth"):
+        raise typer.BadParameter("only people and growth take it", param_hint="--only")
+    if detail and name != "people":
+        raise typer.BadParameter("only people takes it", param_hint="--detail")
 
 
 def check_research() -> None:

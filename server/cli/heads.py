@@ -131,7 +131,8 @@ def reconstruct(
     device: Annotated[
         str | None,
         chosen(
-            "What compares photographs: auto (the default; a GPU where there is one), cpu or gl.", of_setting("device")
+            "What compares photographs: cpu, gl (OpenGL), or auto, the default: a GPU beside few cores.",
+            of_setting("device"),
         ),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,

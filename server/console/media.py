@@ -29,6 +29,7 @@ from server.errors import NotFound
 from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.records import CaptureRecord
+from server.wire.batch_files import TableFormat, send_sheet, send_table
 from server.wire.multipart import receive_calibration_pictures, receive_capture
 from server.wire.send_file import send_archive, send_file
 
@@ -233,6 +234,16 @@ def all_files(who: Reader, request: Request, job_id: str) -> Response:
 @pages.get("/console/jobs/{job_id}/{name}")
 def result_file(who: Reader, request: Request, job_id: str, name: str) -> Response:
     return send_file(request, who[0].jobs.result_file(job_id, name))
+
+
+@pages.get("/console/batches/{batch_id}/heads.{form}")
+def batch_table(who: Reader, batch_id: str, form: TableFormat) -> Response:
+    return send_table(who[0], batch_id, form)
+
+
+@pages.get("/console/batches/{batch_id}/sheet.html")
+def batch_sheet(who: Reader, batch_id: str) -> Response:
+    return send_sheet(who[0], batch_id)
 
 
 @pages.get("/console/calibrations/{calibration_id}/report.html")

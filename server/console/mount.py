@@ -20,7 +20,7 @@ REFUSED = (
 )
 PAGES = frozenset(
     [
-        *("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/service"),
+        *("/", "/subjects", "/captures", "/features", "/jobs", "/batches", "/result", "/calibration", "/service"),
         *("/sign-in", "/favicon.ico"),
     ]
 )
@@ -34,6 +34,7 @@ def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
     """
     from server.console import media  # noqa: F401 - they add their routes to NiceGUI's app
     from server.console.pages import (  # noqa: F401
+        batches,
         calibration,
         captures,
         features,

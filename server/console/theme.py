@@ -16,6 +16,7 @@ PAGES = (
     ("captures", "/captures", "Captures"),
     ("features", "/features", "Features"),
     ("jobs", "/jobs", "Jobs"),
+    ("batches", "/batches", "Batches"),
     ("result", "/result", "Result"),
     ("calibration", "/calibration", "Calibration"),
     ("service", "/service", "Service"),

@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from server.http.json_bodies import JsonBodies
 from server.http.linger import DrainRequestBody
 from server.http.openapi import describe, operation_name
-from server.http.routes import calibrations, captures, jobs, operations, rig, sessions, storage, uploads
+from server.http.routes import batches, calibrations, captures, jobs, operations, rig, sessions, storage, uploads
 from server.metrics import Metrics
 from server.services.health import check_egl
 from server.services.retention import sweep
@@ -25,8 +25,10 @@ from server.storage.store import new_id
 from server.wire import problems
 
 LAG_EVERY_S = 0.02
+BATCHES_AGAIN_S = 5.0
 EXPOSED = ("Location", "ETag", "Upload-Offset", "Upload-Length", "Upload-Expires", "Tus-Resumable", "X-Request-Id")
 
+MODULES = (captures, calibrations, jobs, batches, sessions, uploads, rig, storage, operations)
 MountPages = Callable[[FastAPI, ServiceSettings], None]
 
 log = structlog.get_logger()
@@ -42,6 +44,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
         app.state.service = service = await asyncio.to_thread(open_service, settings, metrics)
         tasks = [asyncio.create_task(_look_around(service))]
         tasks += [asyncio.create_task(_sweep_forever(service)), asyncio.create_task(_measure_lag(metrics))]
+        tasks += [asyncio.create_task(_serve_batches(service))]
         try:
             yield
         finally:
@@ -61,7 +64,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
         redoc_url=None,
         generate_unique_id_function=operation_name,
     )
-    routers = [module.router for module in (captures, calibrations, jobs, sessions, uploads, rig, storage, operations)]
+    routers = [module.router for module in MODULES]
     for router in routers:
         app.include_router(router)
     routes = [route for router in routers for route in router.routes if isinstance(route, APIRoute)]
@@ -126,6 +129,18 @@ async def _sweep_forever(service: Service) -> None:
         except Exception as error:  # a full or missing disk, a database that is away
             log.error("sweep failed", error=str(error)[:300])
         await asyncio.sleep(service.settings.sweep_s)
+
+
+async def _serve_batches(service: Service) -> None:
+    """Every ``poll_s``; a failing call is logged and tried again later."""
+    while True:
+        pause_s = service.settings.poll_s
+        try:
+            await service.threads.disk(service.batches.serve)
+        except Exception as error:  # a database that is away
+            log.error("batches not served", error=str(error)[:300])
+            pause_s = max(pause_s, BATCHES_AGAIN_S)
+        await asyncio.sleep(pause_s)
 
 
 async def _measure_lag(metrics: Metrics) -> None:

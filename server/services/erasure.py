@@ -55,6 +55,7 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
         jobs.delete(job)
         if store.folder("jobs", job).exists():
             raise Unavailable("still-writing", compose("still-writing"))
+    jobs.batches.forget_captures(captures)
     for capture in captures:
         store.remove_capture(capture)
 

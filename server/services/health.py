@@ -1,6 +1,7 @@
 """Whether the service, or this machine, can do its work, and what to do where it cannot."""
 
 import os
+import time
 from dataclasses import dataclass
 from importlib.metadata import version
 
@@ -10,8 +11,11 @@ from sqlalchemy.exc import SQLAlchemyError
 from pipeline.settings import Settings, document_from_settings
 from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.messages.message import compose, verbatim
+from server.metrics import QueueFigures
 from server.services.service import Check, Service
-from server.storage.database import alive_workers
+from server.storage.database import alive_workers, slots_by_queue
+from server.storage.failure_counts import failure_counts
+from server.storage.job_index import Queued
 from server.storage.records import JsonObject
 from server.tasks.child import WorkFailed
 from server.tasks.egl import try_egl
@@ -23,6 +27,7 @@ def readiness(service: Service) -> dict[str, Check]:
         "database": _database(service),
         "disk": _disk(service),
         "worker": _workers(service),
+        "queues": _queues(service),
         "egl": _egl(service),
         "rig": _rig(service),
         "records": _records(service),
@@ -59,6 +64,19 @@ def _workers(service: Service) -> Check:
     return Check(ok=False, detail=compose("no-worker-alive"))
 
 
+def _queues(service: Service) -> Check:
+    """Queues whose jobs wait for a worker that nobody has started. The service can take other work, so that this is no
+    reason to send it none."""
+    try:
+        queued = service.jobs.index.queued()
+        idle = {queue: found.jobs for queue, found in queued.items() if service.jobs.queue_notice(queue)}
+    except SQLAlchemyError:
+        return Check(ok=True, detail=compose("queues-unknown"))
+    if not idle:
+        return Check(ok=True, detail=compose("queues-served"))
+    return Check(ok=True, detail=compose("queues-unserved", queues=sorted(idle), count=sum(idle.values())))
+
+
 def check_egl(service: Service) -> None:
     """Tries to make an OpenGL context, once a process, since that takes a second or more; blocks meanwhile."""
     try:
@@ -87,9 +105,22 @@ def _records(service: Service) -> Check:
 
 def exposition(service: Service) -> bytes:
     """Returns the current metrics in the text format of Prometheus."""
-    jobs = service.jobs.counts()
     captures, damaged = len(service.store.ids("captures")), len(service.store.list_quarantined())
-    return service.metrics.exposition(jobs, captures=captures, free=service.store.free_bytes(), damaged=damaged)
+    queued, slots = service.jobs.index.queued(), slots_by_queue(service.engine, service.settings.silent_s)
+    queues = {
+        name: QueueFigures(found.jobs, max(0.0, time.time() - found.since), slots.get(name, 0))
+        for name in {*queued, *slots}
+        for found in (queued.get(name) or Queued(0, time.time()),)
+    }
+    died = service.jobs.index.counts().get("MAX_RECOVERY_ATTEMPTS_EXCEEDED", 0)
+    return service.metrics.exposition(
+        service.jobs.counts(),
+        captures=captures,
+        free=service.store.free_bytes(),
+        damaged=damaged,
+        queues=queues,
+        failures=failure_counts(service.engine) | {"worker-died": died},
+    )
 
 
 @dataclass(frozen=True, slots=True)

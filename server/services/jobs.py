@@ -4,12 +4,10 @@ The job engine's workflow row is the one truth about a job: its id is the workfl
 input, its state the workflow's status. Progress comes from the event log, files from the store.
 """
 
-import hashlib
 import json
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import cast
 
@@ -24,15 +22,16 @@ from server.log import log_file
 from server.origins import target
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
-from server.services.records import Found, Job
+from server.services.records import Found, Job, moment_of
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
+from server.storage.batches import BatchIndex, BatchRow
 from server.storage.database import alive_workers, workers
 from server.storage.events import EventLog, JobEvent
 from server.storage.job_index import JobIndex, JobQuery
 from server.storage.library import Library
 from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
-from server.storage.store import Store, StoredFile, is_id, new_id
+from server.storage.store import Store, StoredFile, is_id, new_id, repeatable_id
 
 APPLICATION = "eigenhead"
 APPLICATION_VERSION = "eigenhead-jobs-1"  # pinned: a job outlives an upgrade; changes only with the steps themselves
@@ -64,7 +63,7 @@ class Jobs:
 
     def __init__(self, settings: ServiceSettings, store: Store, engine: sa.Engine, library: Library) -> None:
         self._settings, self._store, self._engine, self._library = settings, store, engine, library
-        self.events, self.index = EventLog(engine), JobIndex(engine, WORKFLOW)
+        self.events, self.index, self.batches = EventLog(engine), JobIndex(engine, WORKFLOW), BatchIndex(engine)
         self.client = DBOSClient(
             system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
         )
@@ -93,8 +92,7 @@ class Jobs:
         wanted.check()
         capture = self._store.capture(capture_id)
         refuse_board(capture)
-        if queue is not None and queue not in self._settings.queues:
-            raise InputError("queue", [compose("queue-unknown", queue=f"{queue!r:.40}", queues=self._settings.queues)])
+        self.check_queue(queue)
         self._store.reserve(0, self._settings.free_bytes)
         request: JobRequest = {
             "capture_id": capture_id,
@@ -107,6 +105,11 @@ class Jobs:
             target(wanted.webhook["url"], self._settings.webhook_origins)
             request["webhook"] = wanted.webhook
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
+
+    def check_queue(self, queue: str | None) -> None:
+        """Raises InputError for a queue that jobs may not name; None stands for the service's own."""
+        if queue is not None and queue not in self._settings.queues:
+            raise InputError("queue", [compose("queue-unknown", queue=f"{queue!r:.40}", queues=self._settings.queues)])
 
     def submit_session(self, session: str, wanted: ReconstructionRequest, *, key: str, priority: int) -> list[Job]:
         """Queues a reconstruction of every capture of a session. Raises what ``submit`` raises."""
@@ -123,26 +126,31 @@ class Jobs:
         priority: int,
         idempotency_key: str | None = None,
     ) -> Job:
-        job_id = new_id() if idempotency_key is None else _id_of(key, idempotency_key)
+        job_id = new_id() if idempotency_key is None else repeatable_id(key, idempotency_key)
         first = None if idempotency_key is None else self._status(job_id)
         if first is None:
             self._check_count(key)
-            options: EnqueueOptions = {
-                "workflow_name": WORKFLOW,
-                "queue_name": queue or self._settings.queue,
-                "workflow_id": job_id,
-                "app_version": APPLICATION_VERSION,
-                "priority": priority,
-                "attributes": {"capture": request["capture_id"], "session": session, "key": key},
-            }
             self.index.add(job_id, request, session)
-            self.client.enqueue(options, request)
+            attributes = {"capture": request["capture_id"], "session": session, "key": key}
+            self.client.enqueue(_options(job_id, queue or self._settings.queue, priority, attributes), request)
             first = self._status(job_id)
             assert first is not None
         if not self._asks_the_same(_request(first), request):
             detail = compose("idempotency-key-reused")
             raise Conflict("idempotency-conflict", detail)
         return self._jobs([first])[0]
+
+    def enqueue_within(
+        self, connection: sa.Connection, request: JobRequest, session: str | None, batch: BatchRow
+    ) -> str:
+        """Queues a job of a batch in the caller's transaction and returns its id. It does not count among the jobs of
+        the batch's API key."""
+        job_id = new_id()
+        self.index.add_within(connection, job_id, request, session)
+        attributes = {"capture": request["capture_id"], "session": session, "batch": batch.id}
+        options = _options(job_id, batch.queue, batch.priority, attributes)
+        self.client.enqueue_in_transaction(connection, options, request)
+        return job_id
 
     def _asks_the_same(self, first: JobRequest | None, request: JobRequest) -> bool:
         """Whether both ask the same of the same pictures: an upload that is sent again is a capture of its own."""
@@ -303,8 +311,10 @@ class Jobs:
         """What keeps a queued job from beginning, or that the files of one that succeeded are gone."""
         if state == "succeeded" and not self._result(job_id).is_dir():
             return compose("result-missing")
-        if state != "queued":
-            return None
+        return self.queue_notice(queue) if state == "queued" else None
+
+    def queue_notice(self, queue: str | None) -> Message | None:
+        """Returns what keeps the jobs of a queue from beginning: that no worker serves it. Else None."""
         with self._engine.connect() as connection:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
@@ -356,6 +366,17 @@ class Jobs:
         )
 
 
+def _options(job_id: str, queue: str, priority: int, attributes: dict[str, str | None]) -> EnqueueOptions:
+    return {
+        "workflow_name": WORKFLOW,
+        "queue_name": queue,
+        "workflow_id": job_id,
+        "app_version": APPLICATION_VERSION,
+        "priority": priority,
+        "attributes": attributes,
+    }
+
+
 def _by_state(query: JobQuery) -> JobQuery:
     words = query.sought.split()
     states = [word.casefold() for word in words if word.casefold() in STATUSES]
@@ -372,11 +393,5 @@ def _request(row: WorkflowStatus) -> JobRequest | None:
     return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
 
 
-def _id_of(key: str, idempotency_key: str) -> str:
-    return hashlib.sha256(f"{key}\0{idempotency_key}".encode()).hexdigest()[:28]
-
-
 def _moment(milliseconds: int | None) -> str | None:
-    if milliseconds is None:
-        return None
-    return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return None if milliseconds is None else moment_of(milliseconds)

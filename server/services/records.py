@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Generic, TypeVar
 
 from rig.messages.message import Message
@@ -57,6 +58,29 @@ class Job:
     started: str | None
     finished: str | None
     files: dict[str, FileEntry]
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Holds a batch at one moment.
+
+    ``counts``: captures by state, those of ``ITEM_STATES``; ``total``: their sum; ``eta_s``: estimated remaining
+    seconds, None where nothing says them; ``notice``: why its jobs cannot begin.
+    """
+
+    id: str
+    label: str
+    state: str
+    created: str
+    finished: str | None
+    queue: str
+    priority: int
+    model: str | None
+    settings: Mapping[str, object]
+    total: int
+    counts: Mapping[str, int]
+    eta_s: float | None
+    notice: Message | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,3 +194,8 @@ class NewWebhook(Webhook):
     """Holds a webhook that was just added. ``secret`` signs the messages."""
 
     secret: str
+
+
+def moment_of(milliseconds: int) -> str:
+    """Returns a time in ms since 1970 as text."""
+    return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

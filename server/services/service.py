@@ -7,6 +7,7 @@ import sqlalchemy as sa
 
 from rig.messages.message import Message
 from server.metrics import Metrics
+from server.services.batches import Batches
 from server.services.calibrations import Calibrations
 from server.services.captures import Captures
 from server.services.jobs import Jobs, migrate
@@ -44,6 +45,7 @@ class Service:
     store: Store
     engine: sa.Engine
     jobs: Jobs
+    batches: Batches
     keys: Keys
     webhooks: Webhooks
     uploads: ResumableUploads
@@ -106,18 +108,20 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     library.reconcile(store)
     migrate(settings)
     jobs, rig = Jobs(settings, store, engine, library), open_rig(settings)
+    webhooks = Webhooks(engine, settings.webhook_origins)
     children = ChildProcessPool(settings.checks_at_once, niceness=3)
     return Service(
         settings=settings,
         store=store,
         engine=engine,
         jobs=jobs,
+        batches=Batches(settings, engine, store, jobs, library, webhooks),
         captures=Captures(store, jobs, rig, children, settings, library),
         sessions=Sessions(store, jobs, library),
         calibrations=Calibrations(store, jobs.client, settings.queue, jobs.events),
         storage=StorageCount(store, jobs, settings),
         keys=Keys(engine),
-        webhooks=Webhooks(engine, settings.webhook_origins),
+        webhooks=webhooks,
         uploads=ResumableUploads(store, settings),
         threads=Threads(checks=settings.checks_at_once),
         children=children,

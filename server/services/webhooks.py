@@ -1,4 +1,4 @@
-"""Telling other programs how a job ended: signed, retried, durable.
+"""Telling other programs how a job or a batch ended: signed, retried, durable.
 
 The message and its signature follow https://www.standardwebhooks.com: ``webhook-id``, ``webhook-timestamp`` and
 ``webhook-signature: v1,<base64 HMAC-SHA256 of "id.timestamp.body">``. A delivery is a workflow of the job engine, so
@@ -75,13 +75,20 @@ class Webhooks:
             }
             if job_webhook is not None and hook_id == OWN:
                 message["own"] = job_webhook
-            options: EnqueueOptions = {
-                "workflow_name": DELIVERY,
-                "queue_name": WEBHOOKS_QUEUE,
-                "workflow_id": identity,
-                "app_version": APPLICATION_VERSION,
+            enqueue(_delivery(identity), message)
+
+    def announce_batch(self, batch_id: str, round_number: int, enqueue: Callable[..., Any]) -> None:
+        """Queues one message for each webhook that a batch has finished. Repeating the call for the same round changes
+        nothing."""
+        for hook in self.all():
+            identity = f"hook-{hook.id}-{batch_id}-{round_number}"
+            message: WebhookMessage = {
+                "webhook": hook.id,
+                "type": "batch.finished",
+                "batch_id": batch_id,
+                "id": identity,
             }
-            enqueue(options, message)
+            enqueue(_delivery(identity), message)
 
     def post(self, message: WebhookMessage) -> int:
         """Tries once to deliver a message. Returns the HTTP status of the answer, 0 without sending where the webhook
@@ -112,9 +119,19 @@ class Webhooks:
             )
 
 
+def _delivery(identity: str) -> EnqueueOptions:
+    return {
+        "workflow_name": DELIVERY,
+        "queue_name": WEBHOOKS_QUEUE,
+        "workflow_id": identity,
+        "app_version": APPLICATION_VERSION,
+    }
+
+
 def _signed(message: WebhookMessage, secret: str | None) -> tuple[bytes, dict[str, str]]:
     """The body and headers of a message; without a secret it is not signed."""
-    body = json.dumps({"type": message["type"], "data": {"job_id": message["job_id"]}}).encode()
+    data = {name: value for name, value in message.items() if name in ("job_id", "batch_id")}
+    body = json.dumps({"type": message["type"], "data": data}).encode()
     signed = {} if secret is None else signed_headers(message["id"], int(time.time()), body, secret)
     return body, signed | {"content-type": "application/json"}
 

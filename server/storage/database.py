@@ -81,6 +81,48 @@ session_index = sa.Table(
     sa.Column("changed", sa.BigInteger, nullable=False),
 )
 
+batches = sa.Table(
+    "eigenhead_batches",
+    metadata,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("created", sa.BigInteger, nullable=False),  # ms since 1970
+    sa.Column("label", sa.Text, nullable=False),
+    sa.Column("words", sa.Text, nullable=False),  # what a search compares
+    sa.Column("key", sa.String(64), nullable=False, index=True),
+    sa.Column("digest", sa.String(64), nullable=False),  # of the request, for a key that repeats it
+    sa.Column("wish", sa.String(16), nullable=False),  # what its owner wants: running, paused, cancelled
+    sa.Column("finished", sa.BigInteger, nullable=True, index=True),  # ms; NULL while something is to be done
+    sa.Column("rounds", sa.Integer, nullable=False),  # how often it finished
+    sa.Column("queue", sa.String(64), nullable=False),
+    sa.Column("priority", sa.Integer, nullable=False),
+    sa.Column("model", sa.Text, nullable=True),
+    sa.Column("settings", sa.Text, nullable=False),  # JSON
+)
+
+batch_items = sa.Table(  # a capture of a batch; its job, once it has one, is the engine's row
+    "eigenhead_batch_items",
+    metadata,
+    sa.Column("batch_id", sa.String(64), primary_key=True),
+    sa.Column("position", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("capture_id", sa.String(64), nullable=True, index=True),  # NULL: erased
+    sa.Column("job_id", sa.String(64), nullable=True, index=True),  # NULL: waits
+    sa.Column("recalled", sa.Boolean, nullable=False, default=False),  # its job is being taken back
+    sa.Index("eigenhead_batch_items_waiting", "batch_id", "job_id"),
+)
+sa.Index(
+    "eigenhead_batch_items_recalled",
+    batch_items.c.batch_id,
+    sqlite_where=batch_items.c.recalled.is_(sa.true()),
+    postgresql_where=batch_items.c.recalled.is_(sa.true()),
+)
+
+failures = sa.Table(  # how many jobs failed, by kind, since the database was made
+    "eigenhead_failures",
+    metadata,
+    sa.Column("kind", sa.String(64), primary_key=True),
+    sa.Column("count", sa.BigInteger, nullable=False),
+)
+
 workers = sa.Table(
     "eigenhead_workers",
     metadata,
@@ -173,6 +215,13 @@ def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElemen
     """Returns the SQL condition that a worker has not stopped and sent a heartbeat within the last
     ``silent_s`` seconds."""
     return sa.and_(workers.c.stopped.is_(None), workers.c.seen > now_sql(connection) - silent_s)
+
+
+def slots_by_queue(engine: sa.Engine, silent_s: float) -> dict[str, int]:
+    """Returns how many jobs the live workers of each queue run at once."""
+    slots = sa.select(workers.c.queue, sa.func.sum(workers.c.concurrency)).group_by(workers.c.queue)
+    with engine.connect() as connection:
+        return {row[0]: row[1] for row in connection.execute(slots.where(alive_workers(connection, silent_s)))}
 
 
 def now_sql(engine: sa.Engine | sa.Connection) -> sa.ColumnElement[float]:

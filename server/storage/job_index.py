@@ -1,7 +1,7 @@
 """What jobs are found by: the service's index rows beside the job engine's own table, whose state is the one truth.
 
-The engine's table is read here alone, by names that its migrations keep; all other dealings with it go through its
-client.
+The engine's table is read here and in ``batches`` alone, by names that its migrations keep; all other dealings with it
+go through its client.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -12,7 +12,7 @@ from typing import Literal
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
-from server.storage.database import capture_index, job_index
+from server.storage.database import batch_items, capture_index, job_index
 from server.storage.library import captures_with
 from server.storage.pages import CursorPage, Order, contains, folded, is_or_ends, page_of, words_of
 from server.storage.records import JobRequest
@@ -32,6 +32,7 @@ class JobQuery:
     statuses: Sequence[str] | None = None
     capture: str | None = None
     session: str | None = None
+    batch: str | None = None
     order: JobOrder = "-created"
 
 
@@ -43,23 +44,30 @@ class JobOfCapture:
     status: str
 
 
+@dataclass(frozen=True, slots=True)
+class Queued:
+    """Holds how many jobs wait in a queue, and since when the oldest does (seconds since 1970)."""
+
+    jobs: int
+    since: float
+
+
 class JobIndex:
     """Finds jobs of one of the engine's workflows. Methods block."""
 
     def __init__(self, engine: sa.Engine, workflow: str) -> None:
         self._engine, self._workflow = engine, workflow
-        schema = None if engine.dialect.name == "sqlite" else "dbos"
-        text, number = sa.Text(), sa.BigInteger()
-        names = {"workflow_uuid": text, "status": text, "name": text, "queue_name": text}
-        names |= {"created_at": number, "completed_at": number, "priority": number}
-        columns = [sa.column(name, kind) for name, kind in names.items()]
-        self._status = sa.table("workflow_status", *columns, schema=schema)
+        self._status = engine_jobs(engine)
 
     def add(self, job_id: str, request: JobRequest, session: str | None) -> None:
         """Adds a job to the index. Does nothing where the index has it already."""
-        row = {"job_id": job_id, "capture_id": request["capture_id"], "session": session}
         with suppress(IntegrityError), self._engine.begin() as connection:
-            connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
+            self.add_within(connection, job_id, request, session)
+
+    def add_within(self, connection: sa.Connection, job_id: str, request: JobRequest, session: str | None) -> None:
+        """Adds a new job to the index, in the caller's transaction."""
+        row = {"job_id": job_id, "capture_id": request["capture_id"], "session": session}
+        connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
 
     def remove(self, job_id: str) -> None:
         with self._engine.begin() as connection:
@@ -100,6 +108,14 @@ class JobIndex:
         query = sa.select(status.status, sa.func.count()).where(status.name == self._workflow).group_by(status.status)
         with self._engine.connect() as connection:
             return {row[0]: row[1] for row in connection.execute(query)}
+
+    def queued(self) -> dict[str, Queued]:
+        """Returns how many jobs wait in each queue, and since when the first of them."""
+        status = self._status.c
+        query = sa.select(status.queue_name, sa.func.count(), sa.func.min(status.created_at))
+        query = query.where(status.name == self._workflow, status.status.in_(ENQUEUED)).group_by(status.queue_name)
+        with self._engine.connect() as connection:
+            return {row[0]: Queued(row[1], row[2] / 1000) for row in connection.execute(query)}
 
     def newest_first(self, statuses: Sequence[str]) -> list[str]:
         """Lists the ids of all jobs that have one of the engine's ``statuses``, newest first."""
@@ -151,11 +167,23 @@ class JobIndex:
             clauses.append(row.capture_id == query.capture)
         if query.session is not None:
             clauses.append(row.session == query.session)
+        if query.batch is not None:
+            theirs = sa.select(batch_items.c.job_id).where(batch_items.c.batch_id == query.batch)
+            clauses.append(row.job_id.in_(theirs.where(batch_items.c.job_id.is_not(None))))
         for word in words_of(query.sought):
             captures = sa.select(capture_index.c.id).where(captures_with(word))
             matches = sa.or_(contains(row.words, word), is_or_ends(row.job_id, word))
             clauses.append(sa.or_(matches, row.capture_id.in_(captures)))
         return clauses
+
+
+def engine_jobs(engine: sa.Engine) -> sa.TableClause:
+    """Returns the engine's table of workflows, with the columns that are read of it."""
+    text, number = sa.Text(), sa.BigInteger()
+    names = {"workflow_uuid": text, "status": text, "name": text, "queue_name": text}
+    names |= {"created_at": number, "started_at_epoch_ms": number, "completed_at": number, "priority": number}
+    columns = [sa.column(name, kind) for name, kind in names.items()]
+    return sa.table("workflow_status", *columns, schema=None if engine.dialect.name == "sqlite" else "dbos")
 
 
 def words_of_job(request: JobRequest) -> str:

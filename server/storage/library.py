@@ -133,6 +133,26 @@ class Library:
         with self._engine.connect() as connection:
             return [*connection.scalars(query)]
 
+    def boards_among(self, captures: Collection[str]) -> dict[str, bool]:
+        """Tells of each of the captures whether it shows the calibration board; ids of no capture are left out."""
+        table, found = capture_index.c, dict[str, bool]()
+        with self._engine.connect() as connection:
+            for some in _portions(captures):
+                rows = connection.execute(sa.select(table.id, table.board).where(table.id.in_(some)))
+                found |= {row.id: row.board for row in rows}
+        return found
+
+    def heads_labelled(self, prefix: str) -> list[str]:
+        """Lists the ids of the captures that show a head and whose label begins with ``prefix``, in whatever case,
+        oldest first."""
+        table, begun = capture_index.c, folded(prefix)
+        query = sa.select(table.id, table.label).where(
+            table.board.is_(False), table.words.startswith(begun, autoescape=True)
+        )
+        with self._engine.connect() as connection:  # the words go on after the label
+            rows = connection.execute(query.order_by(table.id)).all()
+        return [row.id for row in rows if folded(row.label).startswith(begun)]
+
     def sessions_of(self, subject: str) -> list[str]:
         """Lists the ids of the sessions of one subject; ``subject`` as ``subject_of`` returns it."""
         with self._engine.connect() as connection:

@@ -236,12 +236,14 @@ class CalibrationOutcome(TypedDict):
 
 
 class WebhookMessage(TypedDict):
-    """Holds one message to a webhook of the service or of a job, as the job engine stores it."""
+    """Holds one message to a webhook of the service or of a job, about a job or a batch, as the job engine stores
+    it."""
 
     webhook: str
     own: NotRequired[JobWebhook]
     type: str
-    job_id: str
+    job_id: NotRequired[str]
+    batch_id: NotRequired[str]
     id: str
 
 

@@ -14,6 +14,7 @@ A folder appears under its final name in one rename, after everything in it reac
 and is not named above was put there by somebody else: it is never read and never deleted.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -54,6 +55,11 @@ T = TypeVar("T")
 def new_id() -> str:
     """Returns a new id: 28 hex digits, 12 of the time in milliseconds and 16 random ones, so that ids sort by time."""
     return f"{time.time_ns() // 1_000_000:012x}{secrets.token_hex(8)}"
+
+
+def repeatable_id(key: str, idempotency_key: str) -> str:
+    """Returns the id of whatever an API key requests under an Idempotency-Key: the same one each time."""
+    return hashlib.sha256(f"{key}\0{idempotency_key}".encode()).hexdigest()[:28]
 
 
 def is_id(text: str) -> bool:

@@ -44,6 +44,7 @@ from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
+from server.storage.failure_counts import note_failure
 from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, JobWebhook, WebhookMessage
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
@@ -133,6 +134,7 @@ class Worker:
                 except JobFailed as error:
                     log.warning("job failed", kind=error.kind, detail=error.detail.text)
                     worker.publish_outcome(job_id, "failed", request.get("webhook"))
+                    worker.count_failure(error.kind)
                     raise
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
                     shutil.rmtree(worker.store.folder("jobs", job_id), ignore_errors=True)
@@ -262,6 +264,11 @@ class Worker:
         with suppress(SQLAlchemyError):
             self.events.append(job_id, {"state": state, "camera_moved": moved} if moved else {"state": state})
         self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options, job_webhook=job_webhook)
+
+    def count_failure(self, kind: str) -> None:
+        """Counts a failed job for the metrics. A database that is away then lacks one."""
+        with suppress(SQLAlchemyError):
+            note_failure(self.engine, kind)
 
     def _failure(self, error: BaseException) -> BaseException:
         if isinstance(error, Cancelled):

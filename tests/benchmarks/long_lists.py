@@ -1,6 +1,7 @@
-"""How long every list takes with a hundred thousand captures and two hundred thousand jobs; prints one JSON object.
+"""How long every list takes with a hundred thousand captures, two hundred thousand jobs and five hundred batches;
+prints one JSON object.
 
-    python -m tests.benchmarks.long_lists [--captures N] [--jobs N] [--postgres] [--keep FOLDER]
+    python -m tests.benchmarks.long_lists [--captures N] [--jobs N] [--batches N] [--postgres] [--keep FOLDER]
 
 A database and a data folder are filled behind the service's back (records without pictures, the engine's rows copied
 from one real job), then a service is started and its lists are asked for over HTTP, each ``ROUNDS`` times; the figures
@@ -27,7 +28,7 @@ import sqlalchemy as sa
 from server.services.jobs import Jobs, migrate
 from server.services.work import ReconstructionRequest
 from server.settings import ServiceSettings
-from server.storage.database import job_index, open_database
+from server.storage.database import batch_items, batches, job_index, open_database
 from server.storage.job_index import words_of_job
 from server.storage.library import Library
 from server.storage.records import CAPTURE, SESSION, CameraSize, CaptureRecord, SessionRecord
@@ -116,7 +117,32 @@ def fill_jobs(engine: sa.Engine, jobs: Jobs, captures: list[str], count: int) ->
                     connection.execute(sa.insert(table), values)
 
 
-def filled(settings: ServiceSettings, captures: int, jobs: int) -> None:
+def fill_batches(engine: sa.Engine, captures: list[str], jobs: int, count: int) -> None:
+    """Shares the jobs out among batches, oldest first; the last ones, whose jobs wait, have not finished."""
+    each = jobs // max(1, count)
+    for number in range(count):
+        made = range(number * each, (number + 1) * each)
+        ended = jobs - made.stop >= QUEUED + RUNNING
+        created = EPOCH_MS + 1000 * made.start
+        row = {"id": identity(number, 4), "created": created, "label": f"Study {number}", "words": f"study {number}"}
+        row |= {"key": "local", "digest": "", "wish": "running", "finished": created + 1 if ended else None}
+        row |= {"rounds": int(ended), "queue": "cpu", "priority": 500, "model": None, "settings": "{}"}
+        items = [
+            {
+                "batch_id": row["id"],
+                "position": place,
+                "capture_id": captures[job % len(captures)],
+                "job_id": identity(job, 3),
+                "recalled": False,
+            }
+            for place, job in enumerate(made)
+        ]
+        with engine.begin() as connection:
+            connection.execute(sa.insert(batches).values(**row))
+            connection.execute(sa.insert(batch_items), items)
+
+
+def filled(settings: ServiceSettings, captures: int, jobs: int, batch_count: int) -> None:
     store, engine = Store(settings.data), open_database(settings)
     ids = [*fill_records(store, captures)]
     migrate(settings)
@@ -124,15 +150,16 @@ def filled(settings: ServiceSettings, captures: int, jobs: int) -> None:
     library.reconcile(store)
     all_jobs = Jobs(settings, store, engine, library)
     fill_jobs(engine, all_jobs, ids, jobs)
+    fill_batches(engine, ids, jobs, batch_count)
     with engine.begin() as connection:
         connection.execute(sa.text("ANALYZE"))  # as both databases do by themselves in time
     all_jobs.close()
     engine.dispose()
 
 
-def lists(captures: int) -> dict[str, str]:
+def lists(captures: int, batch_count: int) -> dict[str, str]:
     """Addresses by what they list; a page far behind begins before one of the middle."""
-    middle = identity(captures // 2, 2)
+    middle, batch = identity(captures // 2, 2), identity(batch_count // 2, 4)
     return {
         "captures": "/v1/captures?limit=100",
         "captures, far behind": f"/v1/captures?limit=100&before={middle}",
@@ -149,6 +176,12 @@ def lists(captures: int) -> dict[str, str]:
         "jobs by end": "/v1/jobs?limit=100&sort=-finished",
         "jobs, word of a session": "/v1/jobs?limit=100&q=carla",
         "jobs, two words": "/v1/jobs?limit=100&q=fine+anna",
+        "batches": "/v1/batches?limit=100",
+        "batches, running": "/v1/batches?limit=100&state=running",
+        "batches, word": "/v1/batches?limit=100&q=study",
+        "a batch": f"/v1/batches/{batch}",
+        "a batch's jobs": f"/v1/jobs?limit=100&batch={batch}",
+        "a batch's failed jobs": f"/v1/jobs?limit=100&batch={batch}&state=failed",
         "sessions": "/v1/sessions?limit=100",
         "subjects": "/v1/subjects?limit=100",
         "subjects by name": "/v1/subjects?limit=100&sort=label",
@@ -158,10 +191,10 @@ def lists(captures: int) -> dict[str, str]:
     }
 
 
-def measured(url: str, captures: int) -> dict[str, list[float]]:
+def measured(url: str, captures: int, batch_count: int) -> dict[str, list[float]]:
     seconds = {}
     with httpx.Client(base_url=url, timeout=120) as client:
-        for name, address in lists(captures).items():
+        for name, address in lists(captures, batch_count).items():
             took = []
             for _ in range(ROUNDS):
                 began = time.monotonic()
@@ -176,6 +209,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--captures", type=int, default=100_000)
     parser.add_argument("--jobs", type=int, default=200_000)
+    parser.add_argument("--batches", type=int, default=500)
     parser.add_argument("--postgres", action="store_true")
     parser.add_argument("--keep", type=Path)
     chosen = parser.parse_args()
@@ -184,13 +218,13 @@ def main() -> None:
         extra: dict[str, Any] = {"database_url": stack.enter_context(running_postgres())} if chosen.postgres else {}
         settings = ServiceSettings(data=folder / "data", jobs_per_key=10**6, **extra)
         if not (folder / "data").is_dir():
-            filled(settings, chosen.captures, chosen.jobs)
+            filled(settings, chosen.captures, chosen.jobs, chosen.batches)
         began = time.monotonic()
         with running_service(settings.data, worker=False, terminal=None, silent_s="100000", **extra) as service:
             started = round(time.monotonic() - began, 1)
-            figures = measured(service.url, chosen.captures)
+            figures = measured(service.url, chosen.captures, chosen.batches)
     database = "postgresql" if chosen.postgres else "sqlite"
-    counts = {"captures": chosen.captures, "jobs": chosen.jobs}
+    counts = {"captures": chosen.captures, "jobs": chosen.jobs, "batches": chosen.batches}
     figures_of_all = {"database": database, **counts, "start_s": started, "list_s [median, slowest]": figures}
     sys.stdout.write(json.dumps(figures_of_all, indent=1) + "\n")
 

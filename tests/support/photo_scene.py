@@ -60,6 +60,24 @@ def texture(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return 0.5 + 0.08 * waves * (0.4 + 0.6 * normals[:, 2].clip(0, 1))
 
 
+def fine_waves(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Waves of 5 to 9 mm in all directions: a pixel is 0.9 mm."""
+    waves = np.sin(points @ np.array([[1.2, 0.2, 0.2], [-0.2, 0.8, 0.4], [0.6, -0.5, 0.5]]).T)
+    return 0.5 + 0.1 * waves.sum(axis=1)
+
+
+def glossy(eye: np.ndarray) -> Colours:
+    """A faint texture under a highlight as a camera at ``eye`` sees it."""
+    halfway = eye / np.linalg.norm(eye) + np.array([0.3, 0.4, 0.87])
+    halfway /= np.linalg.norm(halfway)
+
+    def colours(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        off = np.degrees(np.arccos(np.clip(normals @ halfway, -1.0, 1.0)))
+        return 0.37 + 0.06 * fine_waves(points, normals) + 0.3 * np.exp(-0.5 * (off / 10.0) ** 2)
+
+    return colours
+
+
 def shading(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """A bare Lambertian surface under two lamps."""
     lamps = np.array([[0.5, 0.6, 0.62], [-0.6, 0.2, 0.77]])
@@ -99,11 +117,12 @@ def photograph(
     *,
     noise: float = 0.015,
     gains: np.ndarray | None = None,
+    rig: Rig | None = None,
     true_rig: Rig | None = None,
     seed: int = 3,
 ) -> Scene:
-    """``true_rig`` takes the pictures where it differs from the rig that is told."""
-    rig, rng = fan(640, 480), np.random.default_rng(seed)
+    """``true_rig`` takes the pictures where it differs from ``rig``, a fan of ten by default."""
+    rig, rng = rig or fan(640, 480), np.random.default_rng(seed)
     faces = model.levels["full"].faces
     fine = Mesh(vertices, faces)
     grey = colours(vertices, fine.normals())

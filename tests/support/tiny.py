@@ -12,6 +12,7 @@ from rig.errors import InputError
 from rig.formats.capture_folder import read_capture
 from rig.progress import Progress
 from server.tasks.child import WorkerContext
+from tests.support.pinned_work import picture_bytes, pinned_report
 
 
 def work(
@@ -72,4 +73,22 @@ def busy(
         for _ in range(9000):
             digest = hashlib.sha256(digest).digest()
     write_atomically(Path(result) / "head.ply", digest)
+    return {}
+
+
+def reporting(
+    context: WorkerContext,
+    report: Progress,
+    *,
+    capture: str,
+    result: str,
+    cache: str,
+    model: str | None,
+    settings: dict[str, Any],
+) -> dict[str, Any]:
+    """Writes what tables and sheets read of a head, its numbers drawn from the capture."""
+    shot, _ = read_capture(Path(capture))
+    digest = hashlib.sha256(f"{sorted(shot.digests.items())}".encode()).digest()
+    write_atomically(Path(result) / "report.json", json.dumps(pinned_report(digest[0], settings)).encode())
+    write_atomically(Path(result) / "turntable.png", picture_bytes(digest))
     return {}

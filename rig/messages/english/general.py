@@ -21,6 +21,7 @@ TEMPLATES = {
     "method-not-allowed": "{path} takes {allowed}, and not {method}; /openapi.json says more.",
     "thing-capture": "capture",
     "thing-job": "job",
+    "thing-batch": "batch",
     "thing-calibration": "calibration",
     "thing-session": "session",
     "thing-upload": "upload",

@@ -17,6 +17,7 @@ export default spoken({
     chosen: asked.get("job") || "",
     only: asked.get("state") || "",
     sort: asked.get("sort") || "",
+    batch: asked.get("batch") || "",
     form: null,
     busy: "",
     show: "",
@@ -33,6 +34,9 @@ export default spoken({
       this.first();
     },
     sort() {
+      this.first();
+    },
+    batch() {
       this.first();
     },
     form: {
@@ -90,10 +94,11 @@ export default spoken({
           <div class="line"><input v-model="sought" id="find" class="grow" type="search" maxlength="200" placeholder="Find: label, session, solver, id" aria-label="Find jobs"><button class="b" id="pick" :aria-pressed="picking" @click="pickMany">Select</button></div>
           <div class="line"><select v-model="only" id="state" class="grow" aria-label="State"><option value="">every state</option><option v-for="(n, s) in state.counts" :key="s" :value="s">{{ say(s) }} ({{ n }})</option></select>
             <select v-model="sort" id="sort" class="grow" aria-label="Order"><option value="">newest first</option><option value="created">oldest first</option><option value="-finished">ended last first</option></select></div>
+          <p v-if="batch" class="line small"><span class="grow">Only jobs of one batch</span><a class="b" :href="'/batches?batch=' + batch">To the batch</a><button class="b quiet" id="all-jobs" @click="batch = ''">All jobs</button></p>
           <div v-if="picking" class="panel pad line wrap small" role="region" aria-label="Selected jobs"><strong>{{ say('{count} selected', { count: picked.length }) }}</strong><button class="b quiet" @click="pickAll">All of this page</button><button class="b quiet" @click="picked = []">None</button>
             <button class="b" id="bulk-cancel" :disabled="!picked.length || !!busy" @click="bulk('cancel')">Cancel</button><button class="b" id="bulk-restart" :disabled="!picked.length || !!busy" @click="bulk('restart')">Restart</button><button class="b" id="bulk-remove" :disabled="!picked.length || !!busy" @click="bulk('remove')">Remove</button></div>
         <div class="panel scroll grow" tabindex="0" role="region" aria-label="List of jobs" data-scroll="jobs" @keydown="walk">
-          <p v-if="(sought || only) && !jobs.length" class="muted small" style="padding: .5rem .75rem">No job matches.</p>
+          <p v-if="(sought || only || batch) && !jobs.length" class="muted small" style="padding: .5rem .75rem">No job matches.</p>
           <div v-for="j in jobs" :key="j.id" class="row-line"><input v-if="picking" type="checkbox" :value="j.id" v-model="picked" :aria-label="say('Select job {id}', { id: j.id.slice(-6) })">
           <button class="row-button" :data-job="j.id" :data-state="j.state" :aria-current="job && j.id === job.id" @click="choose(j.id)">
             <span class="line"><strong class="cut grow">{{ captureOf(j) }}</strong><span class="tag" :class="kind(j)">{{ say(j.state) }}</span></span>
@@ -172,13 +177,14 @@ export default spoken({
       return j.queue_position ? say("{count} before it", { count: j.queue_position }) : say("next");
     },
     fields() {
-      return { job: this.job?.id, find: this.sought, state: this.only, sort: this.sort };
+      return { job: this.job?.id, find: this.sought, state: this.only, sort: this.sort, batch: this.batch };
     },
     question() {
       return {
         find: this.sought,
         state: this.only,
         sort: this.sort,
+        batch: this.batch,
         job: this.chosen,
         after: this.behind.at(-1) || "",
       };

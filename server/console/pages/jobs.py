@@ -30,7 +30,7 @@ from server.storage.job_index import JobOrder, JobQuery
 SHOWN = 50  # jobs of a page, and of those that wait before them
 SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
 ACTIVE = (*STATUSES["running"], *STATUSES["queued"])
-ASKED = ("find", "state", "sort", "after")
+ASKED = ("find", "state", "sort", "batch", "after")
 LOG_LINES = 200
 
 
@@ -143,10 +143,11 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsSta
     order = cast(JobOrder, requested["sort"] if requested["sort"] in get_args(JobOrder) else "-created")
     state = requested["state"] if requested["state"] in STATUSES else None
     statuses = ENDED if state is None else STATUSES[state]
-    before, waiting = ([], 0) if after or state else active_jobs(service, sought)
+    batch = requested["batch"]
+    before, waiting = ([], 0) if after or state else active_jobs(service, sought, batch)
     if state == "queued":
-        before, waiting, statuses = *active_jobs(service, sought, running=False), ()
-    page = service.jobs.page(JobQuery(sought, statuses, order=order), SHOWN, after)
+        before, waiting, statuses = *active_jobs(service, sought, batch, running=False), ()
+    page = service.jobs.page(JobQuery(sought, statuses, batch=batch, order=order), SHOWN, after)
     jobs = [job for job in (*before, *page.items) if job.id not in removals]
     return {
         "jobs": [job_line(listed) for listed in listed_jobs(service, jobs)],
@@ -158,9 +159,10 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsSta
     }
 
 
-def active_jobs(service: Service, sought: str, *, running: bool = True) -> tuple[list[Job], int]:
+def active_jobs(service: Service, sought: str, batch: str | None, *, running: bool = True) -> tuple[list[Job], int]:
     """Returns the jobs that run and those that are taken next, and how many more wait."""
-    found = service.jobs.page(JobQuery(sought, ACTIVE if running else STATUSES["queued"]), SOUGHT_MOST)
+    query = JobQuery(sought, ACTIVE if running else STATUSES["queued"], batch=batch)
+    found = service.jobs.page(query, SOUGHT_MOST)
     jobs = sorted(found.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
     return jobs[:SHOWN], found.total - min(SHOWN, len(jobs))
 
@@ -295,5 +297,7 @@ JobsPage.actions = {
 
 
 @ui.page("/jobs")
-async def jobs_page(job: str = "", find: str = "", state: str = "", sort: str = "") -> RedirectResponse | None:
-    return await show("jobs", JobsPage, job=job, find=find, state=state, sort=sort)
+async def jobs_page(
+    job: str = "", find: str = "", state: str = "", sort: str = "", batch: str = ""
+) -> RedirectResponse | None:
+    return await show("jobs", JobsPage, job=job, find=find, state=state, sort=sort, batch=batch)

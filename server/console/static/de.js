@@ -2,7 +2,7 @@
 // What the service tells has its German by code, in messages_de.js; words within it that are marked `:word` are here.
 //
 // Words: capture, shot = Aufnahme (what hangs together: pictures of one moment); clean plate = Leerbild; board =
-// Kalibriertafel; calibration = Kalibrierung; subject = Person; session = Sitzung; consent = Einwilligung; job = Auftrag;
+// Kalibriertafel; calibration = Kalibrierung; subject = Person; session = Sitzung; consent = Einwilligung; job = Auftrag; batch = Stapel;
 // head = Kopf; bust = Büste; silhouette = Silhouette; outline, contour = Kontur; residual = Restfehler; feature = Merkmal;
 // landmark = Landmarke; verdict = Urteil; overlay = Überlagerung; model = Modell; mesh = Netz; key = Schlüssel; rig = Rig;
 // worker = Worker. What an operator is to do stands in the infinitive: "Lampen einschalten".
@@ -14,6 +14,7 @@ export default {
   "Captures": "Aufnahmen",
   "Features": "Merkmale",
   "Jobs": "Aufträge",
+  "Batches": "Stapel",
   "Result": "Ergebnis",
   "Calibration": "Kalibrierung",
   "Service": "Dienst",
@@ -100,6 +101,15 @@ export default {
   "succeeded": "fertig",
   "failed": "gescheitert",
   "cancelled": "abgebrochen",
+  "paused": "angehalten",
+  "finished": "zu Ende",
+  "waiting (captures)": "warten im Stapel",
+  "queued (captures)": "warten in der Warteschlange",
+  "running (captures)": "laufen",
+  "succeeded (captures)": "fertig",
+  "failed (captures)": "gescheitert",
+  "cancelled (captures)": "abgebrochen",
+  "removed (captures)": "entfernt",
   "good": "gut",
   "usable": "brauchbar",
   "poor": "schlecht",
@@ -496,6 +506,37 @@ export default {
   "step limit": "Schrittgrenze",
   "evaluation limit": "Auswertungsgrenze",
   "removed capture": "entfernte Aufnahme",
+  "Only jobs of one batch": "Nur Aufträge eines Stapels",
+  "All jobs": "Alle Aufträge",
+  "To the batch": "Zum Stapel",
+
+  // Batches
+  "{count} batch | {count} batches": "{count} Stapel | {count} Stapel",
+  "Lets run what runs, and begins nothing more": "Lässt laufen, was läuft, und beginnt nichts mehr",
+  "Pause": "Anhalten",
+  "Resume": "Fortsetzen",
+  "Cancel ...": "Abbrechen ...",
+  "Cancel {count} job for good | Cancel {count} jobs for good": "{count} Auftrag endgültig abbrechen | {count} Aufträge endgültig abbrechen",
+  "Its jobs and heads stay": "Seine Aufträge und Köpfe bleiben",
+  "Retry what failed": "Gescheiterte wiederholen",
+  "New batch": "Neuer Stapel",
+  "Captures whose label begins with": "Aufnahmen, deren Bezeichnung beginnt mit",
+  "Find: name": "Suchen: Name",
+  "Find batches": "Stapel suchen",
+  "List of batches": "Liste der Stapel",
+  "No batch matches.": "Kein Stapel passt.",
+  "{done} of {total}": "{done} von {total}",
+  "The chosen batch": "Der gewählte Stapel",
+  "priority {number}": "Vorrang {number}",
+  "Captures by state": "Aufnahmen nach Status",
+  "Its jobs": "Seine Aufträge",
+  "Table, CSV": "Tabelle, CSV",
+  "Table, Parquet": "Tabelle, Parquet",
+  "Contact sheet": "Bildbogen",
+  "What failed": "Was gescheitert ist",
+  "All {count} that failed": "Alle {count}, die gescheitert sind",
+  "No batches yet": "Noch keine Stapel",
+  "A batch makes heads of many captures, behind the jobs of whoever shoots. Programs begin it with POST /v1/batches.": "Ein Stapel macht Köpfe aus vielen Aufnahmen, hinter den Aufträgen dessen, der gerade aufnimmt. Programme beginnen ihn mit POST /v1/batches.",
 
   // Result
   "Head": "Kopf",

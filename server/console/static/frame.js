@@ -72,7 +72,7 @@ export default spoken({
     this.speak = speak;
     this.otherLanguages = Object.fromEntries(Object.entries(LANGUAGES).filter(([tag]) => tag !== language));
     this.keys = [
-      ["1 - 8", "go to a page"],
+      ["1 - 9", "go to a page"],
       ["Space", "Rig: capture"],
       ["B", "Rig: clean plates"],
       ["K R Enter", "Rig, after a shot: keep, retake, reconstruct"],
@@ -152,7 +152,7 @@ export default spoken({
       if (typing(event)) return;
       if (event.key === "?") this.help = !this.help;
       else if (event.key === "Escape") this.help = false;
-      else if (/^[1-8]$/.test(event.key) && !document.querySelector(`[data-digits~="${event.key}"]`))
+      else if (/^[1-9]$/.test(event.key) && !document.querySelector(`[data-digits~="${event.key}"]`))
         window.location.href = this.links[event.key - 1].path;
     },
   },

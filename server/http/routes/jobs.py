@@ -61,6 +61,7 @@ def list_jobs(
     state: State | None = None,
     capture: Key = None,
     session: Key = None,
+    batch: Key = None,
     sort: JobOrder = "-created",
     limit: Limit = 100,
     cursor: Cursor = None,
@@ -68,7 +69,7 @@ def list_jobs(
 ) -> JobList:
     """A page at a time, newest first unless asked otherwise; ``q`` looks into name, model, method, level, id and the
     capture's words. ``offset`` serves older clients: a cursor neither repeats nor drops a job."""
-    query = JobQuery(q, None if state is None else STATUSES[state], capture, session, sort)
+    query = JobQuery(q, None if state is None else STATUSES[state], capture, session, batch, sort)
     if offset:
         old = service.jobs.find(state=state, capture=capture, session=session, limit=limit, offset=offset)
         total = service.jobs.page(query, 1).total

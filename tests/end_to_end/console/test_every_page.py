@@ -13,7 +13,7 @@ from tests.support.services import RunningService, uploaded_capture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/service")
+PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/batches", "/result", "/calibration", "/service")
 
 
 def test_no_page_has_a_violation_dark_or_light_and_each_says_what_to_do(
@@ -37,6 +37,7 @@ def test_no_page_has_a_violation_dark_or_light_and_each_says_what_to_do(
             capture = uploaded_capture(service, tmp_path)
             httpx.post(service.url + "/v1/jobs", json={"capture_id": capture})
             httpx.post(service.url + "/v1/jobs", json={"capture_id": capture, "settings": {"front": "fail"}})
+            httpx.post(service.url + "/v1/batches", json={"captures": [capture], "settings": {"front": "fail"}})
     v.page.locator("#look").click()
     for path in PATHS:
         page = v.go(path)

@@ -16,7 +16,7 @@ from tests.support.services import RunningService, await_state, packed_capture, 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 STATIC = Path(__file__).parents[3] / "server" / "console" / "static"
-PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/result", "/calibration", "/service")
+PATHS = ("/", "/subjects", "/captures", "/features", "/jobs", "/batches", "/result", "/calibration", "/service")
 
 # A table in which every text is its own translation, in brackets: what stands outside of brackets was never said.
 BRACKETS = """export default new Proxy({}, {
@@ -70,6 +70,7 @@ def fill(service: RunningService, folder: Path) -> None:
     capture = uploaded_capture(service, folder)
     for settings in ({}, {"front": "fail"}):
         httpx.post(service.url + "/v1/jobs", json={"capture_id": capture, "settings": settings})
+        httpx.post(service.url + "/v1/batches", json={"captures": [capture], "settings": settings})
 
 
 def misfits(page: Page, folder: Path, name: str) -> list[str]:

@@ -8,19 +8,13 @@ from pipeline.detail.patch_points import PatchSearch, patch_search
 from pipeline.settings import PhotoSettings
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals
-from tests.support.photo_scene import Scene, ellipsoid_model, photograph
-
-
-def fine_texture(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Waves of 5 to 9 mm in all directions: a pixel is 0.9 mm."""
-    waves = np.sin(points @ np.array([[1.2, 0.2, 0.2], [-0.2, 0.8, 0.4], [0.6, -0.5, 0.5]]).T)
-    return 0.5 + 0.1 * waves.sum(axis=1)
+from tests.support.photo_scene import Scene, ellipsoid_model, fine_waves, photograph
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     model = ellipsoid_model()
-    return photograph(model, model.vertices(np.zeros(0)), fine_texture)
+    return photograph(model, model.vertices(np.zeros(0)), fine_waves)
 
 
 def search(scene: Scene, hair: float = 0.0) -> PatchSearch:

@@ -8,7 +8,7 @@ from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids
 from pipeline.detail.folds import folded
 from pipeline.detail.refine import DeformedSurface, deform_to_points, refine_to_surface
-from pipeline.detail.surface_points import SurfacePoints, thinned
+from pipeline.detail.surface_points import SurfacePoints, thinned, with_scaled_deviation
 from pipeline.detail.untangling import head_topology, spoilt_faces
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.regions import head_regions
@@ -22,12 +22,14 @@ AXES_MM = np.array([82.0, 79.0, 81.0])
 NOISE_MM = 0.2
 
 
-def drawn(surface: SurfacePoints, deviation_mm: float = 1.5) -> tuple[np.ndarray, np.ndarray, DeformedSurface]:
+def drawn(
+    surface: SurfacePoints, deviation_mm: float = 1.5, settings: FineSettings | None = None
+) -> tuple[np.ndarray, np.ndarray, DeformedSurface]:
     """The sphere, its faces, and what the points make of it."""
     vertices, faces, nodes = subdivided_sphere()
     loose = np.zeros(len(vertices), bool)
     found = deform_to_points(
-        vertices, np.full(len(vertices), deviation_mm), faces, nodes, surface, FineSettings(), loose=loose
+        vertices, np.full(len(vertices), deviation_mm), faces, nodes, surface, settings or FineSettings(), loose=loose
     )
     return vertices, faces, found
 
@@ -44,6 +46,16 @@ def test_a_sphere_becomes_the_ellipsoid_that_the_points_show() -> None:
     slid = found.vertices - vertices
     slid -= (slid * vertices).sum(axis=1, keepdims=True) * vertices / 80.0**2
     assert np.linalg.norm(slid, axis=1).max() < 0.6  # the same vertex stays the same place
+
+
+def test_a_share_of_the_points_deviation_stays_however_many_they_are() -> None:
+    surface = ellipsoid_points(np.random.default_rng(0), AXES_MM, NOISE_MM)
+    unsure = with_scaled_deviation(surface, np.where(surface.points[:, 0] > 0.0, 2.0, 6.0))
+    vertices, _, stated = drawn(unsure)
+    alone = drawn(unsure, settings=FineSettings(shared_error=0.0))[2]
+    added = np.sqrt(stated.deviation_mm**2 - alone.deviation_mm**2)
+    for side, factor in ((vertices[:, 0] > 20.0, 2.0), (vertices[:, 0] < -20.0, 6.0)):
+        np.testing.assert_allclose(added[side], 0.25 * factor * NOISE_MM, rtol=0.02)
 
 
 def test_the_result_repeats_to_the_bit() -> None:

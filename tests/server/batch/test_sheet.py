@@ -13,6 +13,7 @@ from pipeline.results.overlays import AZIMUTHS_DEG
 from pipeline.warnings import WARNING_CODES
 from rig.messages.message import MessageDocument
 from server.batch.sheet import PANEL_PX, REMARKS, SEVERE, Card, card_class, figures_of, severity, sheet_html, views_of
+from tests.support.pinned_work import picture_bytes
 from tests.support.services import ROOT
 
 
@@ -20,8 +21,8 @@ def messages(*codes: str) -> tuple[MessageDocument, ...]:
     return tuple(MessageDocument(code=code, message=f"words of {code}") for code in codes)
 
 
-def card(name: str, state: str = "done", *codes: str, picture: bytes | None = b"jpeg") -> Card:
-    return Card(name, "S01", state, "breadth 150.0 mm", messages(*codes), picture, f"{name}/")
+def card(name: str, state: str = "done", *codes: str, turntable: Path | None = None) -> Card:
+    return Card(name, "S01", state, "breadth 150.0 mm", messages(*codes), turntable, f"{name}/")
 
 
 class Found(HTMLParser):
@@ -33,13 +34,15 @@ class Found(HTMLParser):
         self.tags.append((tag, dict(attrs)))
 
 
-def test_the_sheet_needs_nothing_beside_it() -> None:
-    found = Found()
-    found.feed(sheet_html("study", [card("a"), card("b", "failed", "input-refused", picture=None)]))
+def test_the_sheet_needs_nothing_beside_it(tmp_path: Path) -> None:
+    found, turntable = Found(), tmp_path / "turntable.png"
+    turntable.write_bytes(picture_bytes(bytes(range(9))))
+    cards = [card("a", turntable=turntable), card("b", "failed", "input-refused"), card("c", turntable=tmp_path / "no")]
+    found.feed(sheet_html("study", cards))
     (picture,) = [attributes for tag, attributes in found.tags if tag == "img"]
-    assert picture["src"] == "data:image/jpeg;base64," + base64.b64encode(b"jpeg").decode()
+    assert picture["src"] == "data:image/jpeg;base64," + base64.b64encode(views_of(turntable) or b"").decode()
     assert {tag for tag, _ in found.tags} & {"script", "link", "iframe"} == set()
-    assert [attributes["href"] for tag, attributes in found.tags if tag == "a"] == ["a/"]
+    assert [attributes["href"] for tag, attributes in found.tags if tag == "a"] == ["a/", "c/"]
 
 
 def test_names_and_messages_are_text() -> None:

@@ -16,8 +16,10 @@ from calibration.quality import verdict as calibration_verdict
 from pipeline.evidence.measurements import DISTANCES
 from rig.acquisition import shot, verdict
 from server.console.theme import PAGES
+from server.services.batches import ITEM_STATES
 from server.services.jobs import FINISHED
 from server.services.storage_use import KINDS
+from server.storage.batches import BatchState
 from tests.support.console_words import (
     CONSOLE,
     Component,
@@ -32,7 +34,7 @@ PARTS = ("database", "disk", "worker", "rig")
 SENTENCE = re.compile(r"[a-z]{2,}[,.:;]? [a-z({\d]")
 # What looks like words in a script and is not shown: keys of the keyboard, names in the browser's store, styles.
 NOT_SHOWN = re.compile(
-    r"Arrow|Escape|Backspace|Delete|eigenhead |(calibration|captures?|subjects) (name|source|form|draft)"
+    r"Arrow|Escape|Backspace|Delete|eigenhead |(batches|calibration|captures?|subjects) (name|source|form|draft)"
     r"|fit again|pose graph"
     r"|Deutsch|English|.*(px|span|-gradient|input|var)\b.*[(;:)-]|\.[\w-]+ span|\{\}px sans-serif|\{\} min"
 )
@@ -60,6 +62,7 @@ def test_no_markup_mixes_words_and_values() -> None:
 def vocabulary() -> Iterator[str]:
     """Words that reach the pages as values."""
     yield from ("queued", "running", *FINISHED)
+    yield from (*get_args(BatchState), *(f"{state} (captures)" for state in ITEM_STATES))
     yield from (*get_args(verdict.Verdict), *get_args(calibration_verdict.Word), *get_args(shot.Status))
     yield from (title for _, _, title in PAGES)
     yield from (name.replace("_", " ") for name in DISTANCES)

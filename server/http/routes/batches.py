@@ -1,0 +1,168 @@
+"""Batches: many captures begun, watched, paused, tried again; and the table and the sheet of their heads."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Response
+from fastapi.responses import StreamingResponse
+from pydantic import ConfigDict, Field
+
+from server.http.auth import ServiceOf, require
+from server.http.list_schemas import Cursor, Limit, Listed, Sought
+from server.http.message_schemas import MessageOut, TextOf
+from server.http.schemas import EXAMPLE_ID, Answer, Id, Idempotency, JobSettings, Moment, Received, Text
+from server.services.batches import PRIORITY, BatchRequest, Selection
+from server.services.keys import Caller
+from server.services.work import ReconstructionRequest
+from server.storage.batches import BatchState
+from server.wire.batch_files import PARQUET_TYPE, TableFormat, send_sheet, send_table
+from server.wire.problems import Responses, documented
+
+router = APIRouter(prefix="/v1", tags=["batches"])
+Reader = Annotated[Caller, Depends(require("read"))]
+Submitter = Annotated[Caller, Depends(require("submit"))]
+TEXT = {"schema": {"type": "string"}}
+TABLE: Responses = {200: {"content": {"text/csv": TEXT, PARQUET_TYPE: {}}}, **documented(404, 409)}
+SHEET: Responses = {200: {"content": {"text/html": TEXT}}, **documented(404)}
+
+
+class NewBatch(Received):
+    """The captures are named in one of three ways: ``captures``, ``session`` or ``prefix``."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {"label": "Study 4", "prefix": "S4-", "settings": {"detail": "fine"}},
+                {"captures": [EXAMPLE_ID]},
+            ]
+        }
+    )
+
+    captures: list[Id] | None = Field(None, min_length=1, max_length=100_000)
+    session: Id | None = Field(None, description="all its captures of a head")
+    prefix: Annotated[Text, Field(min_length=1)] | None = Field(
+        None, description="all captures of a head whose label begins with it, in whatever case"
+    )
+    label: Text = Field("", description="for people; each of its jobs has it as its name")
+    model: str | None = Field(None, max_length=200)
+    settings: JobSettings | None = Field(None, description="of the pipeline; what is not given has its default")
+    queue: str | None = Field(None, max_length=32)
+    priority: int = Field(PRIORITY, ge=1, le=1000, description="of its jobs; lower goes first, and a job has 100")
+
+
+class BatchCounts(Answer):
+    """Captures by state."""
+
+    waiting: int = Field(description="without a job yet")
+    queued: int
+    running: int
+    succeeded: int
+    failed: int
+    cancelled: int
+    removed: int = Field(description="whose capture, or whose job, is gone")
+
+
+class BatchOut(Answer):
+    id: str
+    label: str
+    state: BatchState = Field(description="finished: nothing is left to do; a cancelled one stays cancelled")
+    created: Moment
+    finished: Moment | None
+    queue: str
+    priority: int
+    model: str | None
+    settings: JobSettings
+    total: int = Field(description="captures")
+    counts: BatchCounts
+    eta_s: float | None = Field(description="by the mean of its jobs so far; null before one succeeded")
+    notice: TextOf | None = Field(None, description="why its jobs cannot begin; what to do")
+    notice_message: MessageOut | None = Field(None, validation_alias="notice")
+
+
+class BatchList(Listed):
+    batches: list[BatchOut]
+
+
+@router.post("/batches", status_code=202, responses=documented(400, 404, 409, 413, 415, 507))
+def submit_batch(
+    service: ServiceOf, caller: Submitter, wanted: NewBatch, response: Response, idempotency_key: Idempotency = None
+) -> BatchOut:
+    """A job for each of many captures, behind the jobs of others. The same Idempotency-Key with the same request
+    returns the first batch."""
+    request = BatchRequest(
+        Selection(wanted.captures, wanted.session, wanted.prefix),
+        ReconstructionRequest(wanted.model, wanted.settings),
+        wanted.label,
+        wanted.queue,
+        wanted.priority,
+    )
+    batch = service.batches.submit(request, key=caller.key, idempotency_key=idempotency_key)
+    response.headers["Location"] = f"/v1/batches/{batch.id}"
+    return BatchOut.model_validate(batch)
+
+
+@router.get("/batches", responses=documented(400))
+def list_batches(
+    service: ServiceOf,
+    caller: Reader,
+    q: Sought = "",
+    *,
+    state: BatchState | None = None,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> BatchList:
+    """A page at a time, newest first; ``q`` looks into the label."""
+    found = service.batches.page(q, state, limit, cursor)
+    return BatchList(
+        batches=[BatchOut.model_validate(batch) for batch in found.items], next=found.next, total=found.total
+    )
+
+
+@router.get("/batches/{batch_id}", responses=documented(404))
+def get_batch(service: ServiceOf, caller: Reader, batch_id: str) -> BatchOut:
+    """A batch: its state, its captures by state, remaining seconds. ``GET /v1/jobs?batch=`` lists its jobs."""
+    return BatchOut.model_validate(service.batches.get(batch_id))
+
+
+@router.post("/batches/{batch_id}/pause", responses=documented(404, 409))
+def pause_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
+    """No further job begins; those that run go on. Queued ones are taken back within a second."""
+    return BatchOut.model_validate(service.batches.pause(batch_id))
+
+
+@router.post("/batches/{batch_id}/resume", responses=documented(404, 409))
+def resume_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
+    """Goes on where it was paused."""
+    return BatchOut.model_validate(service.batches.resume(batch_id))
+
+
+@router.post("/batches/{batch_id}/cancel", responses=documented(404))
+def cancel_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
+    """Cancels what has not ended, for good; results stay. A batch that ended stays as it is."""
+    return BatchOut.model_validate(service.batches.cancel(batch_id))
+
+
+@router.post("/batches/{batch_id}/retry", responses=documented(404, 409))
+def retry_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
+    """A new job for each capture whose job failed; the failed ones stay in the list of jobs."""
+    return BatchOut.model_validate(service.batches.retry(batch_id))
+
+
+@router.delete("/batches/{batch_id}", status_code=204, responses=documented(404, 409))
+def delete_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> None:
+    """Forgets a batch that ended. Its jobs and heads stay."""
+    service.batches.remove(batch_id)
+
+
+@router.get("/batches/{batch_id}/table", responses=TABLE, response_class=StreamingResponse)
+def get_batch_table(
+    service: ServiceOf, caller: Reader, batch_id: str, form: Annotated[TableFormat, Query(alias="format")] = "csv"
+) -> Response:
+    """A row a capture, in the batch's order, with the columns of ``eigenhead batch``: docs/batch.md has each with its
+    unit."""
+    return send_table(service, batch_id, form)
+
+
+@router.get("/batches/{batch_id}/sheet", responses=SHEET, response_class=StreamingResponse)
+def get_batch_sheet(service: ServiceOf, caller: Reader, batch_id: str) -> Response:
+    """The contact sheet: three views of each head, its warnings in colour; one file that needs nothing beside it."""
+    return send_sheet(service, batch_id)

@@ -1,0 +1,76 @@
+"""The table and the contact sheet of a batch of the service, by the same code as those of ``eigenhead batch``.
+
+A module of its own, since what draws and measures heads takes a second to import: no start of the service waits for it.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from pipeline.head_model.model_names import UnknownModel
+from server.batch.captures import BatchCapture
+from server.batch.digests import files_sha256
+from server.batch.folder import REPORT, FailureRecord, Origin
+from server.batch.sheet import sheet_lines
+from server.batch.summary import Outcome, expressions_of, sheet_card, table_row
+from server.batch.table import Column, Row, columns_of
+from server.problem_types import URN
+from server.services.batches import Batches
+from server.services.records import Batch, Job
+from server.storage.records import CaptureRecord, SessionRecord
+from server.storage.store import Store
+
+
+def batch_columns(batch: Batch) -> tuple[Column, ...]:
+    """Returns the columns of a batch's table."""
+    expressions: list[str] = []
+    with suppress(UnknownModel):  # it was removed since
+        expressions = expressions_of([batch.model])
+    return columns_of(expressions)
+
+
+def batch_rows(batches: Batches, store: Store, batch: Batch, columns: Sequence[Column]) -> Iterator[Row]:
+    """Yields the rows of a batch's table, in the order of its captures."""
+    return (table_row(outcome, columns) for outcome in _outcomes(batches, store, batch))
+
+
+def batch_sheet(batches: Batches, store: Store, batch: Batch) -> Iterator[str]:
+    """Returns the lines of a batch's contact sheet."""
+    columns = batch_columns(batch)
+    cards = [sheet_card(outcome, table_row(outcome, columns)) for outcome in _outcomes(batches, store, batch)]
+    return sheet_lines(batch.label or batch.id, cards)
+
+
+def _outcomes(batches: Batches, store: Store, batch: Batch) -> Iterator[Outcome]:
+    subjects: dict[str, str] = {}
+    for identity, job in batches.captures(batch.id):
+        record = None if identity is None else store.found("captures", identity)
+        if isinstance(record, CaptureRecord):
+            capture, inputs = _capture(store, record, subjects), record.inputs
+        else:
+            capture, inputs = BatchCapture(identity or "", Path()), {}
+        yield _outcome(store, capture, job, files_sha256(inputs))
+
+
+def _capture(store: Store, record: CaptureRecord, subjects: dict[str, str]) -> BatchCapture:
+    """``subjects``: names by session, as far as they were looked up."""
+    session = record.session or ""
+    if session and session not in subjects:
+        found = store.found("sessions", session)
+        subjects[session] = found.label if isinstance(found, SessionRecord) else ""
+    return BatchCapture(record.id, Path(), subjects.get(session) or record.label, session)
+
+
+def _outcome(store: Store, capture: BatchCapture, job: Job | None, input_sha256: str) -> Outcome:
+    if job is None:
+        return Outcome(capture, Path(), "")
+    result, link = store.folder("jobs", job.id) / "result", f"/result/{job.id}"
+    if job.error is not None:
+        kind = job.error.type.removeprefix(URN)
+        failure = FailureRecord("", kind, job.error.detail, job.error.errors, None)
+        return Outcome(capture, result, link, failure=failure)
+    with suppress(OSError, ValueError):  # not made yet, or removed since
+        report = json.loads((result / REPORT).read_bytes())
+        return Outcome(capture, result, link, report, Origin(input_sha256, "", "", ""))
+    return Outcome(capture, result, link)

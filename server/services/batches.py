@@ -1,0 +1,317 @@
+"""Batches: many captures, a job each, in one queue with everybody else's jobs and behind them.
+
+A batch says what shall become of its captures; ``serve``, which the service calls again and again, makes it so. It
+keeps at most ``FED_MOST`` jobs of batches in each queue, so that a batch of ten thousand costs the queue no more than a
+small one, takes those of a paused batch back, and cancels those of a cancelled one. Whatever stops it, the next call
+goes on.
+"""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Literal
+
+import sqlalchemy as sa
+import structlog
+
+from rig.digest import document_sha256
+from rig.errors import EigenheadError, InputError
+from rig.messages.message import Message, compose
+from server.errors import Conflict, DiskFull, NotFound, TooMany
+from server.services.jobs import STATES, STATUSES, Jobs
+from server.services.records import Batch, Found, Job, moment_of
+from server.services.texts import check_texts
+from server.services.webhooks import Webhooks
+from server.services.work import ReconstructionRequest
+from server.settings import ServiceSettings
+from server.storage.batches import ENQUEUED, GONE, WAITING, BatchItem, BatchRow, BatchState, Tally
+from server.storage.database import slots_by_queue
+from server.storage.library import Library
+from server.storage.records import CaptureRecord, JobRequest
+from server.storage.store import Store, is_id, new_id, repeatable_id
+
+FED_MOST = 100  # jobs of batches that are queued or run in one queue: more than its workers end between two calls
+FAULTS_MOST = 100  # of one refusal: ten thousand wrong ids need not all come back
+PRIORITY = 500  # of a batch; a job has 100, and the lower number goes first
+ITEM_STATES: tuple[str, ...] = ("waiting", "queued", "running", "succeeded", "failed", "cancelled", "removed")
+UNDONE = ("waiting", "queued", "running")
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Describes the captures of a batch, in one of three ways: by id, by session, or by what their labels begin
+    with."""
+
+    captures: Sequence[str] | None = None
+    session: str | None = None
+    prefix: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BatchRequest:
+    """Holds what a batch is to do, and where. ``queue`` None: the service's own."""
+
+    selection: Selection
+    work: ReconstructionRequest
+    label: str = ""
+    queue: str | None = None
+    priority: int = PRIORITY
+
+    def digest(self) -> str:
+        chosen = self.selection
+        captures = None if chosen.captures is None else list(chosen.captures)
+        wanted = [captures, chosen.session, chosen.prefix, self.work.model, self.work.settings]
+        return document_sha256({"wanted": json.dumps([*wanted, self.label, self.queue, self.priority], sort_keys=True)})
+
+
+class Batches:
+    """Manages the batches of a service. Methods block."""
+
+    def __init__(
+        self,
+        settings: ServiceSettings,
+        engine: sa.Engine,
+        store: Store,
+        jobs: Jobs,
+        library: Library,
+        webhooks: Webhooks,
+    ) -> None:
+        self._settings, self._engine, self._store, self._jobs = settings, engine, store, jobs
+        self._library, self._webhooks, self._index = library, webhooks, jobs.batches
+
+    def submit(self, wanted: BatchRequest, *, key: str = "local", idempotency_key: str | None = None) -> Batch:
+        """Begins a batch and returns it. With a known idempotency key it returns the batch of the first request.
+
+        Raises InputError for work that cannot be done and captures that cannot be used, NotFound for a session,
+        DiskFull, TooMany, and Conflict where the idempotency key was used for another request.
+        """
+        wanted.work.check()
+        check_texts({"label": wanted.label}, "request")
+        self._jobs.check_queue(wanted.queue)
+        identity = new_id() if idempotency_key is None else repeatable_id(key, f"batch {idempotency_key}")
+        digest = wanted.digest()
+        if idempotency_key is None or self._index.get(identity) is None:
+            captures = self._chosen(wanted.selection)
+            self._store.reserve(0, self._settings.free_bytes)
+            if len(self._index.unfinished(key)) >= self._settings.batches_per_key:
+                most = self._settings.batches_per_key
+                raise TooMany("too-many-batches", compose("too-many-batches", count=most), retry_after_s=60)
+            row = BatchRow(
+                id=identity,
+                created=_now_ms(),
+                label=wanted.label,
+                key=key,
+                digest=digest,
+                queue=wanted.queue or self._settings.queue,
+                priority=wanted.priority,
+                model=wanted.work.model,
+                settings=wanted.work.settings or {},
+            )
+            self._index.add(row, captures)
+        first = self._known(identity)
+        if first.digest != digest:
+            raise Conflict("idempotency-conflict", compose("idempotency-key-reused"))
+        return self._batches([first])[0]
+
+    def get(self, identity: str) -> Batch:
+        """Returns a batch with its present state. Raises NotFound."""
+        return self._batches([self._known(identity)])[0]
+
+    def page(
+        self, sought: str = "", state: BatchState | None = None, limit: int = 100, cursor: str | None = None
+    ) -> Found[Batch]:
+        """Returns one page of the batches with all words of ``sought`` in their label, newest first. Raises InputError
+        for a cursor of another list."""
+        page = self._index.page(sought, state, limit, cursor)
+        return Found(tuple(self._batches(self._index.of(page.ids))), page.next, page.total)
+
+    def of(self, ids: Sequence[str]) -> list[Batch]:
+        """Returns the batches with these ids, in their order; ids of no batch are left out."""
+        return self._batches(self._index.of(ids))
+
+    def pause(self, identity: str) -> Batch:
+        """Lets no further job of a batch begin; those that run go on. Raises NotFound, and Conflict for a batch that
+        ended."""
+        return self._change(identity, "paused")
+
+    def resume(self, identity: str) -> Batch:
+        """Goes on with a paused batch. Raises NotFound, and Conflict for a batch that ended."""
+        return self._change(identity, "running")
+
+    def cancel(self, identity: str) -> Batch:
+        """Cancels all jobs of a batch that have not ended. A batch that ended stays as it is. Raises NotFound."""
+        self._known(identity)
+        self._index.change(identity, "cancelled")
+        return self.get(identity)
+
+    def retry(self, identity: str) -> Batch:
+        """Makes new jobs for all captures whose job failed. Raises NotFound, and Conflict where none failed or the
+        batch was cancelled."""
+        if self._known(identity).wish == "cancelled":
+            raise Conflict("batch-ended", compose("batch-cancelled"))
+        if not self._index.retry(identity, STATUSES["failed"]):
+            raise Conflict("none-failed", compose("batch-none-failed"))
+        return self.get(identity)
+
+    def remove(self, identity: str) -> None:
+        """Removes a batch that ended; its jobs and their results stay. Raises NotFound, and Conflict for a batch that
+        has not ended."""
+        if self._known(identity).finished is None:
+            raise Conflict("batch-active", compose("batch-active"))
+        self._index.remove(identity)
+
+    def serve(self) -> None:
+        """Brings the jobs of all batches to what their owners want. May run in several processes at once."""
+        for identity, jobs in self._index.recalled().items():  # also those that an ended process left
+            self._take_back(identity, jobs)
+        rows, waiting = self._index.unfinished(), self._index.with_waiting()
+        if not rows:
+            return
+        active = self._index.active()  # asked last: who waited then has a job since, or waits still
+        room = {row.queue: FED_MOST for row in rows}
+        for row in rows:
+            room[row.queue] -= len(active.get(row.id, {}))
+        for row in rows:
+            jobs = active.get(row.id, {})
+            if row.wish == "cancelled":
+                self._cancel_jobs(list(jobs))
+            elif row.wish == "paused":
+                self._index.recall(row.id, queued := [job for job, status in jobs.items() if status in ENQUEUED])
+                self._take_back(row.id, queued)
+            elif row.id in waiting and room[row.queue] > 0:
+                room[row.queue] -= self._feed(row, room[row.queue])
+            if not jobs and (row.wish == "cancelled" or row.id not in waiting):
+                self._webhooks.announce_batch(row.id, row.rounds, self._jobs.client.enqueue)
+                self._index.finish(row, _now_ms())
+
+    def captures(self, identity: str) -> Iterator[tuple[str | None, Job | None]]:
+        """Yields the captures of a batch in their order, None where one was erased, each with its latest job."""
+        for items in self._index.items(identity):
+            ids = [item.job_id for item in items if item.job_id is not None and is_id(item.job_id)]
+            jobs = {job.id: job for job in self._jobs.of(ids)}
+            yield from ((item.capture_id, jobs.get(item.job_id or "")) for item in items)
+
+    def _known(self, identity: str) -> BatchRow:
+        row = self._index.get(identity) if is_id(identity) else None
+        if row is None:
+            raise NotFound(compose("thing-batch"), identity)
+        return row
+
+    def _change(self, identity: str, wish: Literal["running", "paused"]) -> Batch:
+        self._known(identity)
+        if not self._index.change(identity, wish):
+            raise Conflict("batch-ended", compose("batch-ended"))
+        return self.get(identity)
+
+    def _chosen(self, selection: Selection) -> Sequence[str]:
+        ways = (selection.captures, selection.session, selection.prefix)
+        if sum(way is not None for way in ways) != 1:
+            raise InputError("request", [compose("batch-selection")])
+        if selection.captures is not None:
+            chosen, faults = selection.captures, self._faults_of(selection.captures)
+        elif selection.session is not None:
+            self._store.session(selection.session)
+            chosen, faults = self._library.heads_of(selection.session)[::-1], []
+        else:
+            chosen, faults = self._library.heads_labelled(selection.prefix or ""), []
+        if not chosen:
+            faults = [compose("batch-none-chosen")]
+        if len(chosen) > (most := self._settings.batch_captures):
+            faults = [compose("batch-captures-many", count=len(chosen), most=most)]
+        if len(faults) > FAULTS_MOST:
+            faults = [*faults[:FAULTS_MOST], compose("batch-more-faults", count=len(faults) - FAULTS_MOST)]
+        if faults:
+            raise InputError("captures", faults)
+        return chosen
+
+    def _faults_of(self, captures: Sequence[str]) -> list[Message]:
+        if len(captures) > self._settings.batch_captures:
+            return []  # refused for that alone
+        boards, faults = self._library.boards_among(captures), list[Message]()
+        for capture, times in Counter(captures).items():
+            if times > 1:
+                faults.append(compose("batch-capture-repeated", capture=capture, times=times))
+            if capture not in boards:
+                faults.append(compose("batch-capture-unknown", capture=capture))
+            elif boards[capture]:
+                faults.append(compose("batch-capture-board", capture=capture))
+        return faults
+
+    def _feed(self, row: BatchRow, limit: int) -> int:
+        """Gives jobs to the next captures of a batch, all in one transaction. Returns how many."""
+        try:
+            self._store.reserve(0, self._settings.free_bytes)
+        except DiskFull:
+            return 0  # readiness says so
+        with self._engine.begin() as connection:
+            items = self._index.waiting_within(connection, row.id, limit)
+            jobs = {item.position: self._job_within(connection, row, item) for item in items}
+            self._index.give_jobs_within(connection, row.id, jobs)
+        return len(jobs)
+
+    def _job_within(self, connection: sa.Connection, row: BatchRow, item: BatchItem) -> str | None:
+        """The id of a new job, None where the capture was removed since the batch began."""
+        capture = self._store.found("captures", item.capture_id or "")
+        if not isinstance(capture, CaptureRecord):
+            return None
+        request: JobRequest = {"capture_id": capture.id, "model": row.model, "settings": row.settings}
+        if row.label:
+            request["name"] = row.label
+        return self._jobs.enqueue_within(connection, request, capture.session, row)
+
+    def _cancel_jobs(self, jobs: Sequence[str]) -> None:
+        for job_id in jobs:
+            with suppress(EigenheadError):  # it was erased meanwhile
+                _, did = self._jobs.cancel(job_id)
+                if did:
+                    self._webhooks.announce(job_id, "cancelled", self._jobs.client.enqueue)
+
+    def _take_back(self, identity: str, jobs: Sequence[str]) -> None:
+        """Removes recalled jobs, so that their captures wait again; one that has ended meanwhile stays."""
+        for job_id in jobs:
+            taken = True
+            with suppress(NotFound):  # erased, or removed before this was noted
+                taken = self._jobs.cancel(job_id)[0].state == "cancelled"
+                if taken:
+                    self._jobs.delete(job_id)
+            self._index.settle_recall(identity, job_id, taken=taken)
+
+    def _batches(self, rows: Sequence[BatchRow]) -> list[Batch]:
+        tallies = self._index.tallies([row.id for row in rows])
+        slots = slots_by_queue(self._engine, self._settings.silent_s)
+        return [self._batch(row, tallies[row.id], slots.get(row.queue, 0)) for row in rows]
+
+    def _batch(self, row: BatchRow, tally: Tally, slots: int) -> Batch:
+        counts: dict[str, int] = dict.fromkeys(ITEM_STATES, 0)
+        special = {GONE: "removed", WAITING: "cancelled" if row.wish == "cancelled" else "waiting"}
+        for status, count in tally.statuses.items():
+            counts[special[status] if status in special else STATES[status]] += count
+        ended = row.finished is not None
+        state = row.wish if row.wish == "cancelled" or not ended else "finished"
+        undone, eta_s = sum(counts[name] for name in UNDONE), None
+        if state == "running" and undone and slots and tally.mean_s is not None:
+            eta_s = tally.mean_s * undone / min(slots, undone)
+        return Batch(
+            id=row.id,
+            label=row.label,
+            state=state,
+            created=moment_of(row.created),
+            finished=None if row.finished is None else moment_of(row.finished),
+            queue=row.queue,
+            priority=row.priority,
+            model=row.model,
+            settings=row.settings,
+            total=sum(counts.values()),
+            counts=counts,
+            eta_s=eta_s,
+            notice=self._jobs.queue_notice(row.queue) if state == "running" and undone else None,
+        )
+
+
+def _now_ms() -> int:
+    return time.time_ns() // 1_000_000

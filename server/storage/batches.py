@@ -1,0 +1,271 @@
+"""Batches in the database: what each is to make, and which job makes which capture's head.
+
+A batch has a row, each of its captures an item. An item without a job waits; what became of a job says the engine's own
+row, which is joined here and never copied, so that counts agree with the jobs at any moment. Moments are ms since 1970.
+"""
+
+import json
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import sqlalchemy as sa
+from sqlalchemy.exc import IntegrityError
+
+from server.storage.database import batch_items, batches
+from server.storage.job_index import ENQUEUED, RUNNING, engine_jobs
+from server.storage.pages import CursorPage, Order, contains, folded, page_of, storable, words_of
+
+AT_ONCE = 500
+Wish = Literal["running", "paused", "cancelled"]
+BatchState = Literal["running", "paused", "cancelled", "finished"]
+WAITING, GONE = "waiting", "gone"  # of items, beside the engine's statuses
+ACTIVE = (*ENQUEUED, RUNNING)
+RECALLED = batch_items.c.recalled.is_(sa.true())
+NONE = "-"  # in the place of a job's id: none is to be made, since the capture is gone
+
+
+@dataclass(frozen=True, slots=True)
+class BatchRow:
+    """Holds a batch. ``wish``: what its owner wants of it; ``finished``: when nothing was left to do; ``rounds``: how
+    often that was so, or failed jobs were tried again."""
+
+    id: str
+    created: int
+    label: str
+    key: str
+    digest: str
+    queue: str
+    priority: int
+    model: str | None
+    settings: Mapping[str, object]
+    wish: Wish = "running"
+    finished: int | None = None
+    rounds: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class BatchItem:
+    """Holds one capture of a batch, None where it was erased, and the latest job that makes its head."""
+
+    position: int
+    capture_id: str | None
+    job_id: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """Counts the items of a batch: ``statuses`` are the engine's, ``waiting`` and ``gone``. ``mean_s``: mean duration
+    of the jobs that succeeded, None where none did; on SQLite the engine notes whole seconds."""
+
+    statuses: Mapping[str, int]
+    mean_s: float | None
+
+
+class BatchIndex:
+    """Manages the rows of batches. Methods block."""
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine, self._status = engine, engine_jobs(engine)
+
+    def add(self, row: BatchRow, captures: Sequence[str]) -> bool:
+        """Adds a batch with its captures, all of it or nothing. Returns False where the id is taken."""
+        columns = {name: getattr(row, name) for name in BatchRow.__dataclass_fields__}
+        columns |= {"label": storable(row.label), "words": folded(row.label), "settings": json.dumps(row.settings)}
+        items = [{"batch_id": row.id, "position": place, "capture_id": one} for place, one in enumerate(captures)]
+        try:
+            with self._engine.begin() as connection:
+                connection.execute(sa.insert(batches).values(**columns))
+                connection.execute(sa.insert(batch_items), items)
+        except IntegrityError:
+            return False
+        return True
+
+    def get(self, identity: str) -> BatchRow | None:
+        return next(iter(self.of([identity])), None)
+
+    def of(self, ids: Sequence[str]) -> list[BatchRow]:
+        """Returns the batches with these ids, in their order; ids of no batch are left out."""
+        with self._engine.connect() as connection:
+            rows = connection.execute(sa.select(batches).where(batches.c.id.in_(ids)))
+            found = {row.id: _row(row) for row in rows}
+        return [found[identity] for identity in ids if identity in found]
+
+    def page(self, sought: str, state: BatchState | None, limit: int, cursor: str | None) -> CursorPage:
+        """Returns one page of batches, newest first. Raises InputError for a cursor of another list."""
+        rows = sa.select().select_from(batches)
+        for word in words_of(sought):
+            rows = rows.where(sa.or_(contains(batches.c.words, word), batches.c.id == word))
+        if state is not None:
+            rows = rows.where(_in_state(state))
+        with self._engine.connect() as connection:
+            return page_of(connection, rows, Order(batches.c.created, batches.c.id, descending=True), limit, cursor)
+
+    def unfinished(self, key: str | None = None) -> list[BatchRow]:
+        """Lists the batches with something to do, in the order in which they are served; of one API key if given."""
+        query = sa.select(batches).where(batches.c.finished.is_(None))
+        if key is not None:
+            query = query.where(batches.c.key == key)
+        with self._engine.connect() as connection:
+            rows = connection.execute(query.order_by(batches.c.priority, batches.c.created, batches.c.id))
+            return [_row(row) for row in rows]
+
+    def tallies(self, ids: Collection[str]) -> dict[str, Tally]:
+        """Counts the items of each of the batches."""
+        item, job = batch_items.c, self._status.c
+        waits = sa.or_(item.job_id.is_(None), RECALLED)
+        status = sa.case((waits, WAITING), else_=sa.func.coalesce(job.status, GONE)).label("status")
+        took = sa.func.avg(sa.cast(job.completed_at - job.started_at_epoch_ms, sa.Float)).label("took")
+        joined = batch_items.outerjoin(self._status, job.workflow_uuid == item.job_id)
+        query = sa.select(item.batch_id, status, sa.func.count().label("number"), took).select_from(joined)
+        query = query.where(item.batch_id.in_(ids)).group_by(item.batch_id, status)
+        counts: dict[str, dict[str, int]] = {identity: {} for identity in ids}
+        means: dict[str, float] = {}
+        with self._engine.connect() as connection:
+            for row in connection.execute(query):
+                counts[row.batch_id][row.status] = row.number
+                if row.status == "SUCCESS" and row.took is not None:
+                    means[row.batch_id] = row.took / 1000
+        return {identity: Tally(counts[identity], means.get(identity)) for identity in ids}
+
+    def items(self, identity: str) -> Iterator[list[BatchItem]]:
+        """Yields the items of a batch in their order, in portions."""
+        item, after = batch_items.c, -1
+        query = sa.select(item.position, item.capture_id, item.job_id).where(item.batch_id == identity)
+        while True:
+            with self._engine.connect() as connection:
+                rows = connection.execute(query.where(item.position > after).order_by(item.position).limit(AT_ONCE))
+                found = [BatchItem(row.position, row.capture_id, row.job_id) for row in rows]
+            if not found:
+                return
+            yield found
+            after = found[-1].position
+
+    def active(self) -> dict[str, dict[str, str]]:
+        """Returns the engine's status of every queued or running job of a batch, by batch and job."""
+        item, job = batch_items.c, self._status.c
+        query = sa.select(item.batch_id, item.job_id)
+        found: dict[str, dict[str, str]] = {}
+        with self._engine.connect() as connection:
+            rows = connection.execute(sa.select(job.workflow_uuid, job.status).where(job.status.in_(ACTIVE)))
+            active = {row.workflow_uuid: row.status for row in rows}  # few; joined, all items would be gone through
+            ids = list(active)
+            for start in range(0, len(ids), AT_ONCE):
+                for row in connection.execute(query.where(item.job_id.in_(ids[start : start + AT_ONCE]))):
+                    found.setdefault(row.batch_id, {})[row.job_id] = active[row.job_id]
+        return found
+
+    def waiting_within(self, connection: sa.Connection, identity: str, limit: int) -> list[BatchItem]:
+        """Returns the first items of a batch that wait, none where it is not to run. Until the end of the caller's
+        transaction nobody else gives it jobs or changes what it shall do."""
+        runs = sa.select(batches.c.id).where(batches.c.id == identity, batches.c.wish == "running")
+        if connection.scalar(runs.with_for_update()) is None:
+            return []
+        item = batch_items.c
+        query = sa.select(item.position, item.capture_id, item.job_id).where(item.batch_id == identity)
+        rows = connection.execute(query.where(item.job_id.is_(None)).order_by(item.position).limit(limit))
+        return [BatchItem(row.position, row.capture_id, row.job_id) for row in rows]
+
+    def give_jobs_within(self, connection: sa.Connection, identity: str, jobs: Mapping[int, str | None]) -> None:
+        """Notes the job of each item, by position; None: the capture is gone, and there will be none."""
+        place, job = sa.bindparam("place"), sa.bindparam("job")
+        change = sa.update(batch_items).where(batch_items.c.batch_id == identity, batch_items.c.position == place)
+        rows = [{"place": position, "job": job_id or NONE} for position, job_id in jobs.items()]
+        if rows:
+            connection.execute(change.values(job_id=job), rows)
+
+    def recall(self, identity: str, jobs: Collection[str]) -> None:
+        """Notes that these jobs of a batch are to be taken back."""
+        self._change_items(identity, list(jobs), {"recalled": True})
+
+    def recalled(self) -> dict[str, list[str]]:
+        """Returns the jobs that are to be taken back, by batch."""
+        query, found = sa.select(batch_items.c.batch_id, batch_items.c.job_id).where(RECALLED), dict[str, list[str]]()
+        with self._engine.connect() as connection:
+            for row in connection.execute(query):
+                found.setdefault(row.batch_id, []).append(row.job_id)
+        return found
+
+    def settle_recall(self, identity: str, job_id: str, *, taken: bool) -> None:
+        """Notes that a job was taken back, so that its capture waits again, or that it had ended before."""
+        changed = {"recalled": False, "job_id": None} if taken else {"recalled": False}
+        self._change_items(identity, [job_id], changed)
+
+    def with_waiting(self) -> set[str]:
+        """Returns the ids of unfinished batches with items that wait."""
+        with self._engine.connect() as connection:
+            return {*connection.scalars(sa.select(batches.c.id).where(batches.c.finished.is_(None), _has_waiting()))}
+
+    def change(self, identity: str, wish: Wish) -> bool:
+        """Notes what a batch shall do. Returns False where it has finished or was cancelled."""
+        change = sa.update(batches).where(batches.c.id == identity, batches.c.finished.is_(None))
+        with self._engine.begin() as connection:
+            return bool(connection.execute(change.where(batches.c.wish != "cancelled").values(wish=wish)).rowcount)
+
+    def finish(self, row: BatchRow, moment: int) -> None:
+        """Notes that nothing of a batch is left to do, unless that changed since ``row`` was read."""
+        change = sa.update(batches).where(batches.c.id == row.id, batches.c.finished.is_(None))
+        change = change.where(batches.c.wish == row.wish, batches.c.rounds == row.rounds)
+        if row.wish != "cancelled":
+            change = change.where(~_has_waiting())
+        with self._engine.begin() as connection:
+            connection.execute(change.values(finished=moment, rounds=row.rounds + 1))
+
+    def retry(self, identity: str, statuses: Collection[str]) -> int:
+        """Lets all items wait again whose job has one of the engine's ``statuses``. Returns how many."""
+        item, job = batch_items.c, self._status.c
+        joined = batch_items.join(self._status, job.workflow_uuid == item.job_id)
+        query = sa.select(item.job_id).select_from(joined).where(item.batch_id == identity, job.status.in_(statuses))
+        with self._engine.connect() as connection:
+            failed = [*connection.scalars(query)]
+        if failed:
+            self._change_items(identity, failed, {"job_id": None}, reopen=True)
+        return len(failed)
+
+    def forget_captures(self, captures: Collection[str]) -> None:
+        """Removes the ids of erased captures, and of their jobs, from all batches."""
+        listed = list(captures)
+        with self._engine.begin() as connection:
+            for start in range(0, len(listed), AT_ONCE):
+                those = batch_items.c.capture_id.in_(listed[start : start + AT_ONCE])
+                change = sa.update(batch_items).where(those)
+                connection.execute(change.values(capture_id=None, job_id=NONE, recalled=False))
+
+    def remove(self, identity: str) -> None:
+        with self._engine.begin() as connection:
+            connection.execute(sa.delete(batch_items).where(batch_items.c.batch_id == identity))
+            connection.execute(sa.delete(batches).where(batches.c.id == identity))
+
+    def _change_items(
+        self, identity: str, jobs: list[str], values: Mapping[str, object], *, reopen: bool = False
+    ) -> None:
+        with self._engine.begin() as connection:
+            for start in range(0, len(jobs), AT_ONCE):
+                those = batch_items.c.job_id.in_(jobs[start : start + AT_ONCE])
+                change = sa.update(batch_items).where(batch_items.c.batch_id == identity, those)
+                connection.execute(change.values(**values))
+            if reopen:
+                again = sa.update(batches).where(batches.c.id == identity)
+                connection.execute(again.values(finished=None, rounds=batches.c.rounds + 1))
+
+
+def _has_waiting() -> sa.ColumnElement[bool]:
+    """Two conditions, each with an index of its own."""
+    item = batch_items.c
+    those = item.batch_id == batches.c.id
+    return sa.or_(sa.exists().where(those, item.job_id.is_(None)), sa.exists().where(those, RECALLED))
+
+
+def _in_state(state: BatchState) -> sa.ColumnElement[bool]:
+    """A batch that was cancelled stays so; any other is finished once nothing is left to do."""
+    table = batches.c
+    if state == "cancelled":
+        return table.wish == state
+    if state == "finished":
+        return sa.and_(table.wish != "cancelled", table.finished.is_not(None))
+    return sa.and_(table.wish == state, table.finished.is_(None))
+
+
+def _row(row: sa.Row) -> BatchRow:
+    columns = {name: getattr(row, name) for name in BatchRow.__dataclass_fields__}
+    return BatchRow(**columns | {"settings": json.loads(row.settings)})

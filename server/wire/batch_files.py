@@ -1,0 +1,48 @@
+"""Sends the table and the contact sheet of a batch, made while they are sent."""
+
+from collections.abc import Iterator
+from typing import Literal
+
+from fastapi import Response
+from fastapi.responses import StreamingResponse
+
+from rig.messages.message import compose
+from server.errors import Conflict
+from server.services.service import Service
+
+TableFormat = Literal["csv", "parquet"]
+PARQUET_TYPE = "application/vnd.apache.parquet"
+CLOSED = "sandbox allow-popups; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+
+
+def send_table(service: Service, batch_id: str, form: TableFormat) -> Response:
+    """Returns the table of a batch. Raises NotFound, and Conflict for Parquet where pyarrow is not installed."""
+    from server.batch.table_files import CSV, PARQUET, csv_lines, has_parquet, parquet_bytes
+    from server.services.batch_table import batch_columns, batch_rows
+
+    batch = service.batches.get(batch_id)
+    columns = batch_columns(batch)
+    rows = batch_rows(service.batches, service.store, batch, columns)
+    if form == "csv":
+        return StreamingResponse(csv_lines(columns, rows), media_type="text/csv", headers=_saved_as(CSV))
+    if not has_parquet():
+        raise Conflict("no-parquet", compose("batch-parquet-missing"))
+    return Response(parquet_bytes(columns, list(rows)), media_type=PARQUET_TYPE, headers=_saved_as(PARQUET))
+
+
+def send_sheet(service: Service, batch_id: str) -> Response:
+    """Returns the contact sheet of a batch, on which labels of people stand: no script in it would run. Raises
+    NotFound."""
+    from server.services.batch_table import batch_sheet
+
+    lines = batch_sheet(service.batches, service.store, service.batches.get(batch_id))
+    headers = {"Content-Security-Policy": CLOSED, "Content-Disposition": 'inline; filename="sheet.html"'}
+    return StreamingResponse(_encoded(lines), media_type="text/html", headers=headers)
+
+
+def _encoded(lines: Iterator[str]) -> Iterator[bytes]:
+    return (f"{line}\n".encode("utf-8", "replace") for line in lines)
+
+
+def _saved_as(name: str) -> dict[str, str]:
+    return {"Content-Disposition": f'attachment; filename="{name}"'}

@@ -1,0 +1,51 @@
+"""What SIGKILL at any moment may not do to a batch: lose a capture, make its head twice, or leave anything over."""
+
+import os
+import random
+import signal
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.server.worker.test_durability import database
+from tests.support.services import running_service, uploaded_capture, worker_pids
+
+CAPTURES, KILLS = 12, 10
+SPREAD_S = (0.3, 2.5)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_a_batch_survives_kills_of_workers_and_service(kind: str, tmp_path: Path) -> None:
+    """Every second kill takes the service, too, in the midst of a pause or of a resumption."""
+    rng = random.Random(37)
+    with (
+        database(kind) as settings,
+        running_service(tmp_path / "data", silent_s="5", tiny_s="1", **settings) as service,
+        httpx.Client(base_url=service.url, timeout=30) as http,
+    ):
+        captures = [uploaded_capture(service, tmp_path, seed) for seed in range(CAPTURES)]
+        batch = http.post("/v1/batches", json={"captures": captures}).json()["id"]
+        for number in range(KILLS):
+            time.sleep(rng.uniform(*SPREAD_S))
+            if number % 2:
+                http.post(f"/v1/batches/{batch}/{'pause' if number % 4 == 1 else 'resume'}")
+                time.sleep(rng.uniform(0.0, 0.4))
+                service.kill()
+                service.start()
+            else:
+                for pid in worker_pids(service):
+                    os.kill(pid, signal.SIGKILL)
+        http.post(f"/v1/batches/{batch}/resume")
+        deadline = time.monotonic() + 240
+        while not (ended := http.get(f"/v1/batches/{batch}").json())["finished"]:
+            assert time.monotonic() < deadline, ended
+            time.sleep(0.2)
+        assert {state: count for state, count in ended["counts"].items() if count} == {"succeeded": CAPTURES}
+        jobs = http.get("/v1/jobs", params={"limit": 1000}).json()["jobs"]
+        assert sorted(job["capture_id"] for job in jobs) == sorted(captures)
+        assert sorted(path.name for path in (service.data / "jobs").iterdir()) == sorted(job["id"] for job in jobs)
+        assert not [*(service.data / "jobs").glob("*/attempt-*")]
