@@ -83,8 +83,8 @@ def _principal_point_faults(rig: Rig) -> list[Message]:
     share = float(np.median(shares))
     if share <= 0.0 or abs(np.log(share)) < OTHER_SIZE or np.abs(shares / share - 1.0).max() > SIZE_SPREAD:
         return []
-    told_share = float(f"{share:.2g}")  # principal points are not exactly in the middle
-    return [compose("intrinsics-of-other-size", share=told_share, factor=1.0 / told_share)]
+    rounded_share = float(f"{share:.2g}")  # principal points are not exactly in the middle
+    return [compose("intrinsics-of-other-size", share=rounded_share, factor=1.0 / rounded_share)]
 
 
 def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
@@ -172,8 +172,8 @@ def _convention_fault(rig: Rig) -> Message | None:
         return None
     (held, remedy), *others = fitting
     fault = compose("pose-convention", held=held, remedy=remedy)
-    for other, its_remedy in others[:1]:  # y up and z backwards looks like translations of the wrong sign
-        fault = compose("pose-convention-or", fault=fault, held=other, remedy=its_remedy)
+    for other, other_remedy in others[:1]:  # y up and z backwards looks like translations of the wrong sign
+        fault = compose("pose-convention-or", fault=fault, held=other, remedy=other_remedy)
     return fault
 
 

@@ -116,8 +116,10 @@ def refine(
     parts = []
     for fold in range(folds):
         others = [i for i in range(len(captures)) if i % folds != fold]
-        their = None if heads is None else heads.subset(others)
-        without = minimise_tangencies([captures[i] for i in others], rig, focal=focal, prior_px=prior_px, heads=their)
+        other_heads = None if heads is None else heads.subset(others)
+        without = minimise_tangencies(
+            [captures[i] for i in others], rig, focal=focal, prior_px=prior_px, heads=other_heads
+        )
         held_out = captures[fold::folds]
         parts.append((residuals(held_out, rig), residuals(held_out, without)))
         report("refine", (fold + 2) / (folds + 1))

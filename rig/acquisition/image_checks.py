@@ -82,9 +82,8 @@ def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
     """Tells whether something moved between clean plates: whether a block of 16 px changed by more than 8 standard
     deviations."""
     first = cv2.resize(plates[0].astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
-    limit = max(
-        8.0 * noise * np.sqrt(2) / 16, 4.0
-    )  # a block's mean has 1/16 of the noise; no person changes it by less than 4
+    # A block's mean has 1/16 of the noise. No person changes it by less than 4.
+    limit = max(8.0 * noise * np.sqrt(2) / 16, 4.0)
     for plate in plates[1:]:
         small = cv2.resize(plate.astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
         change = small - first
@@ -114,7 +113,7 @@ def blur_px(image: ImageRgb) -> float | None:
     ratio2 = (top / bottom) ** 2
     if ratio2 <= 1:
         return BLUR_MOST_PX  # wider than the two blurs can tell apart
-    # the central difference sees the picture through a box 2 px wide, of variance 1/3
+    # the central difference blurs like a box of 2 px, whose variance is 1/3
     squared = (_GAUSS_LARGE_PX**2 - ratio2 * _GAUSS_SMALL_PX**2) / (ratio2 - 1) - 1 / 3
     return float(min(np.sqrt(max(squared, 0.0)), BLUR_MOST_PX))
 
@@ -141,7 +140,7 @@ def register(image: ImageRgb, plate: ImageRgb) -> Registration:
         return Registration(len(points), 0.0, 0.0)
     moved_px = _largest_move(similarity, here.shape)
     if abs(np.hypot(similarity[0, 0], similarity[1, 0]) - 1) > _SCALE_MOST or moved_px > 2 * _REACH_PX:
-        return Registration(len(points), 0.0, 0.0)  # no camera moves so: the patches agree by chance
+        return Registration(len(points), 0.0, 0.0)  # no camera can move like this: the patches agree by chance
     return Registration(len(points), float(agree.sum()) / len(points), moved_px / factor)
 
 

@@ -17,7 +17,7 @@ OtherView = Callable[[str, Registration], str | None]
 LEVEL_WITHOUT_PLATES = 64.0  # a studio picture's mean, where there is no plate to compare with
 BLACK_LEVEL = 0.02  # of the plate's brightness: below it nothing is visible in a picture
 # Measured on two rendered captures of eleven cameras: own background 0.35 to 0.75 (lamps off: 0.12 to 0.5), another
-# camera's up to 0.07. Between the two bounds the plates of the other cameras are asked.
+# camera's up to 0.07. Between the two bounds the other cameras' plates are compared.
 FOUND_LEAST, FOUND_SURELY = 0.1, 0.25
 MOVED_DARK_PX = 3.0  # the same with the lamps off: up to 2.6 px without any movement
 

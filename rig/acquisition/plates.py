@@ -117,7 +117,7 @@ def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
         folder.rename(_versions(folder) / _version_of(folder).id)
     wanted.rename(folder)
     _remove_old(folder)
-    with suppress(OSError):  # the first ones leave nothing behind
+    with suppress(OSError):  # removed only if it is empty, as after the first plates
         _versions(folder).rmdir()
     return read_plates(folder, names)
 

@@ -119,7 +119,7 @@ class RigSession:
             self._lights_on()
             deadline_s = time.monotonic() + self.config.shot.timeout_s
             for feed in self._feeds.values():
-                # a camera that waits for triggers sends nothing by itself: that is no reason to wait for it
+                # a camera that waits for triggers sends nothing by itself, so it is not waited for
                 feed.wait_frames(self.config.shot.warm_up_frames, deadline_s)
             self._look(deadline_s + self.config.shot.timeout_s)
 
@@ -342,7 +342,7 @@ class RigSession:
             state = self._feeds[name].state()
             waits = self._feeds[name].camera.trigger == "external" and state.period_s is None
             if frame is not None or (not fired and state.opened and waits):
-                continue  # a camera that waits for a trigger that never came is not at fault
+                continue  # no fault of a camera whose trigger never came
             timeout_s = self.config.shot.timeout_s if fired else min(_DIAGNOSIS_S, self.config.shot.timeout_s)
             faults.append(Fault("missing", name, state.error or compose("frame-missing", seconds=timeout_s)))
         return faults

@@ -19,7 +19,7 @@ Edge = Literal["top", "left", "right"]
 WIDTH_PX = 320  # of the picture that is compared
 CHANGE_LEAST = 10.0  # of 255; most shadows on a backdrop change it by less
 NOISE_FACTOR = 6.0
-LOOSE_PX, GAP_PX = 5, 13  # what is thinner is no subject; gaps so wide are closed (skin before a skin-coloured wall)
+LOOSE_PX, GAP_PX = 5, 13  # thinner parts are dropped; gaps so wide are closed (skin before a skin-coloured wall)
 SHARE_LEAST = 0.02  # of the picture: a head that fills less is too far away to be measured, or nobody is there
 OUTLINE_PX = 0.8  # largest error of the simplified outline
 
@@ -43,7 +43,7 @@ def find_subject(image: ImageRgb, plate: ImageRgb) -> SubjectPlace | None:
     if image.shape != plate.shape:
         return None
     here, there = (np.float32(_reduced(picture)) + 1.0 for picture in (image, plate))
-    gain = np.median(here / there, axis=(0, 1))  # light that is brighter or dimmer than it was
+    gain = np.median(here / there, axis=(0, 1))  # the light may be brighter or dimmer than for the plate
     change = np.abs(here - gain * there).max(axis=2)
     noise = 1.4826 * float(np.median(change))
     return _place(change > max(CHANGE_LEAST, NOISE_FACTOR * noise), image.shape)

@@ -120,7 +120,7 @@ class TriggerBox:
         self._sequence = time.monotonic_ns() & 0xFF
         self._clock: BoxClock | None = None
         try:
-            # exclusive: two programs that fire the same box would each believe in their own shot
+            # exclusive: of two programs that fire the same box each would take the shot for its own
             self._serial = serial.Serial(port, baud, timeout=0.05, write_timeout=1.0, exclusive=True)
         except (serial.SerialException, OSError, ValueError) as error:
             raise TriggerUnplugged(port, _first_line(error)) from error

@@ -21,7 +21,7 @@ Verdict = Literal["good", "usable", "poor"]
 PLACE_FAULTS = frozenset({"empty", "cut-off"})
 DISPLACED = frozenset({"moved", "view", "swapped", "dark"})
 CAMERAS_LEAST = 3  # with fewer there is no reconstruction
-SOUND_SHARE = 0.75  # eight of eleven still surround a head; with fewer a side of it is seen by one camera or none
+SOUND_SHARE = 0.75  # 8 of 11 cameras still surround a head; with fewer, one side of it is seen by one camera or none
 
 
 class SubjectDocument(TypedDict):

@@ -60,7 +60,7 @@ class ArchiveLimits:
     ratio: float = 100.0  # unpacked / packed; PNG and JPEG do not shrink at all, uncompressed TIFF plates by about 20
     ratio_floor_bytes: int = 32 << 20  # the ratio is not checked below so many unpacked bytes
     depth: int = 8
-    name_length: int = 150  # a component; with the folder's own path it must stay below 4096
+    name_length: int = 150  # bytes of one part of a path; the whole path must stay below 4096
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,7 +93,7 @@ def _without_specks(share: Share) -> tuple[Share, float]:
     if lost == 0:
         return share, 0.0
     near = cv2.dilate((changed != share).astype(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
-    # The soft edges of what was changed go too.
+    # The soft edges of removed specks and filled holes are removed too.
     changed = np.where(near, np.where(changed > 127, np.uint8(255), np.uint8(0)), changed)
     return changed, lost / area
 

@@ -8,7 +8,7 @@ from rig.messages.message import Message, compose, message_of
 NAMED_MOST = 4  # cameras or keys that one message names
 SAME_LEAST = 3  # from so many faults on that differ in names alone, one message stands for all
 MEASURED = re.compile(r"(?<![\w.])-?(?:\d+\.\d+(?:e[+-]?\d+)?(?![\w.])|\d+(?=%))")
-# no size in pixels, which tells cameras apart
+# matches no sizes in pixels: cameras that differ in size stay apart
 
 
 def say_once(faults: Sequence[Message | str], names: Iterable[str], *, named_most: int = NAMED_MOST) -> list[Message]:

@@ -136,7 +136,7 @@ def decode_image_file(
         pixels = _plane(pixels, where) if kind == "mask" else at_share(pixels, (width, height), share)
     except InputError as error:
         return None, "", compose("of-file", file=where, fault=error.faults[0])
-    if data.startswith(PNG) and PNG_END not in data:  # OpenCV fills up what is cut off
+    if data.startswith(PNG) and PNG_END not in data:  # OpenCV silently fills the missing part of a truncated file
         return None, "", compose("of-file", file=where, fault=compose("picture-damaged"))
     if profile and kind == "colour":
         pixels = _in_srgb(pixels, profile)

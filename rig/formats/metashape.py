@@ -110,7 +110,7 @@ def _judge(
     """Checks attributes and child elements against the table of keys; children in ``tags`` are skipped."""
     keys: dict[str, object] = {f"{place}@{name}": text for name, text in node.attrib.items()}
     if place in ("sensor", "camera") and node.get("master_id") == node.get("id"):
-        keys.pop(f"{place}@master_id", None)  # its own master
+        keys.pop(f"{place}@master_id", None)  # a camera that is its own master is no slave
     for child in node if children else ():
         if child.tag not in tags:
             named = place == "sensor" and child.tag == "property"

@@ -115,7 +115,7 @@ def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> F
     owners = Counter((camera, name) for found in best for camera, known in found.items() for name in known)
     claimed = Counter(name for _, name in owners)
     if most == 1 and any(not _is_telling(cameras[camera]) for camera, _ in owners):
-        return {}  # a number in one file's name may be anything
+        return {}  # a number in a single file's name proves nothing
     return _by_owner((camera, name) for camera, name in owners if claimed[name] == 1)
 
 

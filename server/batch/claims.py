@@ -76,7 +76,7 @@ class Claims:
             return False
         with suppress(OSError):
             os.utime(self._owner)
-            # Both are times of the file's server, and need no clocks that agree.
+            # Both times are the file server's, so clocks need not agree.
             return self._owner.stat().st_mtime - seen < self._silent_s
         return True
 
@@ -134,9 +134,9 @@ class Claims:
         while not self._ended.wait(BEAT_S):
             try:
                 os.utime(self._owner)
-            except FileNotFoundError:  # taken for dead: claims are lost, and new ones may be taken
+            except FileNotFoundError:  # others took this process for dead; its claims are lost, new ones are possible
                 self._show()
-            except OSError:  # a file server that does not answer; the next beat tries again
+            except OSError:  # the file server does not answer; the next beat tries again
                 continue
 
 

@@ -60,7 +60,7 @@ class FailureRecord:
     message: Message
     faults: tuple[Message, ...]
     origin: Origin | None
-    trace: str = ""  # of a fault of the program's own
+    trace: str = ""  # stack trace of a bug in this program
 
 
 class BatchFolder:
@@ -97,7 +97,7 @@ class BatchFolder:
         while True:
             attempt = self.attempts / f"{token}.{number}"
             try:
-                attempt.mkdir(parents=True)  # whoever leaves may take the empty folder above away meanwhile
+                attempt.mkdir(parents=True)  # a process that ends may remove the empty parent folder meanwhile
             except FileExistsError:
                 number += 1
                 continue
@@ -113,13 +113,13 @@ class BatchFolder:
         made, target = attempt / "result", self.result(name)
         self.check_replaceable(name)
         sizes = {path.relative_to(made).as_posix(): path.stat().st_size for path in _files(made)}
-        sizes.pop(REPORT, None)  # it tells seconds, so that its size is another one each time
+        sizes.pop(REPORT, None)  # it contains durations, so its size varies
         document = {"format": RECORD_FORMAT, "capture": name, **asdict(origin), "files": dict(sorted(sizes.items()))}
         write_atomically(made / RECORD, json.dumps(document, indent=1).encode())
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists():
             target.rename(attempt / "replaced")
-        made.rename(target)  # refused where a folder with files is
+        made.rename(target)  # fails if a folder with files exists there
         self.failure_file(name).unlink(missing_ok=True)
 
     def check_replaceable(self, name: str) -> None:

@@ -18,7 +18,7 @@ class BatchProgress:
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
         self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock
-        self._running: dict[str, tuple[float, float]] = {}  # since when, and how far
+        self._running: dict[str, tuple[float, float]] = {}  # by name: start time, share done
         self._took: list[float] = []
         self.ended = self.failed = 0
 

@@ -122,7 +122,7 @@ class BatchRun:
         def kept(task: "BatchTask") -> bool:
             try:
                 return self._is_done(task, None)
-            except OSError:  # said of the capture when its turn comes
+            except OSError:  # reported when the capture's turn comes
                 return False
 
         with ThreadPoolExecutor(EXAMINERS) as pool:
@@ -169,7 +169,7 @@ class BatchRun:
                 with self._lock:
                     self._pending.append(task)
                 passed_over += 1
-                if passed_over > left:  # others have all that are left
+                if passed_over > left:  # other processes have all remaining captures
                     passed_over = 0
                     self._stopped.wait(POLL_S)
 
@@ -203,16 +203,16 @@ class BatchRun:
                 return Outcome(name, "kept")
             failure = self._folder.failure(name)
             if failure is not None and failure.attempt != self._failed_before.get(name):
-                return Outcome(name, "failed", failure=failure)  # another process tried just now
+                return Outcome(name, "failed", failure=failure)  # another process has just tried
             self._make(task, origin, child, claim)
             return Outcome(name, "made", time.monotonic() - began)
         except Cancelled:
             return None
         except (EigenheadError, OSError) as error:
-            if not self._claims.holds(claim):  # another process took this one for dead, and the capture over
+            if not self._claims.holds(claim):  # another process took this one for dead and the claim from it
                 return None
             failure = failure_of(error, task.capture.path, self._claims.token, origin)
-        with suppress(OSError):  # on a full disk it is said on the terminal alone
+        with suppress(OSError):  # on a full disk only the terminal shows it
             self._folder.note_failure(name, failure)
         return Outcome(name, "failed", time.monotonic() - began, failure)
 

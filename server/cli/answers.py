@@ -106,7 +106,8 @@ def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str
 
 def completing(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     """Returns a function that lists the choices beginning with what was typed so far, for completion by the shell."""
-    return lambda incomplete: [choice for choice in choices() if choice.startswith(incomplete)]  # typer tells by name
+    # The parameter's name tells typer what to pass.
+    return lambda incomplete: [choice for choice in choices() if choice.startswith(incomplete)]
 
 
 def chosen(help_text: str, choices: Callable[[], tuple[str, ...]], *names: str) -> Any:
@@ -115,7 +116,7 @@ def chosen(help_text: str, choices: Callable[[], tuple[str, ...]], *names: str) 
 
 
 def _finite(value: float | None) -> float | None:
-    if value is not None and not math.isfinite(value):  # no comparison with a limit says so of NaN
+    if value is not None and not math.isfinite(value):  # NaN passes every comparison with a limit
         raise typer.BadParameter(f"{value} is no finite number")
     return value
 

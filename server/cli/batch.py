@@ -95,7 +95,7 @@ def batch(
     requested = {name: value for name, value in outputs.items() if value}
     document = settings_document(settings, method=method, detail=detail, outputs=requested or None)
     with wrong_usage("FOLDER|LIST"):
-        found = _found(captures, out)
+        found = _captures_in(captures, out)
     with wrong_usage("settings"):
         tasks = plan_batch(found, document, model)
     prepare_folder(out)
@@ -109,7 +109,7 @@ def _share(text: str | None) -> "Shard":
         return WHOLE if text is None else read_shard(text)
 
 
-def _found(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
+def _captures_in(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
     """Returns the captures of a folder or list. Raises InputError for a wrong list, and if ``out`` lies within a
     capture."""
     from server.batch.captures import find_captures, is_archive, read_list
@@ -142,7 +142,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     files: list[Path] = []
     with _terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
         display.prepare(share_tasks)
-        variables = {"EIGENHEAD_THREADS": str(threads_of_worker(cores, count))} | _given_threads()
+        variables = {"EIGENHEAD_THREADS": str(threads_of_worker(cores, count))} | _threads_variable()
         run = BatchRun(folder, share_tasks, workers=count, variables=variables, observer=display)
         outcomes = run.run(lambda: files.extend(write_summary(folder, tasks)))
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
@@ -154,7 +154,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
         fail(str(CapturesFailed([outcome.name for outcome in failed], len(share_tasks))))
 
 
-def _given_threads() -> dict[str, str]:
+def _threads_variable() -> dict[str, str]:
     """Returns EIGENHEAD_THREADS if it is set in the environment: the user's choice goes before our own."""
     import os
 

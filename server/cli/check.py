@@ -56,15 +56,15 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     try:
         with folder_of(capture) as folder:
             if photographs_alone(folder):
-                found["cameras"], found["will"] = _told_by_photographs(folder, report)
+                found["cameras"], found["will"] = _plan_for_photographs(folder, report)
                 _check_front(chosen.front, found["cameras"])
                 return found
-            found["warnings"] = _told_by_files(capture_root(folder))
+            found["warnings"] = _file_warnings(capture_root(folder))
             content = check_capture(capture_root(folder), service_settings().image_pixels, report, strays_pass=True)
             found["cameras"] = [camera.name for camera in content.cameras]
             _check_front(chosen.front, found["cameras"])
             found["front"] = chosen.front or content.front
-            seen = _told_by_outlines(folder, chosen, report)
+            seen = _outline_warnings(folder, chosen, report)
             found["warnings"] += [warned for warned in seen if warned not in found["warnings"]]
     except (WrongVariable, WorkFailed):
         raise
@@ -80,7 +80,7 @@ def _check_front(front: str | None, cameras: list[str]) -> None:
         raise InputError("front", [compose("front-of-other-capture", front=f"{front!r:.80}", cameras=cameras)])
 
 
-def _told_by_files(root: Path) -> list[MessageDocument]:
+def _file_warnings(root: Path) -> list[MessageDocument]:
     """Returns warnings about the files of a capture folder. It is empty where the cameras cannot be read, since
     ``check_capture`` reports that fault."""
     rigs = [*rig_files(root)]
@@ -96,7 +96,7 @@ def _told_by_files(root: Path) -> list[MessageDocument]:
     return documents_of([*read.remarks, *unread_files(root, rigs), *strays])
 
 
-def _told_by_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:
+def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:
     """Returns the names of the photographs of a folder without cameras, and sentences on what a reconstruction will do.
 
     Raises InputError for photographs, or a scale.json, that cannot be used."""
@@ -133,7 +133,7 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
         raise InputError("photographs", faults)
 
 
-def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
+def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
     from pipeline.texturing.chart_colours import chart_colours

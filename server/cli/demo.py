@@ -85,7 +85,7 @@ def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Progres
             capture = client.post("/v1/captures", {"seed": seed, "label": "demo"})
             folders = {"contour": out} | ({"simplex": out / "simplex"} if compare else {})
             starts = {"contour": 0.1, "simplex": 0.4, "": 1.0}
-            for method, after in pairwise([*folders, ""]):  # one at a time: both draw
+            for method, after in pairwise([*folders, ""]):  # one at a time, since both render
                 start, share = starts[method], starts[after] - starts[method]
                 job = client.submit(capture["id"], settings=requested | {"method": method})
                 client.wait(job["id"], report=_part(report, f"{method}: ", start, share))

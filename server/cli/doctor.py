@@ -23,8 +23,8 @@ from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_compute, try_egl
 
 OTHER_VARIABLES = frozenset({MODELS, THREADS, PREFIX + "DEBUG", CACHE})  # valid, but not fields of ServiceSettings
-# The tables of server.storage.database and of the job engine in words of the databases' own: SQLAlchemy takes longer
-# to load than all checks.
+# Queries for the tables of server.storage.database and of the job engine in plain SQL: importing SQLAlchemy takes
+# longer than all checks.
 TABLES = {
     "sqlite": "SELECT name FROM sqlite_master WHERE name = '{}'",
     "postgresql": "SELECT tablename FROM pg_tables WHERE tablename = '{}'",
@@ -99,7 +99,7 @@ def _gpu(settings: ServiceSettings) -> tuple[bool, str]:
     try:
         return True, child.remote(try_compute)()
     except WorkFailed as error:
-        return True, f"none: {error.message.text}"  # the processor does what a GPU would
+        return True, f"none: {error.message.text}"  # no fault: the processor computes instead
     finally:
         child.close()
 
@@ -224,7 +224,7 @@ def _rows(connection: Connection, query: str) -> list[tuple[Any, ...]]:
 
 
 def _read_only(path: Path) -> sqlite3.Connection:
-    closed = not path.with_name(path.name + "-wal").exists()  # then a reader need not make one
+    closed = not path.with_name(path.name + "-wal").exists()  # without a -wal file a reader must not create one
     return sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable={int(closed)}", uri=True, timeout=10)
 
 

@@ -155,7 +155,7 @@ def reconstruct(
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
     for warning in written["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
-    names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # as they should be looked at
+    names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
     made = [out / name for name in names if (out / name).is_file()]
     answer(written, json_out, [str(path) for path in made])
 

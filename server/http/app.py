@@ -126,7 +126,7 @@ async def _sweep_forever(service: Service) -> None:
     while True:
         try:
             await service.threads.disk(sweep, service)
-        except Exception as error:  # a full or missing disk, a database that is away
+        except Exception as error:  # a full or missing disk, an unreachable database
             log.error("sweep failed", error=str(error)[:300])
         await asyncio.sleep(service.settings.sweep_s)
 

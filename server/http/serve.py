@@ -129,7 +129,7 @@ def _serve(settings: ServiceSettings, sock: socket.socket, worker: bool, ready: 
     finally:
         if beside is not None:
             beside.close()
-    if server.interrupted:  # asyncio loses the signal that uvicorn raises again where its last task ends first
+    if server.interrupted:  # asyncio may lose the signal that uvicorn raises again at its end
         raise KeyboardInterrupt
 
 

@@ -27,9 +27,8 @@ async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
     patience = httpx.Timeout(IDLE_TIMEOUT_S, connect=CONNECT_S)
     try:
         with anyio.fail_after(service.settings.import_s):
-            async with httpx.AsyncClient(
-                trust_env=False, timeout=patience
-            ) as client:  # a proxy would be called in place of the checked address
+            # No proxy of the environment: it would connect in place of us, and not to the checked address.
+            async with httpx.AsyncClient(trust_env=False, timeout=patience) as client:
                 return await _follow(service, client, url, folder / "upload")
     except TimeoutError as error:
         raise _failed(compose("import-too-slow", seconds=service.settings.import_s)) from error

@@ -102,7 +102,7 @@ def macro_weights(rng: np.random.Generator, male: bool, sampling: Sampling) -> d
     """Returns random weights of the macro targets of one adult: products of ancestry, sex, age, muscle and weight."""
     race = dict(zip(RACES, rng.dirichlet([sampling.ancestry] * len(RACES)), strict=True))
     maleness = rng.beta(6, 1.2) if male else rng.beta(1.2, 6)
-    old = rng.beta(1.0, 2.0)  # MakeHuman: young is 25 years, old 90; half of the subjects are under 44
+    old = rng.beta(1.0, 2.0)  # 0 is 25 years, 1 is 90 (MakeHuman); half of the subjects are under 44
     sex, age = {"male": maleness, "female": 1 - maleness}, {"young": 1 - old, "old": old}
     muscle, weight = (_three(rng.beta(3, 3), name) for name in ("muscle", "weight"))
     out = {f"{r}-{s}-{a}": race[r] * sex[s] * age[a] for r in RACES for s in sex for a in age}
