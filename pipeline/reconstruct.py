@@ -14,7 +14,7 @@ from pipeline.stages.pose_check import check_pose
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.refined_head import refine_head
 from pipeline.stages.texturing import texture_head
-from pipeline.stages.views import Views, find_views
+from pipeline.stages.views import Views, check_lenses, find_views
 from rig.formats.usdz import check_usd
 
 
@@ -37,9 +37,10 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         check_usd()
     run = Recorder(context.progress)
     views = run(find_views, context)
-    faces = run(find_faces, context, views.capture)
-    alignment = run(align_head, context, views, faces)
-    labels, head = fit_shape(run, context, views, alignment)
+    with run.beside(check_lenses, context, views):
+        faces = run(find_faces, context, views.capture)
+        alignment = run(align_head, context, views, faces)
+        labels, head = fit_shape(run, context, views, alignment)
     depth = run(measure_depth, context, views, head, labels)
     with run.beside(fuse_depth, context, views, head.mesh_world, depth) as fused:
         refined = run(refine_head, context, views, faces, head, labels, depth)

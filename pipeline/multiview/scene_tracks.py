@@ -27,6 +27,7 @@ MAX_WIDTH = 1400  # px: larger pictures are reduced
 INSET_PX = 4.0  # from the outline, where a keypoint is of the backdrop, too
 BAND = 0.004  # of the picture's width beside the line that the other camera allows: 4 px
 RATIO, MAX_DISTANCE = 0.85, 0.6  # of descriptors: to the second best, and at all
+MIN_LIKENESS = 1.0 - 0.5 * (MAX_DISTANCE / RATIO) ** 2  # of a second best that could put the best one in doubt
 MIN_VIEWS = 3
 MAX_MISS = 0.005  # of the picture's width: more is a wrong match
 
@@ -116,8 +117,11 @@ def _matches(one: Camera, first: Keypoints, two: Camera, second: Keypoints) -> I
     """Returns the numbers of keypoints that are each other's most alike near the epipolar lines."""
     if min(len(first[0]), len(second[0])) < 2:
         return np.zeros((0, 2), int)
-    rows, columns = np.nonzero(_beside_lines(one, first[0], two, second[0]) < BAND)
-    likeness = np.einsum("nk,nk->n", first[1][rows], second[1][columns])
+    every = first[1] @ second[1].T
+    rows, columns = np.nonzero(every > MIN_LIKENESS)
+    near = _beside_lines(one, first[0], rows, two, second[0], columns) < BAND
+    rows, columns = rows[near], columns[near]
+    likeness = every[rows, columns]
     order = np.lexsort((-likeness, rows))
     rows, columns, likeness = rows[order], columns[order], likeness[order]
     best = np.flatnonzero(np.diff(rows, prepend=-1))  # of each keypoint of the first view
@@ -131,18 +135,23 @@ def _matches(one: Camera, first: Keypoints, two: Camera, second: Keypoints) -> I
 
 
 def _beside_lines(
-    one: Camera, first: Float[np.ndarray, "n 2"], two: Camera, second: Float[np.ndarray, "m 2"]
-) -> Float32[np.ndarray, "n m"]:
-    """Returns how far each two pixels are from each other's epipolar lines, in shares of the first picture's width."""
+    one: Camera,
+    first: Float[np.ndarray, "n 2"],
+    rows: Int[np.ndarray, " p"],
+    two: Camera,
+    second: Float[np.ndarray, "m 2"],
+    columns: Int[np.ndarray, " p"],
+) -> Float[np.ndarray, " p"]:
+    """Returns how far the pixels of each pair of rows are from each other's epipolar lines, in shares of the first
+    picture's width."""
     relative = two.camera_from_world @ one.camera_from_world.inverse()
     x, y, z = relative.translation
     essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ relative.rotation
     straight, other = (np.insert(c.undistort(p), 2, 1.0, axis=1) for c, p in ((one, first), (two, second)))
     line, other_line = straight @ essential.T, other @ essential
-    slopes = (line[:, :2] ** 2).sum(axis=1)[:, None] + (other_line[:, :2] ** 2).sum(axis=1)
-    missed = np.abs(line.astype(np.float32) @ other.astype(np.float32).T)
-    missed /= np.sqrt(np.maximum(slopes.astype(np.float32), 1e-12))
-    return missed * np.float32(one.intrinsics.fx / one.intrinsics.width)
+    slopes = (line[:, :2] ** 2).sum(axis=1)[rows] + (other_line[:, :2] ** 2).sum(axis=1)[columns]
+    missed = np.abs(np.einsum("pk,pk->p", line[rows], other[columns])) / np.sqrt(np.maximum(slopes, 1e-12))
+    return missed * (one.intrinsics.fx / one.intrinsics.width)
 
 
 def _joined(pairs: list[tuple[int, int]], matched: list[Int[np.ndarray, "_ 2"]], seen: list[Keypoints]) -> SceneTracks:

@@ -22,7 +22,7 @@ from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig
 
-MIN_VIEWS, MAX_VIEWS, MIN_TRACKS = 3, 12, 60  # 12 views take 4 s of one core
+MIN_VIEWS, MAX_VIEWS, MIN_TRACKS = 3, 12, 60  # 12 views take 3 s of one core
 MIN_EFFECT = 1e-3  # of the picture's width, at the subject's farthest pixels: less does not matter to a head
 ROBUST_PX = 1.0  # of a miss (Geman and McClure)
 SHARES = np.linspace(-0.5, 1.5, 9)

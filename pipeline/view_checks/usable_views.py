@@ -13,7 +13,6 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.view_checks.camera_drift import find_drift
 from pipeline.view_checks.head_size import judge_head_size
 from pipeline.view_checks.image_assignment import assign_images
-from pipeline.view_checks.lens_distortion import judge_distortion
 from pipeline.view_checks.mask_edges import masks_off_edges
 from pipeline.view_checks.picture_faults import with_picture_faults
 from pipeline.view_checks.rig_agreement import misplaced_camera
@@ -94,9 +93,8 @@ def usable_views(
     size = judge_head_size(silhouettes, rig, masks_given=bool(assigned.capture.masks))
     given_masks = [name for name in rig.names if name in assigned.capture.masks]
     beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
-    lenses = judge_distortion(assigned.capture.images, silhouettes, rig)
     of_views = (*view_warnings(silhouettes), *moved_warnings)
-    warnings = (*assigned.warnings, *of_views, *size, *beside, *lenses, *capture.remarks)
+    warnings = (*assigned.warnings, *of_views, *size, *beside, *capture.remarks)
     return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
 
 

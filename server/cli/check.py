@@ -137,6 +137,7 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
     from pipeline.texturing.chart_colours import chart_colours
+    from pipeline.view_checks.lens_distortion import judge_distortion
     from pipeline.view_checks.usable_views import usable_views
 
     shot, rig = read_scaled_capture(folder)
@@ -146,7 +147,8 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
         return segment(capture, rig, chosen.segmentation, report=report)
 
     views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures)
-    warnings = [*views.warnings, *(chart_colours(shot, rig)[1] if chosen.texture.chart else ())]
+    lenses = judge_distortion(views.capture.images, views.silhouettes, rig)
+    warnings = [*views.warnings, *lenses, *(chart_colours(shot, rig)[1] if chosen.texture.chart else ())]
     return documents_of(warnings)
 
 
