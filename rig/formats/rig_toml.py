@@ -51,12 +51,12 @@ _SHOT_MOST = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfig:
-    """Holds one [[cameras]] table. Settings that are None are left as they are in the camera."""
+    """Holds one [[cameras]] table. Settings that are left out stay as they are in the camera."""
 
     name: str
     driver: DriverName
     identity: str
-    trigger: TriggerMode = "external"  # by the box's output; software: by a command; free: without synchronisation
+    trigger: TriggerMode = "external"  # external: the box's output; software: a command; free: not synchronised
     channel: int | None = None  # output of the trigger box
     delay_us: int = 0  # of that output
     latency_ms: float = 0.0  # from exposure to arrival: readout and transport, by `rig check`

@@ -132,7 +132,7 @@ async def _sweep_forever(service: Service) -> None:
 
 
 async def _serve_batches(service: Service) -> None:
-    """Every ``poll_s``; a failing call is logged and tried again later."""
+    """Queues jobs of batches every ``poll_s`` seconds. A call that fails is logged, and the next one tries again."""
     while True:
         pause_s = service.settings.poll_s
         try:

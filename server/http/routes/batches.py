@@ -26,7 +26,7 @@ SHEET: Responses = {200: {"content": {"text/html": TEXT}}, **documented(404)}
 
 
 class NewBatch(Received):
-    """The captures are named in one of three ways: ``captures``, ``session`` or ``prefix``."""
+    """Requests a batch. Its captures are named in one of three ways: ``captures``, ``session`` or ``prefix``."""
 
     model_config = ConfigDict(
         json_schema_extra={
