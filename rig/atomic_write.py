@@ -1,4 +1,4 @@
-"""Writing files so that a reader, or a crash, never meets half of one."""
+"""Writes files so that neither a reader nor a crash ever meets a half-written one."""
 
 import os
 import tempfile
@@ -7,11 +7,11 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, parents: bool = True) -> None:
-    """Writes ``data`` under a temporary name beside ``path``, syncs it, and renames it; ``mode`` is the file's.
+    """Writes ``data`` under a temporary name beside ``path``, syncs it, and renames it. ``mode`` are the file's
+    permissions.
 
-    Makes the folder if need be; without ``parents`` it must be there, so that what was removed is not made again by a
-    write that comes late. Raises FileNotFoundError then.
-    """
+    Makes the folder if it is missing. With ``parents`` false it raises FileNotFoundError instead, so that a late write
+    cannot make a removed folder again."""
     if parents:
         path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
@@ -28,6 +28,6 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, parents: boo
 
 
 def unfinished(folder: Path, name: str = "*") -> Iterator[Path]:
-    """Returns temporary files in ``folder`` of a write to ``name`` that goes on, or that a kill or the power cut short;
-    ``*`` stands for any text, as in ``Path.glob``."""
+    """Yields the temporary files in ``folder`` of writes to ``name``: those going on, and those cut short by a kill or
+    a power failure. ``*`` stands for any text, as in ``Path.glob``."""
     return folder.glob(f".{name}.*.part")

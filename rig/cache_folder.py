@@ -1,4 +1,5 @@
-"""Where this machine keeps what can be made again: compiled loops, arrays of models, how long stages take."""
+"""Names the folder in which this machine keeps what can be computed again: compiled loops, arrays of models,
+durations."""
 
 import os
 from pathlib import Path

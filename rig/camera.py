@@ -1,8 +1,7 @@
-"""A camera: pinhole with Brown-Conrady distortion, at a known place.
+"""Models a calibrated camera: a pinhole with Brown-Conrady distortion, and its pose.
 
 ``x = X / Z`` in the camera frame is distorted to ``x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential`` (OpenCV's
-order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of the top-left pixel.
-"""
+order k1 k2 p1 p2 k3), and ``u = fx x_d + cx``. Pixel (0, 0) is the centre of the top-left pixel."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,8 +14,10 @@ from rig.geometry import RigidTransform
 from rig.recorded_lens import RecordedLens
 
 
-@lru_cache(maxsize=1024)  # asked at every projection; the roots of a cubic cost more than projecting a point
+@lru_cache(maxsize=1024)  # needed at every projection; the roots of a cubic cost more than projecting a point
 def _turning_radius(k1: float, k2: float, k3: float) -> float:
+    """Returns the radius at which the radial model ``r (1 + k1 r^2 + k2 r^4 + k3 r^6)`` stops growing; infinity if it
+    never does."""
     cubic = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     squares = cubic.real[(np.abs(cubic.imag) < 1e-12) & (cubic.real > 0)]
     return float(np.sqrt(squares.min())) if len(squares) else np.inf
@@ -34,25 +35,29 @@ class Distortion:
 
     @property
     def is_zero(self) -> bool:
+        """Tells whether all coefficients are 0."""
         return not (self.k1 or self.k2 or self.p1 or self.p2 or self.k3)
 
     def opencv(self) -> Float[np.ndarray, " 5"]:
+        """Returns k1 k2 p1 p2 k3, OpenCV's order."""
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
     def max_valid_radius(self) -> float:
-        """Returns the radius (of ``X / Z``) where the radial model stops growing: farther points fold back."""
+        """Returns the radius (of ``X / Z``) up to which distortion is one to one; beyond it the radial model folds
+        points back."""
         return _turning_radius(self.k1, self.k2, self.k3)
 
     def apply(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Distorts ``X / Z, Y / Z``."""
+        """Distorts normalised coordinates ``X / Z, Y / Z``."""
         return _distorted(normalised, self.opencv())
 
     def jacobian(self, normalised: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 2"]:
-        """Computes the derivative of the distorted by the normalised coordinates."""
+        """Computes the derivative of the distorted coordinates by the normalised ones."""
         return _distortion_slopes(normalised, self.opencv())
 
     def remove(self, distorted: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Inverts ``apply`` by Newton's method; NaN where no point inside the turning radius maps there."""
+        """Inverts ``apply`` by Newton's method. Returns NaN where no point inside the valid radius maps to the given
+        one."""
         if self.is_zero:
             return distorted.copy()
         limit = self.max_valid_radius()
@@ -73,7 +78,8 @@ class Distortion:
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """Holds image size and projection of one camera, in pixels."""
+    """Holds the image size (px) and the projection of one camera: focal lengths and principal point (px), and
+    distortion."""
 
     width: int
     height: int
@@ -88,10 +94,12 @@ class Intrinsics:
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion.opencv()])
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """Returns the camera matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def scaled(self, factor: float) -> "Intrinsics":
-        """Returns the same camera at another resolution: pixel centres move, ``u' = (u + 1/2) factor - 1/2``."""
+        """Returns the intrinsics for an image scaled by ``factor``: ``u' = (u + 1/2) factor - 1/2``, since pixel
+        centres shift."""
         width, height = round(self.width * factor), round(self.height * factor)
         sx, sy = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
@@ -100,12 +108,11 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """Describes a calibrated camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm), of a left
-    perturbation.
+    """Describes a calibrated camera.
 
-    ``recorded``: the lens of its picture files where ``intrinsics`` is the pinhole that they are undistorted to;
-    ``serial``: of its body, as its picture files have it.
-    """
+    ``covariance`` is that of a left perturbation of ``camera_from_world``: 6 x 6, rotation (rad) then translation (mm).
+    ``recorded`` is the lens with which the picture files were taken, if ``intrinsics`` is the pinhole to which they are
+    undistorted. ``serial`` is the serial number of the camera body, as picture files state it."""
 
     name: str
     intrinsics: Intrinsics
@@ -116,6 +123,7 @@ class Camera:
 
     @property
     def centre_world(self) -> Float[np.ndarray, " 3"]:
+        """Returns the centre of projection, in the world frame (mm)."""
         return self.camera_from_world.inverse().translation
 
     @property
@@ -124,13 +132,14 @@ class Camera:
         return self.camera_from_world.rotation[2]
 
     def project(self, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Projects world points (mm) to pixels; NaN behind the camera and past the turning point of the distortion."""
+        """Projects world points (mm) to pixels. Returns NaN behind the camera and beyond the distortion's valid
+        radius."""
         return self._image(self.camera_from_world.apply(points_world))
 
     def project_with_jacobian(
         self, points_world: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-        """Returns pixels, and their derivative by the world point (px / mm)."""
+        """Returns the pixels of world points (mm), and their derivatives by the points (px / mm)."""
         points = self.camera_from_world.apply(points_world)
         with np.errstate(divide="ignore", invalid="ignore"):
             by_point, _ = lens_jacobians(points, self.intrinsics.values())
@@ -143,12 +152,12 @@ class Camera:
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def undistort(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Computes ``X / Z, Y / Z`` of ``pixels``, without distortion."""
+        """Returns the normalised coordinates ``X / Z, Y / Z`` of pixels, with the distortion removed."""
         k = self.intrinsics
         return k.distortion.remove((pixels - (k.cx, k.cy)) / (k.fx, k.fy))
 
     def _image(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Pixels of points in the camera's frame."""
+        """Projects points in the camera's frame (mm) to pixels."""
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels = lens_image(points, self.intrinsics.values())
             radius = np.hypot(points[:, 0], points[:, 1]) / points[:, 2]
@@ -159,8 +168,8 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraStack:
-    """Holds several cameras that look at the same point, as arrays: what ``Camera`` does to many points of one camera,
-    this does to one point in many cameras."""
+    """Holds several cameras as arrays, to project one point to all of them at once. ``Camera`` projects many points to
+    one camera."""
 
     rotations: Float[np.ndarray, "n 3 3"]
     translations: Float[np.ndarray, "n 3"]  # mm
@@ -169,6 +178,7 @@ class CameraStack:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> "CameraStack":
+        """Builds the arrays from cameras."""
         return cls(
             np.array([camera.camera_from_world.rotation for camera in cameras]),
             np.array([camera.camera_from_world.translation for camera in cameras]),
@@ -179,7 +189,7 @@ class CameraStack:
     def project_with_jacobian(
         self, point_world: Float[np.ndarray, " 3"]
     ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-        """Returns the point's pixel in each camera, and its derivative by the point (px / mm); NaN as in
+        """Returns the pixel of a world point (mm) in each camera, and its derivatives by the point (px / mm); NaN as in
         ``Camera.project``."""
         points = self.rotations @ point_world + self.translations
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -191,18 +201,17 @@ class CameraStack:
 
 
 def lens_image(points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]) -> Float[np.ndarray, "n 2"]:
-    """Returns pixels of points in front of a camera, in its frame (mm).
+    """Projects points in a camera's frame (mm) to pixels.
 
-    ``lens``: fx fy cx cy (px) k1 k2 p1 p2 k3, the same for all points or one a point. Nothing is tested: neither that a
-    point lies in front, nor that it is inside the distortion's turning radius.
-    """
+    ``lens`` is fx fy cx cy (px) k1 k2 p1 p2 k3, one for all points or one for each. The caller must make sure that the
+    points lie in front of the camera and inside the distortion's valid radius."""
     return _distorted(points[:, :2] / points[:, 2:], lens[..., 4:]) * lens[..., :2] + lens[..., 2:4]
 
 
 def lens_jacobians(
     points: Float[np.ndarray, "n 3"], lens: Float[np.ndarray, "*n 9"]
 ) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 9"]]:
-    """Returns derivatives of ``lens_image`` by the point (px / mm) and by the lens's nine values."""
+    """Returns the derivatives of ``lens_image`` by the point (px / mm) and by the nine values of the lens."""
     normalised, z = points[:, :2] / points[:, 2:], points[:, 2]
     (x, y), focal = normalised.T, lens[..., :2, None]
     slopes = focal * _distortion_slopes(normalised, lens[..., 4:])
@@ -220,7 +229,7 @@ def lens_jacobians(
 
 
 def _distorted(normalised: Float[np.ndarray, "n 2"], lens: Float[np.ndarray, "*n 5"]) -> Float[np.ndarray, "n 2"]:
-    """The module's equation."""
+    """Distorts normalised coordinates by the module's equation."""
     (x, y), (k1, k2, p1, p2, k3) = normalised.T, lens.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -234,7 +243,7 @@ def _distorted(normalised: Float[np.ndarray, "n 2"], lens: Float[np.ndarray, "*n
 def _distortion_slopes(
     normalised: Float[np.ndarray, "n 2"], lens: Float[np.ndarray, "*n 5"]
 ) -> Float[np.ndarray, "n 2 2"]:
-    """Its derivative by the normalised place, which is symmetric."""
+    """Returns the derivative of ``_distorted`` by the normalised coordinates, a symmetric matrix."""
     (x, y), (k1, k2, p1, p2, k3) = normalised.T, lens.T
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

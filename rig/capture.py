@@ -1,4 +1,4 @@
-"""One synchronised shot of every camera, as a value."""
+"""Defines a capture: one synchronised shot of every camera, in memory."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,9 +20,12 @@ Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """Holds images by camera name (RGB), clean plates, ready masks (True = subject), feature points (pixels) by
-    landmark and camera, the sha256 of every file that it was read from, and what its reader noticed and did not mind.
-    ``soft_masks``: of masks with soft edges the share of the subject in every pixel, 0 to 255."""
+    """Holds the pictures of one shot, and what was read beside them.
+
+    ``images`` are the photographs by camera (RGB), ``backgrounds`` the clean plates, ``masks`` ready-made masks (True =
+    subject); ``soft_masks`` give the subject's share of each pixel, 0 to 255, for masks with soft edges. ``features``
+    are feature points (px) by landmark and camera. ``digests`` are the sha256 of all files read, ``remarks`` the
+    warnings of the reader."""
 
     images: Mapping[str, ImageRgb]
     backgrounds: Mapping[str, tuple[ImageRgb, ...]] = field(default_factory=dict)
@@ -44,9 +47,11 @@ def reassign_images(
     """Returns the capture with some of its images, masks, clean plates and points assigned to other cameras.
 
     Args:
-        pictures: for a camera, the name under which its image is filed now, and its mask unless ``masks`` says so.
-        plates: the same of its clean plates.
-        points: the same of the feature points that were picked in its image.
+        pictures: for a camera, the name under which its image is stored now; its mask follows, unless ``masks`` is
+            given.
+        plates: the same for its clean plates.
+        points: the same for the feature points that were picked in its image.
+        masks: the same for its mask.
     """
 
     def reassign(filed: Mapping[str, Content], source: Mapping[str, str]) -> dict[str, Content]:
@@ -66,7 +71,7 @@ def reassign_images(
 
 
 def _renamed(digests: Mapping[str, str], sources: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Digests under the names that the files should have."""
+    """Returns the digests under the names that the files should have."""
     renamed = {}
     for file, digest in digests.items():
         path = PurePosixPath(file)

@@ -1,4 +1,4 @@
-"""By what files and documents are told apart."""
+"""Computes the digests by which files and documents are told apart."""
 
 import hashlib
 import json
@@ -7,5 +7,5 @@ from typing import Any
 
 
 def document_sha256(document: Mapping[str, Any]) -> str:
-    """Computes the sha256 of a document's canonical JSON, by which results name their settings and inputs."""
+    """Computes the sha256 of a document's canonical JSON. Results refer to their settings and inputs by it."""
     return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

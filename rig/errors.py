@@ -1,4 +1,5 @@
-"""The one exception tree. Every message says what is wrong and what to do; nothing raises a bare Exception."""
+"""Defines the base classes of all exceptions. Every message says what is wrong and what to do; no code raises a bare
+Exception."""
 
 from collections.abc import Iterable
 
@@ -6,7 +7,7 @@ from rig.messages.message import Message, compose, message_of
 
 
 class EigenheadError(Exception):
-    """Is the root of every error that this project raises on purpose; its ``message`` is fit for an operator."""
+    """Is the base of all errors that this project raises deliberately. ``message`` can be shown to an operator."""
 
     def __init__(self, message: Message | str) -> None:
         self.message = message_of(message)
@@ -14,14 +15,15 @@ class EigenheadError(Exception):
 
 
 class Cancelled(EigenheadError):
-    """Ends work that its owner stopped; a progress report raises it."""
+    """Ends work that its owner has cancelled. It is raised by the function that receives progress."""
 
     def __init__(self) -> None:
         super().__init__(compose("cancelled"))
 
 
 class InputError(EigenheadError):
-    """Refuses input that cannot be used. ``faults`` names every fault found, not only the first."""
+    """Refuses input that cannot be used. ``subject`` names the input; ``faults`` lists every fault found, not only the
+    first."""
 
     def __init__(self, subject: str, faults: Iterable[Message | str]) -> None:
         self.subject = subject
@@ -29,14 +31,14 @@ class InputError(EigenheadError):
         super().__init__(compose("input-refused", subject=subject, faults=self.faults))
 
     def located(self, where: str | None = None) -> list[Message]:
-        """Returns the faults with the place where they are, the error's subject if no other is named."""
+        """Returns the faults, each preceded by ``where`` or, without it, by the error's subject."""
         return [compose("located", where=where or self.subject, fault=fault) for fault in self.faults]
 
 
 class WrongVariable(InputError):
-    """Refuses a variable of the environment that cannot be used: a fault of nobody's capture."""
+    """Refuses an environment variable that cannot be used. It is a fault of the machine, not of any capture."""
 
 
 def how_to_install(extra: str) -> Message:
-    """Returns what to type for an optional part of the project, in a checkout and beside a wheel."""
+    """Returns the command that installs an optional part of the project, for a checkout or an installed wheel."""
     return compose("install-extra", extra=extra)

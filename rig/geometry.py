@@ -1,4 +1,4 @@
-"""Rigid motions and similarities, named ``b_from_a``."""
+"""Defines rigid motions and similarities between frames, named ``b_from_a``, and functions on rotations."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidTransform:
-    """Moves a to b: ``x_b = rotation @ x_a + translation`` (mm)."""
+    """Maps coordinates in frame a to frame b: ``x_b = rotation @ x_a + translation`` (mm)."""
 
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, " 3"]
@@ -21,16 +21,19 @@ class RigidTransform:
         return RigidTransform(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def inverse(self) -> "RigidTransform":
+        """Returns a_from_b."""
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
     def apply(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        """Returns the points (mm) in frame b."""
         return points @ self.rotation.T + self.translation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """Maps a to b: ``x_b = scale * rotation @ x_a + translation`` (mm); the paper's ``T(x) = s (R x + t')``, t = s
-    t'."""
+    """Maps coordinates in frame a to frame b: ``x_b = scale * rotation @ x_a + translation`` (mm).
+
+    The paper writes it ``T(x) = s (R x + t')``, with t = s t'."""
 
     scale: float
     rotation: Float[np.ndarray, "3 3"]
@@ -42,6 +45,7 @@ class Similarity:
 
     @classmethod
     def from_rigid(cls, transform: RigidTransform) -> "Similarity":
+        """Returns the similarity of scale 1."""
         return cls(1.0, transform.rotation, transform.translation)
 
     def __matmul__(self, other: "Similarity | RigidTransform") -> "Similarity":
@@ -49,10 +53,12 @@ class Similarity:
         return Similarity(self.scale * inner, self.rotation @ other.rotation, self.apply(other.translation))
 
     def inverse(self) -> "Similarity":
+        """Returns a_from_b."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
     def apply(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        """Returns the points (mm) in frame b."""
         return self.scale * (points @ self.rotation.T) + self.translation
 
 
@@ -67,7 +73,7 @@ def cross_matrix(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3
 
 
 def rotation_from_vector(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
-    """Computes the rotation by ``|vector|`` radians about ``vector`` (Rodrigues' formula)."""
+    """Computes the rotation by ``|vector|`` radians about the axis ``vector`` (Rodrigues' formula)."""
     angle = np.sqrt((vector * vector).sum(axis=-1))[..., None, None]
     skew = cross_matrix(vector)
     # Below 1e-4 rad the series keeps full precision where sin(a)/a and (1-cos a)/a^2 lose digits.
@@ -78,7 +84,7 @@ def rotation_from_vector(vector: Float[np.ndarray, "... 3"]) -> Float[np.ndarray
 
 
 def vector_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
-    """Inverts ``rotation_from_vector``, with the angle in [0, pi]."""
+    """Inverts ``rotation_from_vector``: returns axis times angle (rad), with the angle in [0, pi]."""
     # Through the unit quaternion (x, y, z, w): the largest of its four squared entries is at least 1/4, so that the
     # division below is safe at every angle, pi included.
     r = rotation
@@ -107,8 +113,9 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def rigid_fit(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> RigidTransform:
-    """Estimates target_from_source: the motion T that minimises ``sum_j w_j |target_j - T(source_j)|^2`` (Kabsch 1976),
-    equal weights by default; never a reflection."""
+    """Estimates target_from_source by weighted least squares (Kabsch 1976); weights are equal by default.
+
+    It is the motion T that minimises ``sum_j w_j |target_j - T(source_j)|^2``, and never a reflection."""
     share = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
     source_mean, target_mean = share @ source, share @ target
     rotation = nearest_rotation(((source - source_mean) * share[:, None]).T @ (target - target_mean)).T
@@ -118,8 +125,8 @@ def rigid_fit(
 def look_at(
     centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
 ) -> RigidTransform:
-    """Computes camera_from_world of a camera at ``centre`` that looks at ``target``, ``up`` towards the top of its
-    image."""
+    """Computes camera_from_world of a camera at ``centre`` (mm) that looks at ``target`` (mm). The direction ``up``
+    points to the top of its image."""
     forward = (target - centre) / np.linalg.norm(target - centre)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)

@@ -1,4 +1,4 @@
-"""What a picture is between its file and the pixels' owner."""
+"""Defines the type of pictures in memory, and tells grey pictures from coloured ones."""
 
 from collections.abc import Sequence
 
@@ -9,18 +9,18 @@ ImageRgb = UInt8[np.ndarray, "h w 3"]
 """A picture as sRGB, row by row from the top; h and w are those of the call's other pictures."""
 
 GREY_WEIGHTS = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue: ITU-R BT.601, as JPEG has it
-SPARSE = (slice(None, None, 16), slice(None, None, 16))  # pixels that tell most colour pictures from grey ones
+SPARSE = (slice(None, None, 16), slice(None, None, 16))  # tested first: most colour pictures show colour there
 
 
 def is_grey(image: UInt8[np.ndarray, "_ _ 3"]) -> bool:
-    """Tells whether a picture has no colour in any pixel."""
+    """Tells whether red, green and blue are equal in every pixel."""
     return all(bool((part == part[..., :1]).all()) for part in (image[SPARSE], image))
 
 
 def plates_for(
     image: UInt8[np.ndarray, "_ _ 3"], plates: Sequence[UInt8[np.ndarray, "_ _ 3"]]
 ) -> tuple[UInt8[np.ndarray, "_ _ 3"], ...]:
-    """Returns clean plates as a picture can be compared with them: in grey where it is grey."""
+    """Returns the clean plates to compare a picture with: converted to grey if the picture is grey."""
     if not plates or not is_grey(image):
         return tuple(plates)
     return tuple(plate if is_grey(plate) else _in_grey(plate) for plate in plates)

@@ -1,10 +1,9 @@
-"""Which level of a mask is the subject: white by our convention, black where programs mark what is to be ignored.
+"""Decides which level of a mask is the subject: white by our convention, black where programs mark what to ignore.
 
-Backgrounds hold the borders of a picture but one (a person's shoulders fill the bottom, or another side of a camera
-that hangs on its side), subjects its middle. Where both say that a mask is inverted it is; a close-up that fills the
-frame, and a subject beside the middle, contradict themselves and follow the other views. All views that decide nothing
-follow those that do.
-"""
+Background covers all borders of a picture but one (the subject's shoulders fill the bottom, or another side if the
+camera hangs on its side), and the subject covers the middle. A mask is inverted if both criteria say so. They
+contradict each other for a close-up that fills the frame and for a subject beside the middle; such views follow the
+majority of the others."""
 
 from collections.abc import Mapping
 from typing import Literal
@@ -14,19 +13,19 @@ from jaxtyping import Bool, Float
 
 Convention = Literal["white", "black"]
 
-BORDER_MARGIN = 0.15  # of the borders' share, by which one reading must be the better: shoulders leave 0.25 and more
+BORDER_MARGIN = 0.15  # of the borders' length, by which one convention must fit better: shoulders leave 0.25 and more
 MIDDLE_RADIUS = 0.06  # of the picture's longer side: half a face
-MIDDLE_MARGIN = 0.3  # from one half
+MIDDLE_MARGIN = 0.3  # by which the share of white in the middle must differ from one half
 
 
 def subject_convention(
     mask: Bool[np.ndarray, "h w"], middle_px: Float[np.ndarray, " 2"] | None = None
 ) -> Convention | None:
-    """Returns what a mask alone says: whether white or black is its subject; None where it contradicts itself.
+    """Returns which level is the subject, by this mask alone: white or black; None if the criteria disagree.
 
     Args:
         mask: True where it is white.
-        middle_px: where the cameras look; None: the middle of the picture.
+        middle_px: pixel of the point at which the cameras look; by default the middle of the picture.
     """
     sides = np.sort([mask[0].mean(), mask[-1].mean(), mask[:, 0].mean(), mask[:, -1].mean()])
     white_at_borders, black_at_borders = float(sides[:3].mean()), float(1.0 - sides[1:].mean())
@@ -46,11 +45,11 @@ def subject_convention(
 def inverted_masks(
     masks: Mapping[str, Bool[np.ndarray, "_ _"]], middles_px: Mapping[str, Float[np.ndarray, " 2"]]
 ) -> list[str]:
-    """Returns the masks of a capture whose subject is black; undecided ones are taken as most of the others.
+    """Returns the names of the masks whose subject is black. Undecided masks follow the majority of the others.
 
     Args:
         masks: by camera, True where they are white.
-        middles_px: where each camera sees the place that all look at.
+        middles_px: by camera, the pixel of the point at which all cameras look.
     """
     said = {name: subject_convention(mask, middles_px.get(name)) for name, mask in masks.items()}
     black = [name for name, convention in said.items() if convention == "black"]

@@ -1,4 +1,4 @@
-"""Triangle meshes as values."""
+"""Defines triangle meshes and computes their normals and borders."""
 
 from dataclasses import dataclass
 
@@ -8,26 +8,26 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Holds vertices (mm) and counter-clockwise triangles, seen from outside; ``colours`` are sRGB, one a vertex."""
+    """Holds vertices (mm) and triangles, whose corners run counter-clockwise seen from outside. ``colours`` are sRGB,
+    one a vertex."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     colours: UInt8[np.ndarray, "v 3"] | None = None
 
     def normals(self) -> Float[np.ndarray, "v 3"]:
-        """Computes unit vertex normals, each the area-weighted mean of its faces'; (0, 0, 1) where no face has an
-        area."""
+        """Computes unit vertex normals, weighted by the area of the faces; (0, 0, 1) where no face has an area."""
         return vertex_normals(self.vertices, self.faces)
 
 
 def face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Computes face normals whose length is twice the face's area."""
+    """Computes face normals. The length of each is twice the area of its face."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
 
 
 def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "v 3"]:
-    """Computes unit, area-weighted vertex normals."""
+    """Computes unit vertex normals, weighted by the area of the faces."""
     per_face = face_normals(vertices, faces)
     normals = np.empty_like(vertices)
     corners = faces.ravel()
@@ -40,9 +40,9 @@ def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
 
 
 def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
-    """Finds the directed edges that only one face has: the open rim of the mesh."""
+    """Finds the directed edges that belong to one face only: the border of an open mesh."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     low, high = edges.min(axis=1).astype(np.int64), edges.max(axis=1)
-    # One number for both ends: whole rows sort thirty times as long.
+    # Both ends are packed into one number: sorting rows takes thirty times as long.
     _, first, count = np.unique((low << 32) | high, return_index=True, return_counts=True)
     return edges[first[count == 1]]

@@ -1,4 +1,4 @@
-"""What can be said against a rig before a picture of it is looked at: every fault at once, each with its remedy."""
+"""Checks a rig before any picture is read. Reports every fault, each with its remedy."""
 
 from dataclasses import replace
 
@@ -11,35 +11,35 @@ from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
 
-ONE_PLACE_MM = 1e-3
+ONE_PLACE_MM = 1e-3  # spread of camera centres below which all count as one point
 LEAST_SPREAD_MM = 20.0  # of the camera centres; a rig of two metres whose file is in metres has 2
-LENS_GROWTH_LEAST, LENS_GROWTH_MOST = 0.4, 1.5  # distorted by undistorted radius: 0.6 at 100 degrees of a barrel lens
-LENS_LOST_MOST = 0.1  # share of the picture's middle that no ray meets
+LENS_GROWTH_LEAST, LENS_GROWTH_MOST = 0.4, 1.5  # distorted / undistorted radius: 0.6 for a barrel lens of 100 degrees
+LENS_LOST_MOST = 0.1  # share of the picture's middle that the lens model maps no ray to
 MIDDLE = (
     0.6  # of width and height: where boards are shown and subjects stand; beyond it a good calibration may fold over
 )
 FOCAL_LEAST = 0.15  # of the picture's width; 0.26 is a fisheye of 220 degrees, a pinhole of 0.15 sees 147
 FRAME_LEAST_MM = 100.0  # longer side of what the pictures show where the cameras look: half a head
-FRAME_USUAL_MM = 600.0  # of the studio's arrangements: 556 to 559
-FRAME_MOST_MM = 10_000.0  # and of the spread, since axes that hardly converge meet anywhere: a head is 2% of the side
-UNIT_MOST = 1_000_000  # nanometres; beyond, it is no unit
+FRAME_USUAL_MM = 600.0  # the simulated studio's arrangements have 556 to 559
+FRAME_MOST_MM = 10_000.0  # a head is 2 % of the side then; for the spread too, since nearly parallel axes meet anywhere
+UNIT_MOST = 1_000_000  # units per millimetre (nanometres); a larger factor is no unit
 UNITS = {10: compose("centimetres"), 25.4: compose("inches"), 100: compose("decimetres"), 1000: compose("metres")}
-UNIT_FRAME_MOST_MM = 2500.0  # in a unit that is guessed: a head has a twelfth of the picture then
-FOCAL_LEAST_PX = 10.0  # smaller ones are shares of the picture's size, and so are their principal points
-CORNER_PX = 1.0  # a principal point that nobody gave is 0, or half a pixel off it
-OTHER_SIZE, SIZE_SPREAD = (
-    0.4,
-    0.2,
-)  # logarithm of a size's share, and how far cameras' principal points scatter about it
+UNIT_FRAME_MOST_MM = 2500.0  # limit for a guessed unit: a head fills a twelfth of the picture then
+FOCAL_LEAST_PX = 10.0  # smaller focal lengths, and their principal points, are shares of the picture's size
+CORNER_PX = 1.0  # a principal point that was left out is 0, or half a pixel from it
+OTHER_SIZE = 0.4  # logarithm of the ratio of sizes, from which on it is a fault
+SIZE_SPREAD = 0.2  # relative scatter of the cameras' ratios, up to which they count as one
 GRID = (9, 7)
-CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras that have the common point in their picture
+CONVERGING_LEAST, DIVERGING_MOST = 0.9, 0.5  # share of cameras whose picture contains the common point
 
 
 def rig_faults(rig: Rig, *, any_unit: bool = False) -> list[Message]:
-    """Returns faults of the cameras alone: lenses that map no picture, poses in another convention or unit, no base
-    line. ``any_unit``: a known length beside them will tell the unit."""
+    """Returns the faults of a rig that its cameras alone show: impossible lenses, poses in another convention or unit,
+    and cameras at one place.
+
+    ``any_unit`` skips the check of the unit, because a known length (scale.json) will give it."""
     of_all = _principal_point_faults(rig)
-    if of_all:  # what else such intrinsics look like is said of none
+    if of_all:  # other faults would only follow from this one
         return of_all
     faults = [fault for camera in rig if (fault := _lens_fault(camera))]
     convention = _convention_fault(rig)
@@ -54,7 +54,8 @@ def _lens_fault(camera: Camera) -> Message | None:
     with np.errstate(all="ignore"):
         straight, distorted = _through_lens(camera)
         radius = np.linalg.norm(straight, axis=1)
-        growth = (np.sum(distorted * straight, axis=1) / radius**2)[radius > 1e-6]  # negative: turned inside out
+        # Negative where the lens turns the picture inside out.
+        growth = (np.sum(distorted * straight, axis=1) / radius**2)[radius > 1e-6]
     lost = float(np.mean(~np.isfinite(radius)))
     if lost <= LENS_LOST_MOST and (growth > LENS_GROWTH_LEAST).all() and (growth < LENS_GROWTH_MOST).all():
         return None
@@ -64,12 +65,17 @@ def _lens_fault(camera: Camera) -> Message | None:
 
 
 def _principal_point_faults(rig: Rig) -> list[Message]:
-    """Principal points that lie off the middle by one factor in all cameras, across and down: those of pictures of
-    another size, or none at all. A crop moves them by pixels, and a shifted lens one way."""
+    """Returns a fault if the intrinsics belong to pictures of another size, are shares of the size, or lack principal
+    points.
+
+    For pictures of another size all principal points are off the middle by the same factor, across and down. A crop
+    shifts them by pixels instead, and a shifted lens in one direction."""
     sizes = np.array([(camera.intrinsics.width, camera.intrinsics.height) for camera in rig], float)
     points = np.array([(camera.intrinsics.cx, camera.intrinsics.cy) for camera in rig])
     focal = np.array([(camera.intrinsics.fx, camera.intrinsics.fy) for camera in rig])
-    if (np.abs(points) <= CORNER_PX).all() and (focal > FOCAL_LEAST_PX).all():  # else shares of the picture's size
+    if (np.abs(points) <= CORNER_PX).all() and (
+        focal > FOCAL_LEAST_PX
+    ).all():  # smaller focal lengths: see intrinsics-are-shares
         return [compose("principal-points-missing")]
     if (focal < FOCAL_LEAST_PX).all() and (points > 0.0).all() and (points < 1.0).all():
         return [compose("intrinsics-are-shares")]
@@ -77,15 +83,16 @@ def _principal_point_faults(rig: Rig) -> list[Message]:
     share = float(np.median(shares))
     if share <= 0.0 or abs(np.log(share)) < OTHER_SIZE or np.abs(shares / share - 1.0).max() > SIZE_SPREAD:
         return []
-    told_share = float(f"{share:.2g}")  # principal points are not exactly in the middle
-    return [compose("intrinsics-of-other-size", share=told_share, factor=1.0 / told_share)]
+    rounded_share = float(f"{share:.2g}")  # principal points are not exactly in the middle
+    return [compose("intrinsics-of-other-size", share=rounded_share, factor=1.0 / rounded_share)]
 
 
 def _through_lens(camera: Camera) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """``X / Z, Y / Z`` without and with the lens, over the middle of the picture; NaN where no ray meets it.
+    """Returns ``X / Z, Y / Z`` without and with the lens, for a grid over the middle of the picture; NaN where no ray
+    meets a pixel.
 
-    A recorded lens is asked over the middle of the pinhole's picture, for which its own is read: what a fisheye saw
-    beyond has no place there, and says nothing against it."""
+    For a recorded lens the grid covers the pinhole's picture. What a fisheye recorded outside of it is never used, so
+    that its model need not be right there."""
     k = camera.intrinsics
     edge = 0.5 * (1.0 - MIDDLE)
     sides = zip((k.width, k.height), GRID, strict=True)
@@ -123,7 +130,8 @@ def _spread_faults(rig: Rig) -> list[Message]:
 
 
 def _unit_fault(frame: float) -> Message:
-    """The unit that makes a head fit into the pictures; two that do are both named, for only the file's owner knows."""
+    """Returns a fault that names the unit in which a head would fit into the pictures. If two units fit both are named,
+    since only the file's author knows."""
     fitting = [unit for unit in UNITS if FRAME_LEAST_MM <= frame * unit <= UNIT_FRAME_MOST_MM]
     usual = sorted(fitting, key=lambda unit: abs(np.log(frame * unit / FRAME_USUAL_MM)))
     if len(usual) < 2:
@@ -141,8 +149,8 @@ def _unit_fault(frame: float) -> Message:
 
 
 def frame_mm(rig: Rig) -> float:
-    """Returns what the pictures' longer side shows at the point nearest to all optical axes: the median over the
-    cameras."""
+    """Returns how much (mm) the longer side of a picture shows at the point nearest to all optical axes: the median of
+    the cameras."""
     sides = []
     for camera in rig:
         k, distance = camera.intrinsics, float(np.linalg.norm(camera.centre_world - rig.centre_world()))
@@ -151,7 +159,8 @@ def frame_mm(rig: Rig) -> float:
 
 
 def _convention_fault(rig: Rig) -> Message | None:
-    """Poses that look at no common point as they are written, and all at one when read in another convention."""
+    """Returns a fault if the cameras look at no common point, but would if their poses were read in another
+    convention."""
     if _share_looking_at_one_point(rig) > DIVERGING_MOST:
         return None
     fitting = [
@@ -163,13 +172,14 @@ def _convention_fault(rig: Rig) -> Message | None:
         return None
     (held, remedy), *others = fitting
     fault = compose("pose-convention", held=held, remedy=remedy)
-    for other, its_remedy in others[:1]:  # y up and z backwards looks like translations of the wrong sign
-        fault = compose("pose-convention-or", fault=fault, held=other, remedy=its_remedy)
+    for other, other_remedy in others[:1]:  # y up and z backwards looks like translations of the wrong sign
+        fault = compose("pose-convention-or", fault=fault, held=other, remedy=other_remedy)
     return fault
 
 
 def alternative_conventions(rig: Rig) -> list[tuple[Message, Rig, Message]]:
-    """Reads the poses in other conventions. Returns what each would hold, the rig so read, and the remedy."""
+    """Reads the poses in other conventions. Returns for each a description of what the poses would be, the rig, and the
+    remedy."""
     return [
         (other, Rig(tuple(replace(c, camera_from_world=read(c.camera_from_world)) for c in rig)), remedy)
         for other, (read, remedy) in _CONVENTIONS.items()
@@ -177,7 +187,7 @@ def alternative_conventions(rig: Rig) -> list[tuple[Message, Rig, Message]]:
 
 
 def _share_looking_at_one_point(rig: Rig) -> float:
-    """Share of the cameras that have the point nearest to all optical axes in their picture."""
+    """Returns the share of the cameras whose picture contains the point nearest to all optical axes."""
     point: Float[np.ndarray, "1 3"] = rig.centre_world()[None]
     seen = 0
     for camera in rig:

@@ -1,4 +1,4 @@
-"""How long work tells how far it is."""
+"""Defines how long-running work reports its progress."""
 
 from collections.abc import Callable
 
@@ -8,4 +8,4 @@ Progress = Callable[[str, float], None]
 
 
 def discard_progress(stage: str, fraction: float) -> None:
-    """Does nothing: the progress of work that nobody waits for."""
+    """Does nothing. It receives the progress of work that nobody watches."""

@@ -1,13 +1,12 @@
-"""Lenses that Brown-Conrady cannot hold: their pictures are undistorted as they are read.
+"""Models lenses that Brown-Conrady cannot represent; their pictures are undistorted when they are read.
 
 A camera with such a lens is a pinhole everywhere in the program (``Camera.intrinsics`` has no distortion), and its
-``recorded`` says with which lens the files were taken. Both share focal lengths, principal point and size, so that the
-middle of the picture keeps its resolution; what a fisheye saw beyond the pinhole's frame is left out.
+``recorded`` is the lens with which the files were taken. Both share focal lengths, principal point and size, so that
+the middle of the picture keeps its resolution. What a fisheye recorded outside the pinhole's frame is dropped.
 
 Kannala-Brandt: ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`` with ``theta`` the angle to
-the axis (https://docs.opencv.org/4.x/db/d58/group__calib3d__fisheye.html); rational: OpenCV's eight coefficients
-k1 k2 p1 p2 k3 k4 k5 k6, the radial factor a quotient (https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html).
-"""
+the axis (https://docs.opencv.org/4.x/db/d58/group__calib3d__fisheye.html). Rational: OpenCV's eight coefficients k1 k2
+p1 p2 k3 k4 k5 k6, with a quotient as radial factor (https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html)."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,18 +20,19 @@ COEFFICIENTS: dict[LensModel, tuple[str, ...]] = {
     "kannala-brandt": ("k1", "k2", "k3", "k4"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-ROUNDS, EXACT = 100, 1e-12  # of the inverse of either polynomial: far below what a pixel can show
+ROUNDS, EXACT = 100, 1e-12  # iterations and tolerance of the inverse of either polynomial, far below a visible error
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedLens:
-    """``coefficients``: those of ``COEFFICIENTS[model]``, in that order."""
+    """Holds a lens model and its coefficients, in the order of ``COEFFICIENTS[model]``."""
 
     model: LensModel
     coefficients: tuple[float, ...]
 
     def distorted(self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 2"]:
-        """Returns where a pinhole's ``pixels`` lie in the recorded picture, both with the camera matrix ``matrix``."""
+        """Returns where the pinhole's ``pixels`` lie in the recorded picture. ``matrix`` is the camera matrix of
+        both."""
         import cv2  # here and below: 0.1 s that most starts do without
 
         rays = np.ones((len(pixels), 3))
@@ -47,7 +47,8 @@ class RecordedLens:
     def undistorted(
         self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "n 2"]:
-        """Returns where a recorded picture's ``pixels`` lie in the pinhole's picture."""
+        """Returns where the recorded picture's ``pixels`` lie in the pinhole's picture. ``matrix`` is the camera matrix
+        of both."""
         import cv2
 
         lens, places = np.array(self.coefficients), pixels.reshape(1, -1, 2)
@@ -61,10 +62,10 @@ class RecordedLens:
     def undistort(
         self, picture: Shaped[np.ndarray, "h w ..."], matrix: Float[np.ndarray, "3 3"], *, smooth: bool = True
     ) -> Shaped[np.ndarray, "h w ..."]:
-        """Returns the picture that a pinhole with ``matrix`` would have taken; ``smooth`` interpolates (not for masks).
+        """Returns the picture that a pinhole with camera matrix ``matrix`` would have taken. ``smooth`` interpolates;
+        masks with hard edges need False.
 
-        Pixels that the recorded picture does not hold are black, in a photograph and in its clean plate alike.
-        """
+        Pixels outside the recorded picture are black, in a photograph and in its clean plate alike."""
         import cv2
 
         across, down = _maps(self, (picture.shape[1], picture.shape[0]), tuple(matrix.ravel().tolist()))

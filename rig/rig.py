@@ -1,4 +1,4 @@
-"""A rig: named calibrated cameras."""
+"""Defines a rig: calibrated cameras with names."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from rig.messages.message import compose
 
 
 class UnknownCamera(EigenheadError, KeyError):
-    """Refuses a name that no camera of the rig has."""
+    """Refuses a name that no camera of the rig has. It is a KeyError too."""
 
     def __init__(self, name: str, names: tuple[str, ...]) -> None:
         known = compose("rig-cameras", cameras=names) if names else compose("rig-empty")
@@ -35,11 +35,7 @@ class Rig:
         return iter(self.cameras)
 
     def __getitem__(self, name: str) -> Camera:
-        """Returns the camera of that name.
-
-        Raises:
-            UnknownCamera: no camera has it.
-        """
+        """Returns the camera of that name. Raises UnknownCamera if there is none."""
         for camera in self.cameras:
             if camera.name == name:
                 return camera
@@ -50,17 +46,20 @@ class Rig:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Returns the cameras' names, in the order of their file."""
         return tuple(camera.name for camera in self.cameras)
 
     def subset(self, names: Iterable[str]) -> "Rig":
+        """Returns the rig of the named cameras only, in the rig's order."""
         kept = set(names)
         return Rig(tuple(camera for camera in self.cameras if camera.name in kept))
 
     def scaled(self, factor: float) -> "Rig":
+        """Returns the rig for images scaled by ``factor``."""
         return Rig(tuple(replace(camera, intrinsics=camera.intrinsics.scaled(factor)) for camera in self.cameras))
 
     def centre_world(self) -> Float[np.ndarray, " 3"]:
-        """Returns the point nearest to all optical axes (least squares): where the subject is meant to be."""
+        """Returns the point (mm) nearest to all optical axes by least squares, near which the subject should be."""
         normal, right = np.zeros((3, 3)), np.zeros(3)
         for camera in self.cameras:
             off_axis = np.eye(3) - np.outer(camera.axis_world, camera.axis_world)
@@ -69,7 +68,7 @@ class Rig:
         return np.linalg.solve(normal + 1e-9 * np.eye(3), right)
 
     def front_camera(self) -> str:
-        """Returns the camera in the middle of the fan: the one whose direction is nearest to the mean of all
+        """Returns the name of the camera in the middle of the rig: that whose direction is nearest to the mean of all
         directions."""
         directions = np.stack([camera.centre_world for camera in self.cameras]) - self.centre_world()
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)

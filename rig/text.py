@@ -1,11 +1,11 @@
-"""What a text from outside must be before it is stored or sent on, and what a mistyped word may have meant."""
+"""Checks and escapes text from outside before it is stored or sent, and suggests words for mistyped ones."""
 
 import difflib
 from collections.abc import Iterable
 
 
 def is_encodable(text: str) -> bool:
-    """Tells whether a text can be written as UTF-8: an escape of JSON can name half of a character, which cannot."""
+    """Tells whether a text can be written as UTF-8. JSON's escapes can state half of a surrogate pair, which cannot."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -14,18 +14,18 @@ def is_encodable(text: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """Returns the text with what cannot be written as UTF-8 escaped, so that a message can quote it."""
+    """Returns the text with characters that UTF-8 cannot encode escaped, so that a message can quote it."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def suggest(word: str, known: Iterable[str], *, most: int = 1, min_likeness: float = 0.6) -> list[str]:
-    """Returns the known words that somebody who wrote ``word`` may have meant, the nearest first.
+    """Returns the known words that may have been meant by a mistyped one, the most similar first.
 
     Args:
-        word: what was written.
-        known: what there is.
-        most: words returned at most.
-        min_likeness: share of letters, 0 to 1, that both have in the same order (difflib's ratio); 0.6 lets two wrong
-            letters of five pass.
+        word: the word as it was written.
+        known: all valid words.
+        most: how many words are returned at most.
+        min_likeness: share of letters, 0 to 1, that both have in the same order (difflib's ratio); 0.6 allows two wrong
+            letters of five.
     """
     return difflib.get_close_matches(word, list(known), n=most, cutoff=min_likeness)

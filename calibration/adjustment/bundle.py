@@ -1,12 +1,11 @@
-"""One robust bundle adjustment over everything: intrinsics with distortion, camera poses, board poses.
+"""Adjusts everything at once, robustly: intrinsics with distortion, camera poses, board poses.
 
-The project's Levenberg-Marquardt on blocks of the normal equations (``corner_term``); with eleven cameras and thirty
-shots they have 339 unknowns, which a dense Cholesky factor solves in ten milliseconds: sparse machinery would only cost
-(docs/lab-notes/calibration.md has the times beside scipy's and Ceres's).
+It uses the project's Levenberg-Marquardt on blocks of the normal equations (``corner_term``). Eleven cameras and thirty
+shots have 339 unknowns, which a dense Cholesky factor solves in ten milliseconds, so sparse methods would bring nothing
+(docs/lab-notes/calibration.md compares the times with scipy's and Ceres's).
 
-Cost: ``sum rho(|r|^2 / sigma_c^2) + priors``, rho Cauchy's while outliers are sought and Huber's at the end, sigma_c
-each camera's own noise.
-"""
+Cost: ``sum rho(|r|^2 / sigma_c^2) + priors``. rho is Cauchy's while outliers are sought and Huber's at the end; sigma_c
+is each camera's own noise."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,15 +29,16 @@ from pipeline.estimation.levenberg_marquardt import Evidence, Limits, minimise
 from pipeline.estimation.robust import Cauchy, Huber, LeastSquares, Loss
 from pipeline.estimation.terms import Problem
 
-CAUCHY = Cauchy(2.0)  # in sigma: while outliers are sought
-HUBER = Huber(2.0)  # in sigma: 95 % of a Gaussian's 2D residuals are left as they are
-TOLERANCE = 1e-5  # predicted fall, in squared standard deviations, below which the solution stands
+CAUCHY = Cauchy(2.0)  # scale in standard deviations; used while outliers are sought
+HUBER = Huber(2.0)  # scale in standard deviations; leaves 86 % of a Gaussian's 2D residuals unchanged
+TOLERANCE = 1e-5  # predicted fall of the cost, in squared standard deviations, at which the adjustment ends
 STEPS_MOST = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """Holds which kinds of parameters move. The pose of the first camera never does, since it fixes the world."""
+    """Selects which kinds of parameters the adjustment changes. The pose of the first camera is always fixed, since it
+    defines the world frame."""
 
     intrinsics: bool = True
     poses: bool = True
@@ -48,7 +48,8 @@ class Free:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution:
-    """Holds the state in which the adjustment ended, and its normal matrix."""
+    """Holds the state in which the adjustment ended, and the normal matrix there. ``free`` marks the parameters that it
+    changed."""
 
     state: BundleState
     normal: Float[np.ndarray, "p p"]  # of the free parameters, at the solution, residuals in sigmas
@@ -57,11 +58,12 @@ class BundleSolution:
 
     @property
     def cost(self) -> float:
+        """Returns the cost at the solution."""
         return self.evidence.cost
 
     def covariance(self) -> Float[np.ndarray, "q q"]:
-        """Returns the covariance of all parameters: cameras (intrinsics, pose) first, then boards, then offsets; zero
-        for parameters that were fixed."""
+        """Returns the covariance of all parameters: first the cameras (intrinsics, pose), then boards, then time
+        offsets. It is zero for fixed parameters."""
         full = np.zeros((len(self.free), len(self.free)))
         # Scaled to a unit diagonal first: parameters span from 1e-4 (distortion) to 1e3 (mm).
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self.normal), 1e-12))
@@ -69,7 +71,7 @@ class BundleSolution:
         try:
             lower = cholesky.factor(scaled)
         except cholesky.NotPositiveDefinite:
-            lower = cholesky.factor(scaled + 1e-9 * eye)  # what is not determined gets a variance beyond any use
+            lower = cholesky.factor(scaled + 1e-9 * eye)  # gives undetermined parameters a huge variance
         inverse = cholesky.solve(lower, eye) * np.outer(scale, scale)
         full[np.ix_(self.free, self.free)] = 0.5 * (inverse + inverse.T)
         return full
@@ -78,12 +80,12 @@ class BundleSolution:
 def corner_sigma(
     state: BundleState, seen: Observations, lens_noise: Float[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " c"], float]:
-    """Estimates the noise (px) of each camera's corners within the rig, and the part of it that all cameras share.
+    """Estimates the noise (px) of each camera's corners in the joint solution, and the part of it that all cameras
+    share.
 
-    A camera's own noise is known from its lens. What the joint fit leaves beyond it comes from moments that differ or a
-    board that bends. It is one variance for all cameras: with one for each, the fit could call a camera bad and follow
-    the others exactly.
-    """
+    The noise of each camera alone is known from ``lens_noise``. What the joint solution has beyond it comes from
+    cameras that were not exactly simultaneous, or from a board that bends. That part is one variance for all cameras:
+    with one for each, the fit could call one camera noisy and follow the others exactly."""
     squares = (residuals(state, seen) ** 2).sum(axis=1)
     typical = float(np.median(squares)) / 1.1774**2
     shared = max(0.0, typical - float(np.median(lens_noise[seen.camera[seen.view_of]] ** 2)))
@@ -104,10 +106,14 @@ def solve(
     """Minimises the cost of the bundle adjustment, starting from ``state``.
 
     Args:
+        state: where to start.
+        seen: the corners of all views.
+        prior: of the intrinsics.
         sigma: noise of a corner's coordinate by camera, px.
-        free: which parameters move; all but the time offsets by default.
-        loss: of |r|^2 / sigma^2; least squares by default.
-        tick: called before every step; what it raises ends the adjustment.
+        free: which parameters change; by default all but the time offsets.
+        loss: robust loss of |r|^2 / sigma^2; least squares by default.
+        steps: how many steps are taken at most.
+        tick: called before every step; an exception that it raises ends the adjustment.
     """
     problem = bundle_problem(state, CornerTerm(seen, sigma, loss or LeastSquares()), prior, free or Free())
     limits = Limits(steps=steps, tolerance=TOLERANCE, tries=6, first_damping=1e-4)
@@ -117,13 +123,13 @@ def solve(
 
 
 def bundle_problem(state: BundleState, corners: CornerTerm, prior: LensPrior, free: Free) -> Problem[BundleState]:
-    """Builds the complete problem: corners, lens priors, square pixels, and which parameters move."""
+    """Builds the complete problem: corners, priors of the lenses, square pixels, and which parameters change."""
     mask = free_mask(state, free)
     return Problem((corners, prior, AspectTerm()), len(mask), moved_state, mask)
 
 
 def free_mask(state: BundleState, free: Free) -> Bool[np.ndarray, " q"]:
-    """Returns a mask of the parameters that move."""
+    """Returns a mask over all parameters, True for those that change."""
     cameras, shots = len(state.intrinsics), len(state.board_rotations)
     per_camera = np.zeros((cameras, PER_CAMERA), dtype=bool)
     per_camera[:, : len(INTRINSICS)] = free.intrinsics

@@ -1,9 +1,8 @@
-"""Symmetric positive definite systems of a few hundred unknowns, on one thread.
+"""Solves symmetric positive definite systems of a few hundred unknowns on one thread.
 
-LAPACK's threaded Cholesky is faster on an idle machine (2 against 12 ms for 345 unknowns), but where other work holds
-the cores its threads wait for each other: 600 ms were measured for the same matrix on two busy cores. A calibration
-solves some hundred such systems beside a service that works, so steadiness wins.
-"""
+LAPACK's threaded Cholesky is faster on an idle machine (2 against 12 ms for 345 unknowns). But its threads wait for
+each other where other work occupies the cores: 600 ms were measured for the same matrix on two busy cores. A
+calibration solves some hundred such systems beside a running service, so the steady time is preferred."""
 
 import numpy as np
 from jaxtyping import Float

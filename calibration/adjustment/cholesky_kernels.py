@@ -1,4 +1,4 @@
-"""The compiled loops of Cholesky's factor and of the systems that it solves."""
+"""Contains the compiled loops of ``calibration.adjustment.cholesky``."""
 
 import numpy as np
 
@@ -7,6 +7,8 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True)
 def factor_lower(a: np.ndarray) -> bool:
+    """Replaces the lower triangle of ``a`` by its Cholesky factor; returns False if the matrix is not positive
+    definite."""
     n = a.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -24,6 +26,7 @@ def factor_lower(a: np.ndarray) -> bool:
 
 @njit(cache=True)
 def solve_lower(lower: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Replaces ``x`` by the solution of ``L L^T y = x``, with L the lower triangle ``lower``, and returns it."""
     n, m = x.shape
     for i in range(n):
         for k in range(i):

@@ -1,9 +1,10 @@
-"""The bundle's main term: corners of a board as cameras see them.
+"""Computes the bundle's main term: the reprojection errors of the board's corners.
 
     r = (pi(camera_from_world @ (world_from_board @ X)) - detected) / sigma_c
 
-sigma_c each camera's own noise, under a robust loss of |r|^2. A view (one camera, one shot) touches 15 camera and 6
-board parameters and a time offset, so that the equations are assembled from 22 x 22 blocks, one a view.
+sigma_c is each camera's own noise; a robust loss is applied to |r|^2. A view (one camera, one shot) depends on 15
+parameters of its camera, 6 of its board and one time offset, so the normal equations are assembled from blocks of
+22 x 22, one for each view.
 """
 
 from dataclasses import dataclass, field
@@ -28,14 +29,15 @@ from rig.geometry import cross_matrix
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CornerTerm:
-    """Computes the cost of all corners as a function of the state. ``sigma_px``: noise of a corner's coordinate, for
-    each camera."""
+    """Computes the cost of all corners as a function of the state. ``sigma_px`` is the noise of a corner's coordinate
+    in each camera."""
 
     seen: Observations
     sigma_px: Float[np.ndarray, " c"]
     loss: Loss = field(default_factory=LeastSquares)
 
     def at(self, state: BundleState) -> "LinearisedCornerTerm":
+        """Returns the term at a state."""
         noise = self.sigma_px[self.seen.camera[self.seen.view_of]]
         return LinearisedCornerTerm(self, state, residuals(state, self.seen) / noise[:, None], noise)
 
@@ -51,9 +53,11 @@ class LinearisedCornerTerm:
 
     @property
     def cost(self) -> float:
+        """Returns the sum of the robust loss over all corners."""
         return float(self.term.loss.cost((self.residual**2).sum(axis=1)).sum())
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the blocks of all views to the normal equations."""
         seen, cameras = self.term.seen, len(self.state.intrinsics)
         weight = np.sqrt(self.term.loss.weight((self.residual**2).sum(axis=1)))
         blocks = np.concatenate([self.by_view(), self.residual[:, :, None]], axis=2)
@@ -65,8 +69,8 @@ class LinearisedCornerTerm:
             equations.gradient[at] += product[:-1, -1]
 
     def by_view(self) -> Float[np.ndarray, "n 2 22"]:
-        """Returns the derivatives of each corner by the parameters of the view that it belongs to: camera (15), board
-        (6), time offset (1)."""
+        """Returns the derivatives of each corner by the 22 parameters of its view: camera (15), board (6), time offset
+        (1)."""
         state, seen = self.state, self.term.seen
         world, inside, camera = corner_positions(state, seen)
         behind = inside[:, 2] < DEPTH_LEAST_MM
@@ -82,7 +86,8 @@ class LinearisedCornerTerm:
         return rows
 
     def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
-        """Returns the derivatives of each corner by all parameters, mostly zeros: for tests and other solvers."""
+        """Returns the derivatives of each corner by all ``size`` parameters, mostly zeros; for tests and other
+        solvers."""
         seen, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
         for view, at in enumerate(places(seen, len(self.state.intrinsics), size)):
@@ -92,7 +97,7 @@ class LinearisedCornerTerm:
 
 
 def places(seen: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
-    """Returns, for each view, the indices of its parameters: those of its camera, its board, and its camera's time
+    """Returns, for each view, the indices of its 22 parameters: those of its camera, its board, and its camera's time
     offset."""
     of_camera = seen.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
     board = cameras * PER_CAMERA + seen.shot[:, None] * PER_SHOT + np.arange(PER_SHOT)

@@ -1,12 +1,11 @@
-"""What of a rig's poses can be seen: errors of cameras, once the free choice of the world frame is taken out.
+"""Computes errors of cameras without the part that no image can show: the free choice of the world frame.
 
-A rig moved as a whole is the same rig. Two calibrations are therefore compared, and covariances stated, in the gauge
-that makes the images of the subject's region move least: with ``W`` the (6 C x 6 C, block-diagonal) sum of ``J^T J``
-over points on a sphere of the subject's size, ``J`` the derivative of a pixel by a left perturbation of
-camera_from_world, and ``A`` the (6 C x 6) motions of all cameras under a motion of the world, the projection is
-``S = I - A (A^T W A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment: A Modern
-Synthesis", section 9).
-"""
+A rig moved as a whole is the same rig. So two calibrations are compared, and covariances stated, in the gauge in which
+the images of the subject's region move least. Let ``W`` (6 C x 6 C, block-diagonal) be the sum of ``J^T J`` over points
+on a sphere of the subject's size, with ``J`` the derivative of a pixel by a left perturbation of camera_from_world, and
+let ``A`` (6 C x 6) be the motions of all cameras under a motion of the world. Then the projection is ``S = I - A (A^T W
+A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment: A Modern Synthesis", section
+9)."""
 
 from dataclasses import replace
 
@@ -17,11 +16,12 @@ from rig.camera import Camera, lens_jacobians
 from rig.geometry import RigidTransform, cross_matrix, nearest_rotation, rotation_from_vector
 from rig.rig import Rig
 
-SUBJECT_RADIUS_MM = 110.0
+SUBJECT_RADIUS_MM = 110.0  # of a sphere as large as a head
 
 
 def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 60) -> Float[np.ndarray, "n 3"]:
-    """Returns points spread evenly over a sphere about the point the cameras look at (a Fibonacci lattice)."""
+    """Returns points (mm) spread evenly over a sphere about the point at which the cameras look (a Fibonacci
+    lattice)."""
     index = np.arange(count) + 0.5
     height, angle = 1 - 2 * index / count, np.pi * (1 + np.sqrt(5)) * index
     ring = np.sqrt(1 - height**2)
@@ -29,14 +29,14 @@ def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 
 
 
 def moved(camera: Camera, step: Float[np.ndarray, " 6"]) -> Camera:
-    """Returns the camera moved by a left perturbation of its pose (rotation rad, translation mm): x' = R(w) x + v in
-    the camera frame."""
+    """Returns the camera with its pose perturbed from the left by a rotation (rad) and a translation (mm): x' = R(w) x
+    + v in the camera's frame."""
     motion = RigidTransform(rotation_from_vector(step[:3]), step[3:])
     return replace(camera, camera_from_world=motion @ camera.camera_from_world)
 
 
 def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
-    """Returns the derivative of the points' pixels by a left perturbation of camera_from_world."""
+    """Returns the derivative of the points' pixels by a left perturbation of camera_from_world (px per rad and mm)."""
     _, by_world = camera.project_with_jacobian(points_world)
     by_camera = by_world @ camera.camera_from_world.rotation.T
     points = camera.camera_from_world.apply(points_world)
@@ -44,8 +44,8 @@ def pose_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Flo
 
 
 def image_metric(rig: Rig, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "c 6 6"]:
-    """Computes, for each camera, the mean squared image motion (px^2) of ``points_world`` as a quadratic form of the
-    pose perturbation."""
+    """Returns, for each camera, the matrix Q with which p^T Q p is the mean squared image motion (px^2) of
+    ``points_world`` under the pose perturbation p."""
     metrics = []
     for camera in rig:
         jacobian = pose_jacobian(camera, points_world)
@@ -71,7 +71,7 @@ def world_motions(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p g"]:
 
 
 def gauge_projection(rig: Rig, *, scale: bool = False) -> Float[np.ndarray, "p p"]:
-    """Returns the projection S of the module's docstring."""
+    """Returns the projection S that the module's docstring defines. With ``scale`` the world's scale is free too."""
     weights = _block_diagonal(image_metric(rig, subject_points(rig)))
     motions = world_motions(rig, scale=scale)
     normal = motions.T @ weights @ motions
@@ -86,11 +86,10 @@ def _block_diagonal(blocks: Float[np.ndarray, "c 6 6"]) -> Float[np.ndarray, "p 
 
 
 def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
-    """Returns ``rig`` with its world moved (and scaled, if asked) so that its cameras see the subject's region as those
-    of ``reference`` do.
+    """Returns ``rig`` with its world moved, and with ``scale`` also scaled, so that its cameras see the subject's
+    region as nearly as possible where those of ``reference`` see it.
 
-    The motion is found by Gauss-Newton on image distances, from the motion that brings the cameras' frames together.
-    """
+    Gauss-Newton minimises the distances in the images, starting from the mean motion between the cameras' frames."""
     aligned = _brought_together(rig, reference)
     points = subject_points(reference)
     target = np.concatenate([reference[camera.name].project(points) for camera in rig]).ravel()
@@ -108,8 +107,8 @@ def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
 
 
 def _shifted(rig: Rig, step: np.ndarray) -> Rig:
-    """Returns the rig with ``camera_from_world @ motion`` as poses and, if the step has a seventh entry, translations
-    scaled."""
+    """Returns the rig with poses ``camera_from_world @ motion``; a seventh entry of ``step`` scales the
+    translations."""
     motion = RigidTransform(rotation_from_vector(step[:3]), step[3:6])
     cameras = []
     for camera in rig:
@@ -121,7 +120,7 @@ def _shifted(rig: Rig, step: np.ndarray) -> Rig:
 
 
 def _brought_together(rig: Rig, reference: Rig) -> Rig:
-    """Returns the rig with its world moved by the mean motion that takes its cameras' frames to those of
+    """Returns the rig with its world moved by the mean of the motions that take its cameras' frames to those of
     ``reference``."""
     moves = [camera.camera_from_world.inverse() @ reference[camera.name].camera_from_world for camera in rig]
     rotation = nearest_rotation(np.sum([move.rotation for move in moves], axis=0))
@@ -132,9 +131,11 @@ def _brought_together(rig: Rig, reference: Rig) -> Rig:
 
 
 def image_distance(rig: Rig, reference: Rig, *, scale: bool = False) -> Float[np.ndarray, " c"]:
-    """Computes per camera the RMS distance in pixels between where ``rig`` and ``reference`` see the subject's region,
-    worlds aligned: the size of a calibration error as a fit to silhouettes meets it. Each rig projects with its own
-    lenses: a principal point and a rotation that make up for each other are no error."""
+    """Computes for each camera the RMS distance (px) between where ``rig`` and ``reference`` see the subject's region,
+    worlds aligned.
+
+    It measures a calibration error by its effect on a fit to silhouettes. Each rig projects with its own lenses, so
+    errors of principal point and rotation that cancel each other do not count."""
     points = subject_points(reference)
     aligned = align_world(rig, reference, scale=scale)
     misses = [camera.project(points) - reference[camera.name].project(points) for camera in aligned]
@@ -147,9 +148,11 @@ def intrinsics_jacobian(camera: Camera, points_world: Float[np.ndarray, "n 3"]) 
 
 
 def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "6 15"]:
-    """Returns the pose perturbation that acts on the subject's image like an error of intrinsics (first nine) and pose:
-    what a reader who takes the intrinsics for exact must allow the pose. A principal point 10 px off is almost a
-    turn."""
+    """Returns the matrix that converts an error of the intrinsics (first nine) and pose of a camera to the pose
+    perturbation with the most similar effect on the subject's image.
+
+    A reader who takes the intrinsics as exact must allow the pose that much error: a principal point that is 10 px off,
+    for example, acts almost like a rotation."""
     by_pose = pose_jacobian(camera, points_world).reshape(-1, 6)
     by_lens = intrinsics_jacobian(camera, points_world).reshape(-1, 9)
     good = np.isfinite(by_pose).all(axis=1) & np.isfinite(by_lens).all(axis=1)
@@ -158,9 +161,9 @@ def effective_pose(camera: Camera, points_world: Float[np.ndarray, "n 3"]) -> Fl
 
 
 def image_sigma(rig: Rig, covariance: Float[np.ndarray, "c 15 c 15"]) -> Float[np.ndarray, " c"]:
-    """Computes per camera the standard deviation in pixels (2D) with which it sees the subject's region, worlds
-    aligned, under the joint covariance of all intrinsics (first nine) and poses: what ``image_distance`` to the truth
-    will be."""
+    """Computes for each camera the standard deviation (px, 2D) of where it sees the subject's region, worlds aligned,
+    under the joint covariance of all intrinsics (first nine) and poses. It predicts ``image_distance`` to the true
+    rig."""
     points, count = subject_points(rig), len(rig)
     by_pose = [pose_jacobian(camera, points).reshape(-1, 6) for camera in rig]
     by_lens = [intrinsics_jacobian(camera, points).reshape(-1, 9) for camera in rig]

@@ -1,9 +1,9 @@
-"""Lenses: the intrinsics of each camera from its own views of the board, as a start and as a verdict.
+"""Estimates each camera's lens from its own views of the board, as a start for the bundle and as a check.
 
-Nothing here compares cameras, so shots need not be synchronised. The focal length starts from a scan (the board's pose
-follows from each candidate by IPPE: T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014);
-the bundle of ``bundle.py`` over the one camera finishes it, and its covariance says whether the views suffice.
-"""
+Cameras are not compared, so shots need not be synchronised. The focal length starts from a scan of candidates; for each
+the board's pose follows by IPPE (T. Collins, A. Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 2014). The
+bundle of ``bundle.py`` over the one camera completes the estimate, and its covariance tells whether the views
+suffice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,15 +30,15 @@ from rig.geometry import RigidTransform
 from rig.messages.message import Message, compose
 
 VIEWS_LEAST = 3  # two views of a plane determine fx, fy, cx, cy in theory; a third is the first check
-FOCAL_SHARE_MOST = 0.02  # a focal length looser than 2 % is called badly determined
-SCAN = np.geomspace(0.5, 4.5, 12)  # focal length / longer side of the image
-CORNER_SIGMA_LEAST = 0.02  # px: no detector is better, and a perfect fit must not become an infinite weight
+FOCAL_SHARE_MOST = 0.02  # relative standard deviation from which on a focal length counts as badly determined
+SCAN = np.geomspace(0.5, 4.5, 12)  # candidates of focal length / longer side of the image
+CORNER_SIGMA_LEAST = 0.02  # px; no detector is better, and a perfect fit must not get an infinite weight
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lens:
     """Holds one camera's lens, estimated from that camera alone. ``covariance`` is that of fx fy cx cy (px) k1 k2 p1 p2
-    k3."""
+    k3; ``poses`` are the board's poses by shot."""
 
     camera: str
     intrinsics: Intrinsics
@@ -51,11 +51,12 @@ class Lens:
 
     @property
     def sigma(self) -> Float[np.ndarray, " 9"]:
+        """Returns the standard deviations of fx fy cx cy (px) k1 k2 p1 p2 k3."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def weakness(self) -> Message | None:
-        """Returns why the views do not determine the lens well; None if they do."""
+        """Returns a message on why the views do not determine the lens well; None if they do."""
         if self.views < VIEWS_LEAST:
             return compose("lens-views-too-few", camera=self.camera, views=self.views, needed=VIEWS_LEAST)
         share = self.sigma[0] / self.intrinsics.fx
@@ -81,8 +82,8 @@ def estimate_lens(views: Sequence[View], size: tuple[int, int], board: Board) ->
     state = _start(views, size, board)
     prior, sigma = weak_prior([size]), np.array([1.0])
     solution = solve(state, seen, prior, sigma, loss=CAUCHY)
-    # Whole views that no pose explains (a misread grid) must not bend the lens: they are weighed down by Cauchy's rho,
-    # whose scale now becomes the camera's own noise.
+    # Whole views that no pose explains (a misread grid) must not bend the lens: Cauchy's rho downweights them, and its
+    # scale becomes the camera's own noise here.
     for _ in range(2):
         sigma = np.array([noise_of(residuals(solution.state, seen))])
         solution = solve(solution.state, seen, prior, sigma, loss=CAUCHY)
@@ -111,15 +112,15 @@ def _lens(
 
 
 def noise_of(misses: Float[np.ndarray, "n 2"]) -> float:
-    """Returns the robust standard deviation of one coordinate, px: the median of a 2D Gaussian's radius is 1.1774
-    sigma."""
+    """Returns the robust standard deviation (px) of one coordinate: the median length of the residuals over 1.1774,
+    that of a 2D Gaussian of unit variance."""
     if not len(misses):
         return 1.0
     return max(float(np.median(np.linalg.norm(misses, axis=1))) / 1.1774, CORNER_SIGMA_LEAST)
 
 
 def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> BundleState:
-    """Returns a first state: the focal length that fits best of several, the principal point in the middle, no
+    """Returns a first state: the best-fitting focal length of several, the principal point in the middle, no
     distortion, and board poses by IPPE."""
     width, height = size
     best: tuple[float, Intrinsics, list[RigidTransform]] | None = None
@@ -127,7 +128,7 @@ def _start(views: Sequence[View], size: tuple[int, int], board: Board) -> Bundle
         focal = share * max(size)
         intrinsics = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         fits = [board_poses_of(view.found, intrinsics, board)[0] for view in views]
-        # The mean of the roots: one bad view must not choose the focal length.
+        # Mean of square roots, so that one bad view does not decide the focal length.
         score = float(np.mean([np.sqrt(rms) for _, rms in fits]))
         if best is None or score < best[0]:
             best = (score, intrinsics, [pose for pose, _ in fits])
@@ -150,8 +151,8 @@ def single_state(intrinsics: Intrinsics, camera_from_boards: Sequence[RigidTrans
 
 
 def board_poses_of(found: Found, intrinsics: Intrinsics, board: Board) -> list[tuple[RigidTransform, float]]:
-    """Returns the possible camera_from_board, each with its RMS error (px), best first. The image of a plane fits up to
-    two poses."""
+    """Returns the possible poses camera_from_board of one view, each with its RMS error (px), best first. The image of
+    a plane has up to two."""
     points = board.corners()[found.ids]
     count, turns, shifts, errors = cv2.solvePnPGeneric(
         points, found.corners, intrinsics.matrix(), intrinsics.distortion.opencv(), flags=cv2.SOLVEPNP_IPPE

@@ -1,7 +1,6 @@
-"""What is known of lenses before, or beside, the corners: Gaussian priors of the intrinsics.
+"""Defines Gaussian priors of the intrinsics: what is known of lenses independently of the corners.
 
-The priors are weak; they only keep what the views do not determine where lenses are.
-"""
+The default priors are weak; they only hold parameters that the views do not determine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,21 +31,24 @@ class LensPrior:
         return LensPrior(np.linalg.solve(total, pull[:, :, None])[:, :, 0], total)
 
     def at(self, state: BundleState) -> "LinearisedLensPrior":
+        """Returns the prior at a state."""
         return LinearisedLensPrior(self, state.intrinsics - self.mean)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedLensPrior:
-    """Holds the prior at the distance ``away`` from its mean."""
+    """Holds the prior and the difference ``away`` of the present intrinsics from its mean."""
 
     prior: LensPrior
     away: Float[np.ndarray, "c 9"]
 
     @property
     def cost(self) -> float:
+        """Returns the squared Mahalanobis distance from the mean, summed over the cameras."""
         return float(np.einsum("ci,cij,cj->", self.away, self.prior.information, self.away))
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the prior to the normal equations."""
         for camera, (information, away) in enumerate(zip(self.prior.information, self.away, strict=True)):
             block = slice(camera * PER_CAMERA, camera * PER_CAMERA + len(INTRINSICS))
             equations.matrix[block, block] += information
@@ -54,25 +56,29 @@ class LinearisedLensPrior:
 
 
 class AspectTerm:
-    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` of each camera: pixels are nearly square."""
+    """Computes the residual ``2 (fx - fy) / (fx + fy) / ASPECT_PRIOR`` of each camera, since pixels are nearly
+    square."""
 
     def at(self, state: BundleState) -> "LinearisedAspectPrior":
+        """Returns the term at a state."""
         return LinearisedAspectPrior(*state.intrinsics[:, :2].T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedAspectPrior:
-    """Holds the focal lengths (px) of all cameras."""
+    """Holds the focal lengths (px) of all cameras at one state."""
 
     fx: Float[np.ndarray, " c"]
     fy: Float[np.ndarray, " c"]
 
     @property
     def residual(self) -> Float[np.ndarray, " c"]:
+        """Returns the residual of each camera, in standard deviations."""
         return 2.0 * (self.fx - self.fy) / (self.fx + self.fy) / ASPECT_PRIOR
 
     @property
     def cost(self) -> float:
+        """Returns the sum of squared residuals."""
         return float((self.residual**2).sum())
 
     def slopes(self) -> Float[np.ndarray, "c 2"]:
@@ -80,6 +86,7 @@ class LinearisedAspectPrior:
         return np.stack([4.0 * self.fy, -4.0 * self.fx], axis=1) / ((self.fx + self.fy)[:, None] ** 2 * ASPECT_PRIOR)
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the term to the normal equations."""
         for camera, (slope, residual) in enumerate(zip(self.slopes(), self.residual, strict=True)):
             block = slice(camera * PER_CAMERA, camera * PER_CAMERA + 2)
             equations.matrix[block, block] += np.outer(slope, slope)
@@ -87,7 +94,7 @@ class LinearisedAspectPrior:
 
 
 def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
-    """Returns wide priors that hold for any lens, from the image sizes alone."""
+    """Returns wide priors that hold for any lens; they depend on the image sizes alone."""
     mean, sigma = [], []
     for width, height in sizes:
         long = max(width, height)
@@ -99,5 +106,5 @@ def weak_prior(sizes: Sequence[tuple[int, int]]) -> LensPrior:
 
 
 def fixed_prior(intrinsics: Float[np.ndarray, "c 9"]) -> LensPrior:
-    """Returns a prior without information, for lenses that are held fixed by ``Free(intrinsics=False)``."""
+    """Returns a prior with zero information, for lenses that ``Free(intrinsics=False)`` keeps fixed."""
     return LensPrior(intrinsics, np.zeros((len(intrinsics), 9, 9)))

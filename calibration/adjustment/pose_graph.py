@@ -1,11 +1,10 @@
-"""The pose graph: where cameras and boards stand, before the bundle adjustment makes it precise.
+"""Estimates where cameras and boards stand (the pose graph), as a start for the bundle adjustment.
 
-Each view gives camera_from_board up to two doubts: a plane's image allows two poses (IPPE), and a checkerboard may be
-turned (``Board.turns``). Two cameras that share shots settle both: the relative pose must be the same in every shot, so
-each shot's candidates are tried on all others, and the one with most support wins. Pairs are joined by a maximum
-spanning tree. What cannot be settled is refused: a tie between turns, cameras that share no shot, a camera whose views
-agree with nobody (its pictures are mirrored, or its shots bear the wrong names).
-"""
+Each view gives camera_from_board with two ambiguities: the image of a plane allows two poses (IPPE), and a checkerboard
+may be turned (``Board.turns``). Two cameras that share shots resolve both, since their relative pose must be the same
+in every shot: each shot's candidates are tested on all other shots, and the one with the most support wins. Pairs are
+joined by a maximum spanning tree. What remains ambiguous is refused: a tie between turns, cameras that share no shot,
+and a camera whose views agree with no other's (its pictures are mirrored, or its shots are named wrongly)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -23,16 +22,17 @@ from rig.errors import EigenheadError
 from rig.geometry import RigidTransform, rigid_fit
 from rig.messages.message import Message, compose
 
-# Distances below are in squares of the board, seen by the camera. Depth from a single view is good to a percent of the
+# Distances below are in squares of the board as the camera sees it. A single view gives depth to one percent of the
 # camera's distance, half a square of a usual board; a turned or mirrored board is off by its whole length.
 AGREE_SQUARES = 1.0
 SECOND_POSE_RATIO = 3.0  # the second pose of IPPE counts if its residual is within this factor of the first's
-CANDIDATES_MOST = 60
-SAME_DEG = 15.0  # candidates closer than this are one hypothesis
+CANDIDATES_MOST = 60  # relative poses tested for a pair of cameras
+SAME_DEG = 15.0  # candidates whose rotations differ by less are one hypothesis
 
 
 class PoseGraphError(EigenheadError):
-    """Reports that the views do not determine how the cameras stand to each other. ``reasons`` names the cameras."""
+    """Reports that the views do not determine how the cameras stand to each other. ``reasons`` are messages that name
+    the cameras."""
 
     def __init__(self, reasons: Iterable[Message]) -> None:
         self.reasons = tuple(reasons)
@@ -41,8 +41,8 @@ class PoseGraphError(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Holds the possible camera_from_board of one view: each pose with each turn of the board. ``turns`` index
-    Board.turns()."""
+    """Holds the possible camera_from_board of one view: each pose with each turn of the board. ``turns`` are indices
+    into ``Board.turns()``."""
 
     poses: tuple[RigidTransform, ...]
     turns: tuple[int, ...]
@@ -50,8 +50,10 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """Holds the relative pose of two cameras with shots in common: the best a_from_b, in how many shots it holds
-    (``support``), and whether another pose holds equally well."""
+    """Holds the relative pose of two cameras with common shots.
+
+    ``a_from_b`` is the best candidate, ``support`` the number of the ``shared`` shots in which it holds; ``ambiguous``
+    tells that another pose holds equally well."""
 
     a: str
     b: str
@@ -62,13 +64,14 @@ class Edge:
 
     @property
     def consistent(self) -> bool:
+        """Tells whether the relative pose holds in at least half of the shared shots."""
         return self.support >= max(1, self.shared / 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
-    """Holds all cameras in the frame of ``names[0]`` and the placed boards; the boards' turns are applied to ``views``,
-    and ``strays`` are views that fit nowhere."""
+    """Holds all cameras and boards in the frame of ``names[0]``. The boards' turns are applied to ``views`` already;
+    ``strays`` are views that fit in no turn."""
 
     names: tuple[str, ...]
     shots: tuple[str, ...]
@@ -79,6 +82,8 @@ class Graph:
     edges: tuple[Edge, ...]
 
     def state(self, lenses: dict[str, Lens]) -> BundleState:
+        """Returns the graph as the start of a bundle adjustment, with the intrinsics of ``lenses`` and no time
+        offsets."""
         return BundleState(
             np.stack([lenses[name].intrinsics.values() for name in self.names]),
             np.stack([self.cameras[name].rotation for name in self.names]),
@@ -91,8 +96,8 @@ class Graph:
 
 
 def build_graph(detections: Detections, lenses: dict[str, Lens]) -> Graph:
-    """Places all cameras and boards in one frame. Raises PoseGraphError if the shared views do not connect the
-    cameras."""
+    """Estimates the poses of all cameras and boards in one frame. Raises PoseGraphError if the shared views do not
+    connect all cameras."""
     board = detections.board
     names = tuple(name for name in detections.sizes if name in lenses)
     options = {(v.camera, v.shot): _candidates(v, lenses[v.camera], board) for v in detections.views}
@@ -119,7 +124,7 @@ def _candidates(view: View, lens: Lens, board: Board) -> Candidates:
 
 
 def _turn_motions(board: Board) -> list[RigidTransform]:
-    """The motions of the board that take corner i to corner turn[i]."""
+    """Returns the motions of the board that take corner i to corner turn[i], one for each turn."""
     corners = board.corners()
     return [rigid_fit(corners, corners[turn]) for turn in board.turns()]
 
@@ -130,7 +135,7 @@ def _edge(a: str, b: str, options: dict[tuple[str, str], Candidates], board: Boa
     )
     if not shots:
         return None
-    # Turning both boards alike changes nothing: b is taken as it stands, all turns are tried on a.
+    # Turning both boards alike changes nothing, so turns are tried on a only.
     of_a = [options[a, shot].poses for shot in shots]
     of_b = [
         [p for p, t in zip(options[b, shot].poses, options[b, shot].turns, strict=True) if t == 0] for shot in shots
@@ -152,7 +157,8 @@ def _disagreement(
     of_b: Sequence[Sequence[RigidTransform]],
     board: Board,
 ) -> Float[np.ndarray, " s"]:
-    """Per shot, the smallest distance between the board that a sees and the one that b's poses put before it."""
+    """Returns for each shot the smallest distance (squares) between the board as a sees it and as b sees it, in the
+    frame of a."""
     corners = _outline(board)
     values = []
     for poses_a, poses_b in zip(of_a, of_b, strict=True):
@@ -165,7 +171,8 @@ def _disagreement(
 def _squares_apart(
     seen: Float[np.ndarray, "*k n 3"], put: Float[np.ndarray, "*j n 3"], board: Board
 ) -> Float[np.ndarray, "*b"]:
-    """Distance in the image, in sides of a square as the camera sees it; large where ``put`` is behind the camera."""
+    """Returns the distance in the image, in sides of a square as the camera sees it; large where ``put`` is behind the
+    camera."""
     depth = seen[..., 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.linalg.norm(seen[..., :2] / depth - put[..., :2] / put[..., 2:], axis=-1) * depth[..., 0]
@@ -184,8 +191,8 @@ def _angle_deg(first: Float[np.ndarray, "3 3"], second: Float[np.ndarray, "3 3"]
 
 
 def _span(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, RigidTransform]:
-    """camera_from_world of all cameras that a maximum spanning tree reaches from ``names[0]`` (Prim), whose frame the
-    world is."""
+    """Returns camera_from_world of all cameras that a maximum spanning tree reaches from ``names[0]`` (Prim's
+    algorithm); the frame of ``names[0]`` is the world."""
     placed = {names[0]: RigidTransform.identity()}
     while True:
         border = [edge for edge in edges if (edge.a in placed) != (edge.b in placed)]
@@ -204,7 +211,7 @@ def _place_boards(
     options: dict[tuple[str, str], Candidates],
     board: Board,
 ) -> tuple[dict[str, RigidTransform], list[View], list[View]]:
-    """world_from_board per shot, the views with the turn that fits it, and the views that fit it in no turn."""
+    """Returns world_from_board by shot, the views with the fitting turn applied, and the views that fit in no turn."""
     boards: dict[str, RigidTransform] = {}
     kept, strays = [], []
     corners, turns = _outline(board), board.turns()
@@ -230,7 +237,7 @@ def _fits(
     corners: np.ndarray,
     board: Board,
 ) -> list[tuple[float, int]]:
-    """Per view: distance to the board so placed in the best turn, and that turn."""
+    """Returns for each view the distance (squares) of the board so placed in its best turn, and that turn."""
     table = []
     for view in views:
         option = options[view.camera, view.shot]
@@ -255,7 +262,7 @@ def _reasons(
     edges: Sequence[Edge],
     options: dict[tuple[str, str], Candidates],
 ) -> list[Message]:
-    """One sentence per group of cameras that does not join the largest."""
+    """Returns one message for each group of cameras that is not connected with the largest."""
     good = [edge for edge in edges if edge.consistent and not edge.ambiguous]
     groups: list[set[str]] = []
     for name in names:
@@ -307,7 +314,8 @@ def _fits_when_mirrored(
 
 
 def _mirror(found: Found, board: Board, width: int) -> Found:
-    """The find in the picture turned over left to right, in an order that keeps the board's colours."""
+    """Returns the detection in the picture mirrored left to right, with its corners in an order that keeps the board's
+    colours."""
     columns, rows = board.grid
     index = np.arange(board.corner_count).reshape(rows, columns)
     # A mirrored row starts with the same colour where the number of columns of squares is odd; else turn the rows over.

@@ -1,7 +1,6 @@
-"""What a bundle adjustment estimates, what it has seen, and where a state puts every corner.
+"""Defines what a bundle adjustment estimates (the state) and what it observes, and projects the corners of a state.
 
-Poses are perturbed from the left, as ``Camera.covariance`` states them.
-"""
+Poses are perturbed from the left, as for ``Camera.covariance``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,13 +15,14 @@ from rig.geometry import RigidTransform, nearest_rotation, rotation_from_vector
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 PER_CAMERA, PER_SHOT = len(INTRINSICS) + 6, 6
-BEHIND_PX = 1e3  # residual of a corner that falls behind its camera
+BEHIND_PX = 1e3  # residual of a corner that lies behind its camera
 DEPTH_LEAST_MM = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Corners of all views, sorted by view: ``camera``, ``shot`` index the state, ``starts`` the views."""
+    """Holds the detected corners of all views, sorted by view. ``camera`` and ``shot`` are, for each view, indices into
+    the state; ``starts`` are the first corner of each view, and the end."""
 
     camera: Int[np.ndarray, " v"]
     shot: Int[np.ndarray, " v"]
@@ -32,10 +32,11 @@ class Observations:
 
     @property
     def view_of(self) -> Int[np.ndarray, " n"]:
+        """Returns the index of the view of each corner."""
         return np.repeat(np.arange(len(self.camera)), np.diff(self.starts))
 
     def subset(self, kept: Bool[np.ndarray, " n"]) -> "Observations":
-        """Selects the corners ``kept``; views stay, possibly empty."""
+        """Returns only the corners marked in ``kept``. All views stay, possibly without corners."""
         counts = np.bincount(self.view_of[kept], minlength=len(self.camera))
         starts = np.concatenate([[0], np.cumsum(counts)])
         return replace(self, starts=starts, points=self.points[kept], pixels=self.pixels[kept])
@@ -43,7 +44,10 @@ class Observations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleState:
-    """Holds what is estimated. ``offsets``: time offset of each camera, in shots, along ``velocities`` of the board."""
+    """Holds the estimated parameters: intrinsics (fx fy cx cy k1 k2 p1 p2 k3), camera_from_world, world_from_board
+    (mm).
+
+    ``offsets`` are time offsets of each camera, in shots; ``velocities`` the motion of the board per shot (rad, mm)."""
 
     intrinsics: Float[np.ndarray, "c 9"]
     camera_rotations: Float[np.ndarray, "c 3 3"]
@@ -54,12 +58,12 @@ class BundleState:
     velocities: Float[np.ndarray, "s 6"]
 
     def camera_pose(self, index: int) -> RigidTransform:
+        """Returns camera_from_world of the camera at ``index``."""
         return RigidTransform(self.camera_rotations[index], self.camera_translations[index])
 
 
 def observations(views: Sequence[View], cameras: Sequence[str], shots: Sequence[str], board: Board) -> Observations:
-    """Returns what every view found, end to end: corners (px) and their places on the board (mm), by camera and
-    shot."""
+    """Collects the corners of all views: pixels, and positions on the board (mm)."""
     corners = board.corners()
     counts = [len(view.found.ids) for view in views]
     return Observations(
@@ -84,7 +88,7 @@ def camera_of(state: BundleState, index: int, name: str, size: tuple[int, int]) 
 
 
 def moved_state(state: BundleState, step: Float[np.ndarray, " q"]) -> BundleState:
-    """Returns the state after a step of all parameters: cameras (intrinsics, pose), boards, time offsets."""
+    """Returns the state after a step ``step`` of all parameters: cameras (intrinsics, pose), boards, time offsets."""
     cameras, shots = len(state.intrinsics), len(state.board_rotations)
     per_camera = step[: cameras * PER_CAMERA].reshape(cameras, PER_CAMERA)
     per_shot = step[cameras * PER_CAMERA : cameras * PER_CAMERA + shots * PER_SHOT].reshape(shots, PER_SHOT)
@@ -106,7 +110,7 @@ def _motions(steps: Float[np.ndarray, "n 6"]) -> tuple[Float[np.ndarray, "n 3 3"
 
 
 def orthonormal(state: BundleState) -> BundleState:
-    """Takes the rounding of many small turns out of the rotations."""
+    """Returns the state with rotations made orthonormal again, after the rounding errors of many steps."""
     return replace(
         state,
         camera_rotations=np.stack([nearest_rotation(r) for r in state.camera_rotations]),
@@ -117,7 +121,7 @@ def orthonormal(state: BundleState) -> BundleState:
 def corner_positions(
     state: BundleState, seen: Observations
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Returns world and camera coordinates of all corners, and the camera index of each."""
+    """Returns all corners in the world frame and in their camera's frame (mm), and the camera index of each."""
     camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
     world = np.einsum("nij,nj->ni", state.board_rotations[shot], seen.points) + state.board_translations[shot]
     if state.offsets.any():
@@ -129,7 +133,7 @@ def corner_positions(
 
 
 def residuals(state: BundleState, seen: Observations) -> Float[np.ndarray, "n 2"]:
-    """Returns projected less detected, pixels; ``BEHIND_PX`` where a corner falls behind its camera."""
+    """Returns projected minus detected pixels; ``BEHIND_PX`` for corners behind their camera."""
     _, inside, camera = corner_positions(state, seen)
     behind = inside[:, 2] < DEPTH_LEAST_MM
     inside[behind] = (0.0, 0.0, 1.0)

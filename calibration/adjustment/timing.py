@@ -1,9 +1,8 @@
-"""Were the cameras' moments the same? A time offset per camera, from how the residuals follow the board's motion.
+"""Estimates whether the cameras were synchronous: one time offset a camera, by how residuals follow the board's motion.
 
-The board's velocity in a shot is taken from its poses in the shots before and after (central differences), so offsets
-are in units of the time between shots, and mean something only where the shots are frames of one recording. Offsets are
-estimated beside everything else in the bundle; the first camera's is zero.
-"""
+The board's velocity in a shot is the central difference of its poses in the shots before and after. So offsets are in
+units of the time between shots, and are meaningful only if the shots are frames of one recording. They are estimated
+jointly with all other parameters; the first camera's offset is zero."""
 
 from dataclasses import dataclass, replace
 
@@ -18,7 +17,8 @@ from rig.geometry import RigidTransform, vector_from_rotation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeOffsets:
-    """Offsets and standard deviations per camera in shots, and the 2D RMS (px) without and with them."""
+    """Holds offsets and standard deviations of each camera (in shots), and the RMS of the residuals (px, 2D) without
+    and with them."""
 
     offsets: Float[np.ndarray, " c"]
     sigma: Float[np.ndarray, " c"]
@@ -27,7 +27,8 @@ class TimeOffsets:
 
 
 def board_velocities(state: BundleState) -> Float[np.ndarray, "s 6"]:
-    """Left perturbation of world_from_board per shot; one-sided at the ends."""
+    """Returns the board's motion per shot, a left perturbation of world_from_board (rad, mm); one-sided differences at
+    the ends."""
     poses = [RigidTransform(r, t) for r, t in zip(state.board_rotations, state.board_translations, strict=True)]
     velocities = np.zeros((len(poses), 6))
     for i in range(len(poses)):
@@ -45,7 +46,7 @@ def board_velocities(state: BundleState) -> Float[np.ndarray, "s 6"]:
 def estimate_offsets(
     state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"]
 ) -> TimeOffsets:
-    """Adds the offsets to the bundle and solves it again, from its solution ``state``."""
+    """Estimates the offsets by solving the bundle again with them, starting from its solution ``state``."""
     before = _rms(state, seen)
     state = replace(state, velocities=board_velocities(state))
     first = solve(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER).state

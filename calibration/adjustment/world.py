@@ -1,8 +1,7 @@
-"""The world frame of a rig calibrated here: x to the subject's left, y up, z towards the front camera.
+"""Chooses the world frame of a calibrated rig: x to the subject's left, y up, z towards the front camera.
 
-Up is the direction to which the cameras' image rows are perpendicular: a camera that is not rolled has its x axis
-horizontal at whatever elevation it stands. The origin is the point nearest to all optical axes.
-"""
+Up is the direction perpendicular to the cameras' image rows: a camera that is not rolled has a horizontal x axis at any
+elevation. The origin is the point nearest to all optical axes."""
 
 from dataclasses import replace
 
@@ -16,21 +15,23 @@ from rig.rig import Rig
 
 
 def up_direction(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the unit vector, in the rig's present frame, that the cameras hold to be up."""
+    """Returns the unit vector that points up, in the rig's present frame."""
     rights = np.stack([camera.camera_from_world.rotation[0] for camera in rig])
     ups = -np.stack([camera.camera_from_world.rotation[1] for camera in rig])
     values, vectors = np.linalg.eigh(rights.T @ rights)
     mean = ups.mean(axis=0)
-    # Two small eigenvalues: all cameras look the same way round, so their rows leave a plane of candidates.
+    # Two small eigenvalues: all rows are parallel, so a whole plane of directions is perpendicular to them.
     spread = vectors[:, :1] if values[1] > 0.05 * values[2] else vectors[:, :2]
     up = spread @ (spread.T @ mean)
     return up / np.linalg.norm(up)
 
 
 def in_world_frame(rig: Rig, front: str | None = None) -> Rig:
-    """Returns the same rig in the project's world frame. ``front`` names the front camera; without it the middle one of
-    the fan is taken. Covariances are those of left perturbations and do not change. Raises InputError if it is
-    unknown."""
+    """Returns the same rig in the project's world frame. ``front`` names the front camera; by default it is the middle
+    one.
+
+    Covariances are those of left perturbations and do not change. Raises InputError if ``front`` is no camera of the
+    rig."""
     if front is not None and front not in rig:
         raise InputError("front camera", [compose("front-of-other-rig", front=f"{front!r}", cameras=rig.names)])
     origin, up = rig.centre_world(), up_direction(rig)

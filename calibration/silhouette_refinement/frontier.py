@@ -1,11 +1,11 @@
-"""Frontier points: places where an epipolar plane touches the subject, seen on the silhouettes of two cameras.
+"""Finds frontier points: points where an epipolar plane touches the subject, seen on the silhouettes of two cameras.
 
-Where the angle of a contour's rays about the line through both centres has a local extreme, the plane of that angle
-touches the subject there, and, unless something hides it, the other contour has an extreme of the same angle. The outer
-two of a pair are ``pipeline.view_checks.camera_drift``'s; a head with hair and shoulders has several more. Only convex
-ones count: where two parts of an outline cross (a T-junction) the contour has a concave corner that is no point of the
-subject. With no bound on their angles many could be paired, so this needs cameras good to about ``GATE_PX``.
-"""
+Consider the angle of a contour's rays about the line through both camera centres. At a local extreme of the angle the
+epipolar plane touches the subject, and unless something hides that point, the other contour has an extreme at the same
+angle. ``pipeline.multiview.tangency`` uses the two outermost extremes of a pair; a head with hair and shoulders has
+several more. Only convex extremes count: where two parts of an outline cross (a T-junction) the contour has a concave
+corner that is no point of the subject. Extremes are paired by their angles, so the cameras must be accurate to about
+``GATE_PX`` already."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,17 +31,17 @@ from pipeline.multiview.tangency import (
 from rig.camera import Camera
 from rig.rig import Rig
 
-GATE_PX = 2.5  # how far two extremes of one frontier point may be apart
-REACH = 15  # contour pixels to either side over which an extreme must be one
-PROMINENCE_PX = 0.3  # by how much: an outline straighter than a radius of 400 px has no place on it
-SMOOTH_PX = 1.0  # along the contour: shifts a bend of radius r by 1 / (2 r) px
-INSIDE_PX = 4.0  # this far behind a convex extreme the subject is met
+GATE_PX = 2.5  # largest distance of two extremes that count as one frontier point
+REACH = 15  # contour pixels to either side among which an extreme must be the largest
+PROMINENCE_PX = 0.3  # by so much: an outline straighter than a radius of 400 px does not locate an extreme
+SMOOTH_PX = 1.0  # smoothing along the contour; it shifts a bend of radius r by 1 / (2 r) px
+INSIDE_PX = 4.0  # at this distance behind a convex extreme the mask must show the subject
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contour:
-    """Holds the longest closed outline of a silhouette, in order: sub-pixel places, rays in the world, and what is
-    whole."""
+    """Holds the longest closed outline of a silhouette, in order: sub-pixel positions, unit rays in the world frame,
+    and which pixels are ``whole`` (not at the picture's border)."""
 
     camera: Camera
     mask: Bool[np.ndarray, "h w"]
@@ -51,6 +51,7 @@ class Contour:
 
     @classmethod
     def of(cls, camera: Camera, silhouette: Silhouette) -> "Contour":
+        """Extracts the outline of a silhouette, smoothed by ``SMOOTH_PX``."""
         found, _ = cv2.findContours(silhouette.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         chain = max(found, key=len).reshape(-1, 2).astype(float)
         pixels = gaussian_filter1d(on_contour(chain, silhouette.distance), SMOOTH_PX, axis=0, mode="wrap")
@@ -62,7 +63,8 @@ class Contour:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Extremes:
-    """Local extremes of one contour's angle; ``side`` is +1 for maxima."""
+    """Holds the local extremes of the angle along one contour: angle (rad), +1 for maxima and -1 for minima, pixel, and
+    the angle's change per pixel."""
 
     angle: Float[np.ndarray, " e"]
     side: Float[np.ndarray, " e"]
@@ -71,8 +73,8 @@ class _Extremes:
 
 
 def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig, gate_px: float = GATE_PX) -> list[Tangency]:
-    """Returns every pair's frontier points that both contours show, and show unmistakably. ``rig``: usable cameras
-    only."""
+    """Returns the frontier points of every pair of cameras that both contours show without ambiguity. ``rig`` must
+    contain only cameras with a usable silhouette."""
     contours = [Contour.of(camera, silhouettes[camera.name]) for camera in rig]
     found = []
     for one, two in combinations(contours, 2):

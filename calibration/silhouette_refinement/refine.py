@@ -38,22 +38,22 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
 
-PRIOR_PX = 0.2  # of a camera that states no covariance
-FOCAL_SPREAD = 1e-3  # of the logarithm: what a board leaves open
-NOISE_LEAST_PX = 0.07  # a contour of a binary mask is not better
-OUTER_STEPS = 1  # with outer tangents alone, which cannot be confused
+PRIOR_PX = 0.2  # standard deviation in the image, of a camera that states no covariance
+FOCAL_SPREAD = 1e-3  # standard deviation of the focal length's logarithm after a calibration with a board
+NOISE_LEAST_PX = 0.07  # no contour of a binary mask is more accurate
+OUTER_STEPS = 1  # steps with outer tangents alone, whose pairing is certain
 STEPS, RIM_STEPS = 6, 2
-# One step to a set of tangencies, and hardly damped: the calibration is near, its covariance holds the rest.
+# One almost undamped step for each set of tangencies: the start is near, and its covariance bounds the step.
 ONE_STEP = Limits(steps=1, first_damping=MIN_DAMPING)
-SETTLED_PX = 1e-2
+SETTLED_PX = 1e-2  # image motion of a step below which the cameras have converged
 FOLDS = 5
-GAIN_SIGMAS = 2.0  # by how many of its standard deviations the held-out residuals must shrink
+GAIN_SIGMAS = 2.0  # the mean cost of held-out residuals must fall by so many of its standard deviations
 
 Pairs = Callable[[tuple[str, str]], bool]  # whether the tangencies of two cameras take part
 
 
 class TooFewCaptures(EigenheadError):
-    """Nothing would be left to refine from."""
+    """Reports that too few captures are left to refine from and to check the result by."""
 
     def __init__(self, captures: int) -> None:
         super().__init__(compose("refinement-too-few-captures", count=captures))
@@ -61,22 +61,25 @@ class TooFewCaptures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Tangency residuals (px), each with the two cameras that it is of."""
+    """Holds tangency residuals (px), and for each the two cameras that it belongs to."""
 
     cameras: tuple[tuple[str, str], ...]
     px: Float[np.ndarray, " n"]
 
     def of(self, camera: str) -> Float[np.ndarray, " k"]:
-        """Selects the tangencies that a camera takes part in."""
+        """Returns the residuals of all tangencies in which a camera takes part."""
         return self.px[[camera in pair for pair in self.cameras]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """Holds the result of a refinement. ``before``: residuals of all captures at the start; ``after``: of each capture
-    where the others alone put the cameras; ``before_px`` and ``after_px`` their robust RMS with the noise ``noise_px``.
-    ``change_px``: RMS motion (2D) per camera of the subject's region, worlds aligned, from the start to ``proposed``,
-    the rig that all captures agree on and that ``rig`` is only where ``kept``."""
+    """Holds the result of a refinement.
+
+    ``rig`` is ``proposed`` if the refinement is ``kept``, otherwise the start; ``reason`` says why. ``before`` are the
+    residuals of all captures at the start, ``after`` those of each capture with the cameras that the other captures
+    alone give; ``before_px`` and ``after_px`` are their robust RMS, ``noise_px`` the noise these assume. ``change_px``
+    is, for each camera, the RMS motion (2D) of the image of the subject's region from the start to ``proposed``, worlds
+    aligned."""
 
     rig: Rig
     proposed: Rig
@@ -99,12 +102,12 @@ def refine(
     heads: Heads | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> Refinement:
-    """Refines extrinsics, and with ``focal`` focal lengths, from all captures; kept if they agree when each is held out
-    in its turn (several at a time where there are more than ``FOLDS``).
+    """Refines extrinsics, and with ``focal`` also focal lengths, from all captures.
 
-    ``prior_px``: standard deviation in the image of a camera without a covariance. ``heads``: a model whose rims speak
-    as well, once the tangencies have settled. Raises TooFewCaptures.
-    """
+    The result is kept if each capture, held out in its turn (several at a time if there are more than ``FOLDS``),
+    agrees better with cameras refined by the others. ``prior_px`` is the standard deviation in the image of a camera
+    without a covariance. ``heads`` is a model whose rims are used as well, once the tangencies have converged. Raises
+    TooFewCaptures."""
     if len(captures) < 2:
         raise TooFewCaptures(len(captures))
     folds = min(FOLDS, len(captures))
@@ -113,8 +116,10 @@ def refine(
     parts = []
     for fold in range(folds):
         others = [i for i in range(len(captures)) if i % folds != fold]
-        their = None if heads is None else heads.subset(others)
-        without = minimise_tangencies([captures[i] for i in others], rig, focal=focal, prior_px=prior_px, heads=their)
+        other_heads = None if heads is None else heads.subset(others)
+        without = minimise_tangencies(
+            [captures[i] for i in others], rig, focal=focal, prior_px=prior_px, heads=other_heads
+        )
         held_out = captures[fold::folds]
         parts.append((residuals(held_out, rig), residuals(held_out, without)))
         report("refine", (fold + 2) / (folds + 1))
@@ -151,15 +156,17 @@ def _joined(parts: Sequence[Residuals]) -> Residuals:
 
 
 def residuals(captures: Sequence[Mapping[str, Silhouette]], rig: Rig, pairs: Pairs | None = None) -> Residuals:
-    """Returns the residuals of all captures' outer tangencies, or of those of some ``pairs`` of cameras: the same ones
-    whatever the rig, so that two rigs compare."""
+    """Returns the residuals of all captures' outer tangencies, or of those between the given ``pairs`` of cameras.
+
+    Outer tangencies are the same for every rig, so the residuals of two rigs can be compared."""
     found = [_tangencies(capture, rig, pairs, outer=True) for capture in captures]
     misses = [tangency_residuals(PackedTangencies.of(tangencies, rig), rig) for tangencies in found]
     return Residuals(tuple(t.cameras for tangencies in found for t in tangencies), np.concatenate(misses))
 
 
 def robust_rms(misses: Float[np.ndarray, " n"], noise_px: float) -> float:
-    """RMS where a residual beyond three standard deviations counts ever less (Geman-McClure)."""
+    """Returns the RMS of residuals (px), in which those beyond three standard deviations count less and less
+    (Geman-McClure)."""
     return float(np.sqrt(np.mean(_forgiven(misses, noise_px)))) if len(misses) else float("nan")
 
 
@@ -168,14 +175,15 @@ def _forgiven(misses: Float[np.ndarray, " n"], noise_px: float) -> Float[np.ndar
 
 
 def noise_of(misses: Float[np.ndarray, " n"]) -> float:
-    """Returns the robust standard deviation, px."""
+    """Returns the robust standard deviation of residuals, px."""
     return max(NOISE_LEAST_PX, 1.4826 * float(np.median(np.abs(misses)))) if len(misses) else NOISE_LEAST_PX
 
 
 def gain_of(before: np.ndarray, after: np.ndarray, noise: float) -> tuple[float, float]:
-    """By how much the mean robust cost falls, and the standard deviation of that."""
+    """Returns by how much the mean robust cost falls from ``before`` to ``after``, and the standard deviation of
+    that."""
     one, two = _forgiven(before, noise), _forgiven(after, noise)
-    if len(one) != len(two):  # a tangency at the image's border came or went
+    if len(one) != len(two):  # a tangency at the image's border appeared or disappeared
         spread = np.hypot(one.std() / np.sqrt(max(1, len(one))), two.std() / np.sqrt(max(1, len(two))))
         return float(one.mean() - two.mean()), float(spread)
     fall = one - two
@@ -191,9 +199,11 @@ def minimise_tangencies(
     heads: Heads | None,
     pairs: Pairs | None = None,
 ) -> Rig:
-    """Returns the cameras of least tangency cost over all captures, with the start as prior; then of that and the rims
-    of the heads. Only the tangencies of ``pairs`` of cameras count where they are given. The result's covariances are
-    those of the last step, in the subject's gauge."""
+    """Returns the cameras that minimise the tangency cost over all captures, with the start as prior; with ``heads``
+    the cost of the heads' rims is added at the end.
+
+    Only tangencies of ``pairs`` of cameras count if these are given. The covariances of the result are those of the
+    last step, in the subject's gauge (``calibration.adjustment.gauge``)."""
     here = _Refining(captures, start, focal, prior_px, pairs)
     correction = here.prior.centre
     solution = None
@@ -218,7 +228,7 @@ def minimise_tangencies(
 
 
 class _Refining:
-    """What stays the same while the tangencies of a refinement are found again and again."""
+    """Holds what stays constant while the tangencies of a refinement are found anew in each step."""
 
     def __init__(
         self,
@@ -243,14 +253,15 @@ class _Refining:
         return minimise(Problem((*terms, self.prior), len(correction), np.add), correction, ONE_STEP)
 
     def tangency_term(self, correction: Float[np.ndarray, " p"], *, outer: bool) -> TangencyTerm:
-        """Returns the tangencies of all captures as the corrected cameras find them, and their robust noise."""
+        """Returns the cost of the tangencies that the corrected cameras find in all captures, with their robust
+        noise."""
         rig = self.rig(correction)
         found = [t for capture in self.captures for t in _tangencies(capture, rig, self.pairs, outer=outer)]
         seen = PackedTangencies.of(found, rig)
         return TangencyTerm(seen, self.start, self.focal, noise_of(tangency_residuals(seen, rig)))
 
     def rim_terms(self, correction: Float[np.ndarray, " p"], heads: Heads) -> list[Quadratic]:
-        """Returns what the rim of each capture's head says of the cameras."""
+        """Returns the cost of each capture's rims as a quadratic function of the cameras."""
         rig, poses = self.rig(correction), _pose_places(self.start, focal=self.focal)
         terms = []
         for capture, place in zip(self.captures, heads.starts, strict=True):
@@ -273,12 +284,12 @@ def _tangencies(capture: Mapping[str, Silhouette], rig: Rig, pairs: Pairs | None
 
 
 def _pose_places(rig: Rig, *, focal: bool) -> Int[np.ndarray, " q"]:
-    """Where the six pose parameters of every camera stand among all parameters."""
+    """Returns the indices of each camera's six pose parameters among all parameters."""
     return np.concatenate([per_camera(focal=focal) * k + np.arange(6) for k in range(len(rig))])
 
 
 def _prior(rig: Rig, *, focal: bool, prior_px: float) -> Float[np.ndarray, "p p"]:
-    """Information of the start: the board's covariance per camera, and of the focal length's logarithm."""
+    """Returns the prior information of the cameras: their covariances, and that of the focal length's logarithm."""
     centre = rig.centre_world()[None]
     blocks = []
     for camera in rig:
@@ -291,13 +302,12 @@ def _prior(rig: Rig, *, focal: bool, prior_px: float) -> Float[np.ndarray, "p p"
 
 
 def gauge_free(information: Float[np.ndarray, "p p"], projection: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Returns the information of N(0, information^-1) about what ``projection`` leaves, whatever the world's own
-    motion; and, since no image determines that, a prior that keeps it at zero.
+    """Returns the information of N(0, information^-1) about what ``projection`` leaves, regardless of motions of the
+    world; and a prior that keeps such motions at zero, since no image determines them.
 
-    With S the projection, I - S = A B of rank 6, and M the information: the least of (x - A t)^T M (x - A t) over all
-    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A rig moved as a whole then costs nothing, as it costs
-    the tangencies nothing, and ``(I - S)^T M (I - S)`` fixes the frame without pulling at anything that can be seen.
-    """
+    With S the projection, I - S = A B of rank 6, and M the information: the minimum of (x - A t)^T M (x - A t) over all
+    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A rig moved as a whole then costs nothing, just as it
+    costs the tangencies nothing, and ``(I - S)^T M (I - S)`` fixes the frame without affecting anything visible."""
     world = np.eye(len(projection)) - projection
     motions = scipy.linalg.orth(world, rcond=1e-9)
     pulled = information @ motions
@@ -307,7 +317,7 @@ def gauge_free(information: Float[np.ndarray, "p p"], projection: Float[np.ndarr
 
 
 def _projection(rig: Rig, *, focal: bool) -> Float[np.ndarray, "p p"]:
-    """Takes the world's own motion out of a step."""
+    """Returns the projection that removes the world's own motion from a step."""
     poses = _pose_places(rig, focal=focal)
     matrix = np.eye(per_camera(focal=focal) * len(rig))
     matrix[np.ix_(poses, poses)] = gauge_projection(rig)

@@ -1,4 +1,4 @@
-"""The report of a silhouette refinement: one HTML page that needs nothing else, and the same as JSON."""
+"""Writes the report of a silhouette refinement: one self-contained HTML page, and the same content as JSON."""
 
 from dataclasses import dataclass
 from html import escape
@@ -18,7 +18,7 @@ BINS, HISTOGRAM_WIDTH, HISTOGRAM_HEIGHT = 24, 420.0, 160.0
 
 
 class HeldOut(TypedDict):
-    """Residuals of the captures held out, and how many equations they are."""
+    """Holds the residuals (robust RMS, px) of captures held out, before and after, and the number of equations."""
 
     before_px: float
     after_px: float
@@ -27,6 +27,8 @@ class HeldOut(TypedDict):
 
 
 class RefinedCamera(TypedDict):
+    """Holds the residuals of one camera's tangencies (px) before and after, and how far it was moved."""
+
     before_px: float
     after_px: float
     equations: int
@@ -37,7 +39,7 @@ class RefinedCamera(TypedDict):
 
 
 class RefinementDocument(TypedDict):
-    """What ``refine --json`` prints."""
+    """Describes what ``refine --json`` prints."""
 
     kept: bool
     reason: str
@@ -52,7 +54,7 @@ class RefinementDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinementRun:
-    """Holds a refinement with the rig it started from, the names of its captures, and what is to be said beside it."""
+    """Holds a refinement together with the rig it started from, the names of its captures, and warnings."""
 
     refinement: Refinement
     start: Rig
@@ -81,7 +83,7 @@ class RefinementRun:
 
 
 def refinement_page(run: RefinementRun) -> str:
-    """Returns the HTML page."""
+    """Returns the report as an HTML page."""
     found = run.refinement
     verdict = "kept" if found.kept else "rejected: the calibration stays as it was"
     kind = "good" if found.kept else "bad"

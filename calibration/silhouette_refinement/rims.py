@@ -1,10 +1,9 @@
-"""What the rims of a head say of the cameras: the model fitted to one capture, everything but the cameras taken out.
+"""Turns the rims of a head fitted to one capture into equations for the cameras alone.
 
-With the cameras held, the contour solver (section 4.4, ``pipeline.contour_fit.contour``) finds shape and pose. The
-normal equations there, over (shape, pose, cameras), are reduced to the cameras by the Schur complement, so that a head
-which could be another one says no more than it knows. Captures of several subjects add up: heads are their own, cameras
-the same.
-"""
+With the cameras fixed, the contour solver (section 4.4, ``pipeline.contour_fit.contour``) estimates shape and pose. Its
+normal equations at the solution, over (shape, pose, cameras), are reduced to the cameras by the Schur complement, so
+that the uncertainty of the head's shape is accounted for. The equations of several captures add up: each has a head of
+its own, and all share the cameras."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,28 +21,30 @@ from pipeline.settings import FittingSettings
 from rig.geometry import Similarity
 from rig.rig import Rig
 
-HELD_PX = 0.01  # as the cameras' prior: a tenth of what is looked for
+HELD_PX = 0.01  # prior that keeps cameras fixed in the fit: a tenth of the errors sought
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heads:
-    """Holds a model for all captures, and where each capture's head is to start from (``world_from_head``)."""
+    """Holds a model for the heads of all captures, and the pose at which the fit of each capture's head starts
+    (``world_from_head``)."""
 
     model: HeadModel
     starts: Sequence[Similarity]
     settings: FittingSettings = field(default_factory=FittingSettings)
 
     def subset(self, chosen: Sequence[int]) -> "Heads":
-        """Returns the heads of some of the captures."""
+        """Returns the heads of the captures with the indices ``chosen``."""
         return replace(self, starts=[self.starts[i] for i in chosen])
 
 
 def rim_equations(
     silhouettes: Mapping[str, Silhouette], rig: Rig, heads: Heads, start: Similarity
 ) -> tuple[Float[np.ndarray, "c6 c6"], Float[np.ndarray, " c6"]]:
-    """Normal matrix and gradient over the left perturbations (rad, mm) of all cameras; zero for those without a usable
-    silhouette. Raises ValueError where none is usable."""
-    bare = Rig(tuple(replace(camera, covariance=None) for camera in rig))  # the prior is the caller's
+    """Returns normal matrix and gradient of the rims' cost over the left perturbations (rad, mm) of all cameras.
+
+    They are zero for cameras without a usable silhouette. Raises ValueError if no silhouette is usable."""
+    bare = Rig(tuple(replace(camera, covariance=None) for camera in rig))  # the caller adds the prior
     solved = solve_contour(heads.model, start, silhouettes, bare, replace(heads.settings, calibration_px=HELD_PX))
     problem = replace(solved.problem, camera_information=np.zeros_like(solved.problem.camera_information))
     stage = replace(solved.stage, cameras=True)

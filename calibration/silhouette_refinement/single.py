@@ -1,8 +1,7 @@
-"""Refinement by the silhouettes of one capture, as a calibration from photographs alone has it.
+"""Refines cameras by the silhouettes of a single capture, for calibrations from photographs alone.
 
-There is no other capture to hold out; pairs of cameras are held out instead. A view takes part in pairs on both sides,
-so that a pair judges poses that it did not move, though a fault of a view's mask is judged by that mask.
-"""
+No other capture can be held out, so pairs of cameras are. Every view takes part in pairs on both sides, so held-out
+pairs judge poses that they did not influence; but a fault of a view's mask is judged by the same mask."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,13 +24,15 @@ from pipeline.imaging.silhouette import Silhouette
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
-VIEWS_LEAST = 8  # 28 pairs: fewer leave a camera without pairs of its own once a fifth is held out
+VIEWS_LEAST = 8  # 28 pairs; with fewer some camera would have no pairs left once a fifth is held out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SingleRefinement:
-    """``rig``: ``proposed`` where it is ``kept``, else the start; ``change_px``: RMS motion of the subject's region
-    (2D), the median camera's; ``reason``: why it is kept or not."""
+    """Holds the result of a refinement by one capture.
+
+    ``rig`` is ``proposed`` if it is ``kept``, otherwise the start; ``reason`` says why. ``change_px`` is the RMS motion
+    (2D) of the image of the subject's region, of the median camera."""
 
     rig: Rig
     proposed: Rig
@@ -41,8 +42,10 @@ class SingleRefinement:
 
 
 def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement | None:
-    """Refines extrinsics from one capture's silhouettes; kept if pairs of cameras, each fifth held out in its turn,
-    agree. None where fewer than ``VIEWS_LEAST`` views have a silhouette of use."""
+    """Refines extrinsics from the silhouettes of one capture.
+
+    The result is kept if pairs of cameras, a fifth held out in its turn, agree better. Returns None if fewer than
+    ``VIEWS_LEAST`` views have a usable silhouette."""
     seen = [name for name in rig.names if name in capture and capture[name].quality.usable]
     if len(seen) < VIEWS_LEAST:
         return None
@@ -68,6 +71,7 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement 
 
 
 def _pairs(names: list[str], fold: int, *, inside: bool) -> Pairs:
-    """Whether a pair is in a fold, or outside of it: every camera has some of its pairs in each."""
+    """Returns a test of whether a pair of cameras is in a fold (``inside``), or outside. Every camera has pairs in each
+    fold."""
     place = {name: index for index, name in enumerate(names)}
     return lambda pair: (sum(place[name] for name in pair) % FOLDS == fold) == inside

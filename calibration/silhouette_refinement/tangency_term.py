@@ -1,18 +1,18 @@
-"""The residual of a frontier point that two cameras see, and its derivative by both cameras.
+"""Computes the residual of a frontier point that two cameras see, and its derivatives by both cameras.
 
 A plane through two camera centres that touches the subject touches both silhouettes, at the images of one frontier
-point (Ramanathan, Steinbach and Girod 2000; Wong and Cipolla 2001). With centres c and rays d at the two tangent
-pixels, base b = c2 - c1, the planes differ by the angle
+point (Ramanathan, Steinbach and Girod 2000; Wong and Cipolla 2001). Each camera gives such a plane. With centres c,
+rays d at the two tangent pixels and base b = c2 - c1, the angle between the two planes is
 
     delta = |b| b . (d1 x d2) / (|b x d1| |b x d2|)
 
-and, divided by the change of angle per pixel in both images, the residual is the distance in pixels of either contour
-that it would take, were both equally noisy. At a tangent point the contour runs along the plane, so to first order the
-pixels stay where they are as a camera moves: with x' = R(w) x + v in camera 1's frame,
+Divided by the change of angle per pixel in both images together, it is the residual: the distance in pixels by which
+each contour would have to move if both were equally noisy. At a tangent point the contour runs along the plane, so to
+first order the tangent pixels stay where they are when a camera moves. With x' = R(w) x + v in camera 1's frame,
 
     d delta ~ w . (R1 (d2 x b)) x R1 d1 + v . R1 (d1 x d2)         and likewise, signs swapped, for camera 2.
 
-A focal length (its logarithm) turns the rays: its derivative is taken by central differences.
+A focal length (its logarithm) turns the rays; its derivative is taken by central differences.
 """
 
 from collections.abc import Sequence
@@ -28,14 +28,14 @@ from pipeline.multiview.tangency import Tangency
 from rig.camera import Camera
 from rig.rig import Rig
 
-ROBUST_SIGMAS = 3.0
-ZOOM_STEP = 1e-4  # of a focal length's logarithm: rays are smooth in it
+ROBUST_SIGMAS = 3.0  # scale of Geman and McClure's loss, in standard deviations
+ZOOM_STEP = 1e-4  # difference of a focal length's logarithm for its derivative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedTangencies:
-    """n tangencies of a rig: indices of both cameras, tangent pixels, and the change of angle per pixel of both
-    together (rad / px)."""
+    """Holds n tangencies of a rig as arrays: indices of both cameras, tangent pixels, and ``steepness``, the change of
+    angle per pixel of both contours together (rad / px)."""
 
     cameras: Int[np.ndarray, "n 2"]
     pixels: Float[np.ndarray, "n 2 2"]
@@ -43,6 +43,7 @@ class PackedTangencies:
 
     @classmethod
     def of(cls, tangencies: Sequence[Tangency], rig: Rig) -> "PackedTangencies":
+        """Packs tangencies whose cameras are all in ``rig``."""
         index = {name: k for k, name in enumerate(rig.names)}
         return cls(
             np.array([[index[name] for name in t.cameras] for t in tangencies], int).reshape(-1, 2),
@@ -53,11 +54,10 @@ class PackedTangencies:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TangencyTerm:
-    """Geman and McClure's cost of tangency residuals over the corrections of all cameras.
+    """Computes Geman and McClure's cost of tangency residuals as a function of the corrections of all cameras.
 
-    The value is the correction of every camera of ``start``, one after the other: a left perturbation (rad, mm) and,
-    with ``focal``, the change of the focal length's logarithm.
-    """
+    A correction lists, camera by camera, a left perturbation of the pose in ``start`` (rad, mm) and, with ``focal``,
+    the change of the focal length's logarithm."""
 
     seen: PackedTangencies
     start: Rig
@@ -65,6 +65,7 @@ class TangencyTerm:
     noise_px: float
 
     def at(self, correction: Float[np.ndarray, " p"]) -> Residuals:
+        """Returns the residuals, in standard deviations, and their derivatives at a correction."""
         rig = corrected(self.start, correction, focal=self.focal)
         residual_px = tangency_residuals(self.seen, rig)
         return Residuals(
@@ -75,12 +76,13 @@ class TangencyTerm:
 
 
 def per_camera(*, focal: bool) -> int:
-    """Unknowns of a camera: rotation, translation and, if asked for, focal length."""
+    """Returns the number of unknowns of a camera: 6 of its pose, and 1 with ``focal``."""
     return 7 if focal else 6
 
 
 def corrected(rig: Rig, correction: Float[np.ndarray, " p"], *, focal: bool) -> Rig:
-    """Returns the rig with every camera moved, and with ``focal`` zoomed, by its part of the correction."""
+    """Returns the rig with the pose, and with ``focal`` the focal length, of every camera changed by its part of the
+    correction."""
     cameras = []
     for camera, step in zip(rig, correction.reshape(len(rig), -1), strict=True):
         cameras.append(zoomed(moved(camera, step[:6]), float(step[6])) if focal else moved(camera, step))
@@ -88,20 +90,21 @@ def corrected(rig: Rig, correction: Float[np.ndarray, " p"], *, focal: bool) -> 
 
 
 def zoomed(camera: Camera, log_scale: float) -> Camera:
-    """Returns the camera with both focal lengths scaled."""
+    """Returns the camera with both focal lengths multiplied by ``exp(log_scale)``."""
     lens, scale = camera.intrinsics, float(np.exp(log_scale))
     return replace(camera, intrinsics=replace(lens, fx=lens.fx * scale, fy=lens.fy * scale))
 
 
 def tangency_residuals(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, " n"]:
-    """Returns the module's residual (px)."""
+    """Returns the residuals (px) that the module's docstring defines."""
     base, rays = _bases(seen, rig), _rays(seen, rig)
     across = np.cross(rays[:, 0], rays[:, 1])
     return _gain(seen, base, rays) * (base * across).sum(axis=1)
 
 
 def tangency_jacobian(seen: PackedTangencies, rig: Rig, *, focal: bool) -> Float[np.ndarray, "n p"]:
-    """d(residual) / d(corrections of all cameras), px per rad, mm and logarithm; the gain is taken as constant."""
+    """Returns the derivatives of the residuals by the corrections of all cameras (px per rad, mm and unit of the
+    logarithm). The factor from angles to pixels is taken as constant."""
     size, count = per_camera(focal=focal), len(seen.cameras)
     base, rays = _bases(seen, rig), _rays(seen, rig)
     gain = _gain(seen, base, rays)[:, None]
@@ -123,13 +126,13 @@ def tangency_jacobian(seen: PackedTangencies, rig: Rig, *, focal: bool) -> Float
 
 
 def _bases(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 3"]:
-    """From the first camera's centre to the second's (mm)."""
+    """Returns the vectors from the first camera's centre to the second's (mm)."""
     centres = np.stack([camera.centre_world for camera in rig])
     return centres[seen.cameras[:, 1]] - centres[seen.cameras[:, 0]]
 
 
 def _rays(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 2 3"]:
-    """Unit rays, in the world, through both tangent pixels."""
+    """Returns unit rays through both tangent pixels, in the world frame."""
     rays = np.empty((*seen.cameras.shape, 3))
     for k, camera in enumerate(rig):
         here = seen.cameras == k
@@ -140,6 +143,6 @@ def _rays(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 2 3"]:
 def _gain(
     seen: PackedTangencies, base: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Pixels per unit of the triple product, both contours equally noisy."""
+    """Returns the factor from the triple product to pixels, with both contours equally noisy."""
     planes = [np.linalg.norm(np.cross(base, rays[:, side]), axis=1) for side in (0, 1)]
     return np.linalg.norm(base, axis=1) / (planes[0] * planes[1] * seen.steepness)

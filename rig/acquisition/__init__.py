@@ -1,1 +1,4 @@
-"""Shots of a real rig: trigger, cameras' pictures of one moment, clean plates, what is wrong with them."""
+"""Takes shots with a real rig: triggers it, collects simultaneous pictures, keeps clean plates, and judges the
+pictures.
+
+Enters: rig.toml and its devices. Leaves: capture folders with sync certificates, or named faults."""

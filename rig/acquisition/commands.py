@@ -1,7 +1,6 @@
-"""What an operator does with a rig: `eigenhead rig check`, `preview`, `capture`, and taking clean plates.
+"""Implements what an operator does with a rig: `eigenhead rig check`, `preview`, `capture`, and taking clean plates.
 
-Each function is one command: it opens a session, works, and closes it. Nothing is printed here.
-"""
+Each function is one command: it opens a session, works, and closes it. It prints nothing."""
 
 import itertools
 import json
@@ -33,7 +32,7 @@ from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig
 
-HIDDEN_BY_BOARD = ("view", "swapped", "moved", "plates", "overexposed")  # what is judged by the background, or is paper
+HIDDEN_BY_BOARD = ("view", "swapped", "moved", "plates", "overexposed")  # faults that a board in the picture causes
 COLUMNS = ("camera", "found", "resolution", "fps", "exposure", "sharpness", "sync", "last seen", "remark")
 
 

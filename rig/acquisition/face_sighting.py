@@ -1,8 +1,7 @@
-"""What the pictures of a shot tell of the subject's face, said while the subject still sits there.
+"""Turns what was found of the subject's face in the pictures of a shot into remarks for the operator.
 
-Who finds the face (``pipeline.faces``) leaves a ``FaceSighting``; here it becomes sentences. They are remarks, no
-faults: a head is made of a shot with a face that is turned away, and of a statue in which no network sees one.
-"""
+``pipeline.faces`` finds the face and makes the ``FaceSighting``. Remarks are no faults: a head can be reconstructed
+from a shot with the face turned away, and of a statue in which no network finds one."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -53,7 +52,7 @@ def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tupl
 
 
 def _ways(sighting: FaceSighting) -> list[Message]:
-    """Where the face looks, beyond ``TURNED_DEG``: across, then up or down."""
+    """Returns where the face looks if it is turned by more than ``TURNED_DEG``: left or right, then up or down."""
     left, up = sighting.left_deg or 0.0, sighting.up_deg or 0.0
     ways = []
     if abs(left) > TURNED_DEG:

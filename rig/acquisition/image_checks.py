@@ -1,7 +1,7 @@
-"""Is a picture fit to be used? Exposure, sharpness, noise, and whether the camera still sees what its clean plate saw.
+"""Measures whether a picture is fit for use: exposure, sharpness, noise, and motion of the background since its clean
+plate.
 
-Pure functions of images. Brightness is in the image's values (0 to 255), lengths in pixels.
-"""
+All are pure functions of images. Brightness is in the image's values (0 to 255), lengths in pixels."""
 
 import itertools
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ from rig.parabola import second_difference, vertex_offset
 
 Grey = Float[np.ndarray, "h w"]
 
-BLUR_MOST_PX = 10.0  # what blur_px says of anything softer
+BLUR_MOST_PX = 10.0  # blur_px returns this for anything more blurred
 
 _GAUSS_SMALL_PX, _GAUSS_LARGE_PX = 1.0, 2.0
 _WORKING_WIDTH_PX = 640  # registration halves larger images until they are below twice this
 _PATCH_PX = 33
-_REACH_PX = 24  # how far a patch is searched for
+_REACH_PX = 24  # largest displacement of a patch that is searched
 _PATCHES_MOST = 60
 _ALIKE = 0.7  # normalised correlation from which a patch counts as found
 _AGREE_PX = 1.5
@@ -82,7 +82,8 @@ def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
     """Tells whether something moved between clean plates: whether a block of 16 px changed by more than 8 standard
     deviations."""
     first = cv2.resize(plates[0].astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
-    limit = max(8.0 * noise * np.sqrt(2) / 16, 4.0)  # a block's mean has 1/16 of the noise; 4 values are no person
+    # A block's mean has 1/16 of the noise. No person changes it by less than 4.
+    limit = max(8.0 * noise * np.sqrt(2) / 16, 4.0)
     for plate in plates[1:]:
         small = cv2.resize(plate.astype(np.float32), None, fx=1 / 16, fy=1 / 16, interpolation=cv2.INTER_AREA)
         change = small - first
@@ -112,7 +113,7 @@ def blur_px(image: ImageRgb) -> float | None:
     ratio2 = (top / bottom) ** 2
     if ratio2 <= 1:
         return BLUR_MOST_PX  # wider than the two blurs can tell apart
-    # the central difference sees the picture through a box 2 px wide, of variance 1/3
+    # the central difference blurs like a box of 2 px, whose variance is 1/3
     squared = (_GAUSS_LARGE_PX**2 - ratio2 * _GAUSS_SMALL_PX**2) / (ratio2 - 1) - 1 / 3
     return float(min(np.sqrt(max(squared, 0.0)), BLUR_MOST_PX))
 
@@ -139,12 +140,12 @@ def register(image: ImageRgb, plate: ImageRgb) -> Registration:
         return Registration(len(points), 0.0, 0.0)
     moved_px = _largest_move(similarity, here.shape)
     if abs(np.hypot(similarity[0, 0], similarity[1, 0]) - 1) > _SCALE_MOST or moved_px > 2 * _REACH_PX:
-        return Registration(len(points), 0.0, 0.0)  # no camera moves so: the patches agree by chance
+        return Registration(len(points), 0.0, 0.0)  # no camera can move like this: the patches agree by chance
     return Registration(len(points), float(agree.sum()) / len(points), moved_px / factor)
 
 
 def _block_variance(after: ImageRgb, before: ImageRgb) -> float:
-    """Median over blocks of 16 px, and over the channels, of the variance of the difference of two pictures."""
+    """Returns the variance of the difference of two pictures: the median over blocks of 16 px and over the channels."""
     size = 16 if min(after.shape[:2]) >= 16 else 1
     height, width = (length // size * size for length in after.shape[:2])
     difference = after[:height, :width].astype(np.float32) - before[:height, :width]

@@ -1,5 +1,5 @@
-"""What is wrong with the pictures of a shot: light, focus, and what the cameras look at. Pure functions of pictures,
-clean plates and settings."""
+"""Judges the pictures of a shot: light, focus, and what the cameras look at. All are pure functions of pictures, clean
+plates and settings."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -15,9 +15,9 @@ from rig.messages.message import compose
 OtherView = Callable[[str, Registration], str | None]
 
 LEVEL_WITHOUT_PLATES = 64.0  # a studio picture's mean, where there is no plate to compare with
-BLACK_LEVEL = 0.02  # of the plate's brightness: nothing can be seen in it
+BLACK_LEVEL = 0.02  # of the plate's brightness: below it nothing is visible in a picture
 # Measured on two rendered captures of eleven cameras: own background 0.35 to 0.75 (lamps off: 0.12 to 0.5), another
-# camera's up to 0.07. Between the two bounds the plates of the other cameras are asked.
+# camera's up to 0.07. Between the two bounds the other cameras' plates are compared.
 FOUND_LEAST, FOUND_SURELY = 0.1, 0.25
 MOVED_DARK_PX = 3.0  # the same with the lamps off: up to 2.6 px without any movement
 
@@ -80,7 +80,7 @@ def judge_checks(
 def _light_faults(
     checks: Mapping[str, PictureCheck], levels: Mapping[str, float], shot: ShotConfig
 ) -> tuple[list[Fault], dict[str, bool]]:
-    """Faults of light, and which cameras have enough of it."""
+    """Returns the faults of light, and for each camera whether it has enough light to judge its view."""
     ratios = {name: check.exposure.mean / levels[name] for name, check in checks.items() if name in levels}
     common = median(ratios.values()) if len(ratios) >= 3 else 1.0
     faults: list[Fault] = []
@@ -109,7 +109,8 @@ def _view_faults(name: str, found: Registration, lit: bool, shot: ShotConfig, wh
 
 
 def _whose_view(name: str, image: ImageRgb, registration: Registration, plates: Plates) -> str | None:
-    """The camera whose clean plate fits the picture far better than the own one does."""
+    """Returns the camera whose clean plate fits the picture far better than its own camera's; None if there is no such
+    camera."""
     others = {other: register(image, plate).found for other, plate in plates.first.items() if other != name}
     best = max(others, key=lambda other: others[other], default=None)
     return best if best is not None and others[best] >= max(FOUND_LEAST, 2 * registration.found) else None

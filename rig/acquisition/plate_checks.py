@@ -1,5 +1,7 @@
-"""Are new clean plates clean? Judged before they replace others: by what moves while they are taken, by their light,
-and against the plates in use. Pure functions of pictures."""
+"""Checks that new clean plates show an empty studio, before they replace others.
+
+They are judged by what moves while they are taken, by their light, and by comparison with the plates in use. All are
+pure functions of pictures."""
 
 from collections.abc import Collection, Mapping, Sequence
 
@@ -14,7 +16,7 @@ from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb
 from rig.messages.message import compose
 
-SEEN_SHARE = 0.5  # of the cameras: a person in the seat is seen by all; what one camera sees is its own wall or a bump
+SEEN_SHARE = 0.5  # of the cameras: all see a person in the seat; a change seen by one is of its own wall, or a bump
 
 
 class PlatesRefused(ShotFailed):

@@ -1,4 +1,4 @@
-"""Clean plates: pictures of the empty studio, several of each camera, kept beside rig.toml.
+"""Stores clean plates: pictures of the empty studio, several of each camera, kept beside rig.toml.
 
     plates/<camera>/000.png ...     (or plates/<camera>.png: what a capture folder's background/ holds is accepted too)
     plates/plates.json              when they were taken, the noise of each camera
@@ -117,20 +117,20 @@ def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
         folder.rename(_versions(folder) / _version_of(folder).id)
     wanted.rename(folder)
     _remove_old(folder)
-    with suppress(OSError):  # the first ones leave nothing behind
+    with suppress(OSError):  # removed only if it is empty, as after the first plates
         _versions(folder).rmdir()
     return read_plates(folder, names)
 
 
 def _remove_old(folder: Path) -> None:
-    """Versions beyond the newest ``VERSIONS_MOST``, but for the one in use."""
+    """Removes all but the newest ``VERSIONS_MOST`` versions; the one in use stays."""
     for old in plates_versions(folder)[VERSIONS_MOST:]:
         if not old.in_use:
             shutil.rmtree(_versions(folder) / old.id, ignore_errors=True)
 
 
 def _remove_unfinished(folder: Path) -> None:
-    """What a process left that ended while it wrote a version."""
+    """Removes versions whose writing process ended before they were complete."""
     for left in _versions(folder).glob("*.new"):
         if time.time() - left.stat().st_mtime > UNFINISHED_S:
             shutil.rmtree(left, ignore_errors=True)
@@ -146,7 +146,7 @@ def plates_versions(folder: Path) -> list[PlatesVersion]:
 
 
 def _version_of(folder: Path) -> PlatesVersion:
-    """What plates.json says; the time of the folder where there is none, or nothing that can be read."""
+    """Describes the version in a folder, by plates.json; without a readable one its time is that of the folder."""
     try:
         document = json.loads((folder / "plates.json").read_text(encoding="utf-8"))
         taken = str(document["taken"])

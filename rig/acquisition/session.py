@@ -1,11 +1,11 @@
-"""A session with the rig: every camera open, lamps on, the box at hand; shots, clean plates, looks.
+"""Runs a session with a rig: opens its cameras, lamps and trigger box; takes pictures, shots and clean plates.
 
     with RigSession(config) as session:
         session.warm_up()
         shot = session.shoot()
 
-Nothing waits without a deadline, and no single camera holds up another: each has its thread (rig.drivers.feed). What
-fails is a named fault of the shot; an exception is for what is no shot at all (ShotFailed, InputError).
+Every wait has a deadline, and no camera delays another: each has a thread of its own (rig.drivers.feed). Failures are
+faults of the shot; an exception means that there is no shot at all (ShotFailed, InputError).
 """
 
 import threading
@@ -33,11 +33,11 @@ from rig.rig import Rig
 
 MakeDriver = Callable[[CameraConfig, Path], Driver]
 
-_LIVE_WAIT_PERIODS = 3.0  # how long a camera that runs by itself may take for its next frame
-_ARM_TO_FIRE_S = 0.02  # for the live view's frame that is under way
+_LIVE_WAIT_PERIODS = 3.0  # frame periods that a free-running camera may take for its next frame
+_ARM_TO_FIRE_S = 0.02  # pause in which the live view's present frame ends
 _CLOSE_S = 3.0
-_SILENT_S = 10.0  # a camera that gave a look nothing holds up no other look for so long
-_DIAGNOSIS_S = 1.0  # to look at pictures when nothing could be fired
+_SILENT_S = 10.0  # so long nobody waits for a camera that gave no live picture
+_DIAGNOSIS_S = 1.0  # wait for pictures if the trigger failed: they may still show why
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class RigSession:
         self._broken: dict[str, Message] = {}
         self._box: TriggerBox | None = None
         self._box_error: TriggerError | None = None
-        self._last_seen: dict[str, Frame] = {}  # for what stands still
+        self._last_seen: dict[str, Frame] = {}  # to recognise a frozen stream
         self._silent_until_s: dict[str, float] = {}
         self._busy = threading.Lock()
         for camera in config.cameras:
@@ -119,7 +119,7 @@ class RigSession:
             self._lights_on()
             deadline_s = time.monotonic() + self.config.shot.timeout_s
             for feed in self._feeds.values():
-                # a camera that waits for triggers sends nothing by itself: that is no reason to wait for it
+                # a camera that waits for triggers sends nothing by itself, so it is not waited for
                 feed.wait_frames(self.config.shot.warm_up_frames, deadline_s)
             self._look(deadline_s + self.config.shot.timeout_s)
 
@@ -189,7 +189,7 @@ class RigSession:
         self._box, self._box_error = None, error
 
     def _try_box(self, act: Callable[[TriggerBox], object]) -> bool:
-        """Whether the box did it. A box that did not is given up; the next shot tries to open it again."""
+        """Tells whether the box carried out ``act``. If not it is closed; the next shot tries to open it."""
         if self._box is None:
             return False
         try:
@@ -213,7 +213,7 @@ class RigSession:
             time.sleep(self.config.lights.settle_s)
 
     def _glance(self) -> None:
-        """Notes the picture that each camera shows before the release: the same one after it is a frozen stream."""
+        """Notes the picture of each camera before the release; if the same one follows it, the stream is frozen."""
         now_s = time.monotonic()
         running = {name: s.period_s for name, feed in self._feeds.items() if (s := feed.state()).period_s is not None}
         for name in running:
@@ -227,10 +227,10 @@ class RigSession:
                 self._last_seen[name] = frame
 
     def _look(self, deadline_s: float, only: Collection[str] | None = None) -> dict[str, Frame]:
-        """The next frame of every camera; those that wait for a trigger get one when no live view comes.
+        """Returns the next frame of every camera. Cameras that wait for a trigger get one if they have no live view.
 
-        One that gave nothing the last time is not waited for again until ``_SILENT_S`` have passed; what it sends while
-        others are waited for is taken."""
+        A camera that sent nothing last time is not waited for during ``_SILENT_S``; its frames are taken if they
+        come."""
         now_s = time.monotonic()
         feeds = {name: feed for name, feed in self._feeds.items() if only is None or name in only}
         for feed in feeds.values():
@@ -253,7 +253,7 @@ class RigSession:
         return found
 
     def _fire(self) -> Fired | None:
-        """Arms and fires the box; None, with the error kept, where it does not."""
+        """Arms and fires the box. Returns None, and keeps the error, if that fails."""
         trigger = self.config.trigger
         mask = sum(1 << c.channel for c in self.config.cameras if c.trigger == "external" and c.channel is not None)
         fired: list[Fired] = []
@@ -268,7 +268,7 @@ class RigSession:
         return fired[0] if self._try_box(act) else None
 
     def _release(self) -> _Release:
-        """The moment of the shot: the box's, or with no box in rig.toml the command to the cameras."""
+        """Releases the shot and returns its moment: the box's or, without a box in rig.toml, that of the command."""
         now_s = time.monotonic()
         for feed in self._feeds.values():
             feed.want(now_s)
@@ -342,7 +342,7 @@ class RigSession:
             state = self._feeds[name].state()
             waits = self._feeds[name].camera.trigger == "external" and state.period_s is None
             if frame is not None or (not fired and state.opened and waits):
-                continue  # a camera that waits for a trigger that never came is not at fault
+                continue  # no fault of a camera whose trigger never came
             timeout_s = self.config.shot.timeout_s if fired else min(_DIAGNOSIS_S, self.config.shot.timeout_s)
             faults.append(Fault("missing", name, state.error or compose("frame-missing", seconds=timeout_s)))
         return faults
@@ -390,7 +390,7 @@ class RigSession:
 
 
 def _without_consequences(faults: list[Fault]) -> tuple[Fault, ...]:
-    """Leaves out what another fault explains: a camera in the dark is not also out of focus or elsewhere."""
+    """Leaves out faults that follow from others: a dark picture is not also unsharp or displaced."""
     dark = {fault.camera for fault in faults if fault.code == "dark"}
     return tuple(fault for fault in faults if not (fault.camera in dark and fault.code in ("blurred", "view")))
 

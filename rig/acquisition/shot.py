@@ -1,8 +1,7 @@
-"""What a shot delivers: pictures, a certificate of how far they belong to one moment, and every fault by its name.
+"""Defines a shot: pictures, a certificate of how far they belong to one moment, and all faults with their codes.
 
-What the clock says is judged here, by pure functions of frames; what the pictures say in rig.acquisition.judgement;
-rig.acquisition.session does the shooting.
-"""
+Timing is judged here, by pure functions of frames; pictures are judged in rig.acquisition.judgement;
+rig.acquisition.session takes the shot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -64,10 +63,12 @@ REMEDIES: dict[str, Message] = {
 WARNINGS = frozenset({"moved", "overexposed", "blurred", "setting", "plates", "empty", "cut-off"})
 """Faults with which a capture is still worth reconstructing; the others end it."""
 
-DROPPED_PERIODS = 0.8
+DROPPED_PERIODS = 0.8  # a frame late by so many periods of the live view is the next one: its own was dropped
 
 
 class FaultDocument(TypedDict):
+    """Holds a fault as plain values for JSON."""
+
     code: str
     camera: str | None
     detail: str
@@ -142,6 +143,8 @@ class CameraSync:
 
 
 class CameraSyncDocument(TypedDict):
+    """Holds the timing of one camera as plain values for JSON."""
+
     status: Status
     arrival_ms: float | None
     skew_ms: float | None
@@ -160,6 +163,8 @@ class SyncDocument(TypedDict):
 
 
 class CheckDocument(TypedDict):
+    """Holds what was measured on one picture as plain values for JSON."""
+
     mean: float
     clipped_share: float
     blur_px: float | None

@@ -1,4 +1,4 @@
-"""The trigger box: its line protocol (docs/trigger-protocol.md) and the client that drives one over pyserial.
+"""Drives the trigger box over pyserial by its line protocol (docs/trigger-protocol.md).
 
 A request is ``@SS BODY*CCCC\\n`` and its reply ``#SS BODY*CCCC\\n``: SS is a sequence number (two hex digits), CCCC the
 CRC-16/CCITT-FALSE of ``SS BODY``. The start character resynchronises a receiver at any moment, so noise between lines
@@ -17,7 +17,7 @@ from rig.errors import EigenheadError
 from rig.formats.trigger_lines import BAUD, CLOCK_PERIOD_US, PROTOCOL, REPLY, REQUEST, LineReader, encode_line
 from rig.messages.message import Message, compose
 
-BUSY_S = 1.5  # the longest delay and the longest pulse, 1 s in all, with room for the lines between
+BUSY_S = 1.5  # longest release: delay and pulse take up to 0.5 s each, and the lines between them some time
 
 
 class TriggerError(EigenheadError):
@@ -120,7 +120,7 @@ class TriggerBox:
         self._sequence = time.monotonic_ns() & 0xFF
         self._clock: BoxClock | None = None
         try:
-            # exclusive: two programs that fire the same box would each believe in their own shot
+            # exclusive: of two programs that fire the same box each would take the shot for its own
             self._serial = serial.Serial(port, baud, timeout=0.05, write_timeout=1.0, exclusive=True)
         except (serial.SerialException, OSError, ValueError) as error:
             raise TriggerUnplugged(port, _first_line(error)) from error
@@ -206,7 +206,8 @@ class TriggerBox:
             raise WrongDevice(self.port, " ".join(words)) from error
 
     def _command(self, body: str, attempts: int | None = None) -> list[str]:
-        """Sends ``body`` until it is answered, and again while the box is busy releasing; the words after OK."""
+        """Sends ``body`` until it is answered, also while the box is busy with a release. Returns the words after
+        OK."""
         until_s = time.monotonic() + BUSY_S
         while True:
             with self._lock:

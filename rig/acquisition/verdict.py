@@ -1,7 +1,6 @@
-"""Is a capture worth reconstructing? Said while the subject still sits there, of shots and uploads alike.
+"""Judges whether a capture is worth reconstructing, for shots (while the subject is still there) and uploads alike.
 
-Measures one camera at a time, so that a large rig is judged in the memory of one camera.
-"""
+Cameras are measured one at a time, so that judging a large rig takes the memory of one camera."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ Verdict = Literal["good", "usable", "poor"]
 PLACE_FAULTS = frozenset({"empty", "cut-off"})
 DISPLACED = frozenset({"moved", "view", "swapped", "dark"})
 CAMERAS_LEAST = 3  # with fewer there is no reconstruction
-SOUND_SHARE = 0.75  # eight of eleven still surround a head; with fewer a side of it is seen by one camera or none
+SOUND_SHARE = 0.75  # 8 of 11 cameras still surround a head; with fewer, one side of it is seen by one camera or none
 
 
 class SubjectDocument(TypedDict):

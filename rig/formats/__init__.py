@@ -1,3 +1,3 @@
-"""Files of rigs, captures, pictures and meshes, ours and other programs'. Every reader names all faults at once; every
-writer renames a finished file into place.
-"""
+"""Reads and writes files of rigs, captures, pictures and meshes, our own formats and other programs'.
+
+Every reader reports all faults of a file at once; every writer renames a finished file into place."""

@@ -1,12 +1,11 @@
-"""Safe extraction of an uploaded .zip, .tar or .tar.gz.
+"""Extracts an uploaded .zip, .tar or .tar.gz safely.
 
-An archive comes from a stranger. Nothing in it is believed: members are listed and judged by name and kind before the
-first byte is written, bytes are counted as they come out, and a refusal leaves the folder as it was. Every fault is
-named with the member that has it.
+An archive comes from a stranger, so none of its statements is trusted: members are checked by name and kind before the
+first byte is written, bytes are counted as they are unpacked, and a refused archive leaves the folder empty. Every
+fault names the member that has it.
 
 Sources of the attacks: https://www.bamsoftware.com/hacks/zipbomb (overlapping members), CVE-2007-4559 (traversal and
-links in tar), https://www.unicode.org/reports/tr39 (confusable names).
-"""
+links in tar), https://www.unicode.org/reports/tr39 (confusable names)."""
 
 import errno
 import gzip
@@ -36,9 +35,9 @@ from rig.formats.archive_names import (
 from rig.messages.message import Message, compose
 
 COPY_BYTES = 1 << 20
-UTF8_FLAG, DOS = 0x800, 0  # of zip: names are UTF-8; the system of MS-DOS
-FAULTS_MOST = 100  # named one by one; the rest are counted
-SAME_LEAST = 3  # members with the same fault, from which on it is said once
+UTF8_FLAG, DOS = 0x800, 0  # zip's flag for names in UTF-8, and its number of the system MS-DOS
+FAULTS_MOST = 100  # faults listed singly; the others are only counted
+SAME_LEAST = 3  # from so many members with the same fault on, one message stands for all
 FOREIGN_KINDS = {
     b"7z\xbc\xaf\x27\x1c": "7-Zip",
     b"Rar!\x1a\x07": "RAR",
@@ -47,8 +46,8 @@ FOREIGN_KINDS = {
     b"\x28\xb5\x2f\xfd": "Zstandard",
     b"\x1f\x9d": "compress",
 }
-HEADER_BYTES_MOST = 1 << 16  # a tar header's long name or pax records
-DIRECTORY_BYTES_MOST = 4 << 20  # a zip's list of members: 5000 of them with long names
+HEADER_BYTES_MOST = 1 << 16  # of a tar header with a long name or pax records
+DIRECTORY_BYTES_MOST = 4 << 20  # of a zip's list of members: 5000 with long names fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,14 +58,14 @@ class ArchiveLimits:
     total_bytes: int = 16 << 30
     member_bytes: int = 1 << 30
     ratio: float = 100.0  # unpacked / packed; PNG and JPEG do not shrink at all, uncompressed TIFF plates by about 20
-    ratio_floor_bytes: int = 32 << 20  # below this no ratio is a danger
+    ratio_floor_bytes: int = 32 << 20  # the ratio is not checked below so many unpacked bytes
     depth: int = 8
-    name_length: int = 150  # a component; with the folder's own path it must stay below 4096
+    name_length: int = 150  # bytes of one part of a path; the whole path must stay below 4096
 
 
 @dataclass(frozen=True, slots=True)
 class _Member:
-    """``guessed``: whether nothing tells the encoding of the name."""
+    """Holds one member of an archive. ``guessed`` tells that the archive does not state the encoding of the name."""
 
     name: str
     size: int
@@ -76,14 +75,14 @@ class _Member:
 
     @property
     def shown(self) -> str:
-        """Returns the name as messages have it; what may be garbled is not shown."""
+        """Returns the name for messages; a name that may be garbled is replaced."""
         text = re.sub(r"[^\x00-\x7f]", "?", self.name) if self.guessed else self.name
         return f"{text!r:.120}"
 
 
 @dataclass(slots=True)
 class _Faults:
-    """What is wrong with members, said once of all that have the same: messages that differ in ``member`` alone."""
+    """Collects faults of members; those whose messages differ only in ``member`` are reported once."""
 
     by_cause: dict[tuple[object, ...], list[Message]] = field(default_factory=dict)
 
@@ -109,9 +108,8 @@ def is_archive(path: Path) -> bool:
 def extract_archive(path: Path, folder: Path, limits: ArchiveLimits = ArchiveLimits()) -> tuple[str, ...]:
     """Unpacks ``path`` into the empty or absent ``folder`` and returns the relative names of the files written.
 
-    Raises InputError naming every fault; then nothing is left in ``folder``. OSError (a full disk) passes through, with
-    nothing left either.
-    """
+    Raises InputError naming every fault, and OSError (a full disk, for example). In both cases ``folder`` is left
+    empty."""
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.iterdir()):
         raise InputError(folder.name, [compose("archive-folder-not-empty")])
@@ -124,7 +122,7 @@ def extract_archive(path: Path, folder: Path, limits: ArchiveLimits = ArchiveLim
 
 
 def pack_folder(folder: Path, path: Path) -> None:
-    """Writes the files below ``folder`` into an uncompressed .tar: images do not shrink any more."""
+    """Writes the files below ``folder`` into a .tar without compression, since images do not compress further."""
     with tarfile.open(path, "w") as archive:
         for file in sorted(file for file in folder.rglob("*") if file.is_file()):
             archive.add(file, arcname=file.relative_to(folder).as_posix(), recursive=False)
@@ -141,7 +139,7 @@ def _format(path: Path) -> str | None:
 
 
 def _is_old_header(head: bytes) -> bool:
-    """Whether a tar of before POSIX begins so: it has no sign but the sum over its first member's header."""
+    """Tells whether a tar from before POSIX begins so; only the checksum of its first header identifies it."""
     if len(head) < tarfile.BLOCKSIZE or not head[0]:
         return False
     try:
@@ -158,7 +156,7 @@ def _foreign_kind(path: Path) -> str | None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Iterable[_Member]]:
-    """The members of an archive; every way a damaged one can fail becomes an InputError."""
+    """Yields the members of an archive. Every failure that damage can cause is raised as InputError."""
     kind = _format(path)
     if kind is None:
         foreign = _foreign_kind(path)
@@ -170,7 +168,7 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
             with zipfile.ZipFile(path) as archive:
                 yield _zip_members(archive)
         else:
-            # tarfile's own way with gzip ends at the first of several members, as pigz and bgzip write them.
+            # tarfile's own gzip reader stops after the first of several gzip members, as pigz and bgzip write them.
             with (
                 gzip.open(path) if kind == "tar.gz" else path.open("rb") as stream,
                 tarfile.open(
@@ -190,7 +188,7 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
         RecursionError,
     ) as error:
         raise InputError("archive", [compose("archive-damaged", reason=_words(error))]) from error
-    except (NotImplementedError, RuntimeError) as error:  # what zipfile raises for methods and keys it does not have
+    except (NotImplementedError, RuntimeError) as error:  # zipfile's errors for unknown methods and encrypted members
         raise InputError("archive", [compose("archive-not-unpacked", reason=_words(error))]) from error
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EACCES, errno.EROFS, errno.EMFILE):
@@ -199,7 +197,8 @@ def _opened(path: Path) -> Iterator[Iterable[_Member]]:
 
 
 class _TarInfo(tarfile.TarInfo):
-    """tarfile reads the extra header of a long name into memory whole, whatever size it claims."""
+    """Limits the size of extra headers, such as a long name: tarfile reads them whole into memory, whatever size they
+    claim."""
 
     def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
         if self.type not in (*tarfile.SUPPORTED_TYPES, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE):
@@ -212,7 +211,7 @@ class _TarInfo(tarfile.TarInfo):
 
 
 def _check_directory_size(path: Path) -> None:
-    """zipfile reads the list of members into memory whole; its length stands in the end record."""
+    """Raises InputError if the zip's list of members is too long: zipfile reads it whole into memory."""
     with path.open("rb") as stream:
         end = zipfile._EndRecData(stream)  # type: ignore[attr-defined]
     if end is not None and end[5] > DIRECTORY_BYTES_MOST:
@@ -241,7 +240,8 @@ def _zip_members(archive: zipfile.ZipFile) -> list[_Member]:
 
 
 def _zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, *, windows: bool) -> _Member:
-    """``windows``: whether no name in the archive has a slash, so that backslashes of DOS's and .NET's are slashes."""
+    """Returns a member of a zip. ``windows``: no name in the archive has a slash, so that backslashes separate
+    folders."""
     name, guessed = info.orig_filename, False
     if not info.flag_bits & UTF8_FLAG:
         raw = name.encode("cp437")  # as zipfile decoded it
@@ -292,15 +292,15 @@ def _buffered(stream: object) -> BufferedIOBase:
 
 
 def _extract(members: Iterable[_Member], folder: Path, limits: ArchiveLimits, packed_bytes: int) -> tuple[str, ...]:
-    """Writes the files while no fault is known; after the first fault only the rest of the list is judged. Whether a
-    name is kept is known at the end, when all files lie in one folder or do not."""
+    """Writes the files until the first fault; the members after it are only checked. A fault in the name of a folder
+    counts only if the folder is kept, which is known at the end: a folder around all files is not."""
     faults = _Faults()
     seen: dict[str, tuple[str, str]] = {}
     odd: dict[tuple[str, ...], list[Message]] = {}
     written: list[str] = []
     room = min(limits.total_bytes, max(limits.ratio_floor_bytes, int(limits.ratio * packed_bytes)))
     for number, member in enumerate(members, 1):
-        room -= max(0, member.size)  # to pass over a tar's member means to unpack it
+        room -= max(0, member.size)  # skipped members count too: a tar's member is unpacked to skip it
         if number > limits.members or room < 0 or member.size > limits.member_bytes:
             faults.add(_too_much(number, member, limits, packed_bytes))
             break
@@ -322,7 +322,7 @@ def _extract(members: Iterable[_Member], folder: Path, limits: ArchiveLimits, pa
 
 
 def _common_folder(names: Sequence[str]) -> tuple[str, ...]:
-    """The parts of the innermost folder that holds all files."""
+    """Returns the parts of the path of the innermost folder that contains all files."""
     folders = [tuple(name.split("/")[:-1]) for name in names] or [()]
     return tuple(same[0] for same in takewhile(lambda parts: len(set(parts)) == 1, zip(*folders, strict=False)))
 
@@ -357,8 +357,8 @@ def _judge(
     faults: _Faults,
     limits: ArchiveLimits,
 ) -> str | None:
-    """The relative name to write to (None: nothing to write). Adds what is wrong with the member to ``faults``, and to
-    ``odd`` what is wrong with a part of its name, should that be kept."""
+    """Returns the relative name to write a member to; None if there is nothing to write. Adds its faults to ``faults``,
+    and those of a part of its name, which count only if that part is kept, to ``odd`` under the part's path."""
     if member.kind not in ("file", "folder"):
         faults.add(compose("member-no-file", member=member.shown, kind=_NO_FILES[member.kind]))
         return None

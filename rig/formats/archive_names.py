@@ -1,9 +1,8 @@
-"""Names of an archive's members: how their bytes are read, and which names are not written.
+"""Decodes the names of an archive's members, and refuses names that must not be written.
 
-Names are UTF-8 where their bytes are, whatever the archive says: macOS writes them so without the flag that tells it.
-Bytes that are not are read as code page 437, the format's own. What nobody keeps, the folders around the capture and
-what file managers add, may have any name that can be written.
-"""
+A name is read as UTF-8 if its bytes are valid UTF-8, whatever the archive states, because macOS writes UTF-8 without
+setting the flag for it; otherwise as code page 437, the zip format's own. Names that are not kept, those of folders
+around the capture and of files that file managers add, need only be writable."""
 
 import re
 import struct
@@ -13,7 +12,7 @@ import zlib
 from rig.formats.picture_names import JUNK
 from rig.messages.message import Message, compose
 
-UNICODE_PATH = 0x7075  # Info-ZIP's field of zip
+UNICODE_PATH = 0x7075  # number of Info-ZIP's extra field that holds a name in UTF-8
 COMPONENT_BYTES_MOST = 255  # of a file's or folder's name, on every usual file system
 DROPPED = frozenset(name.casefold() for name in JUNK)  # never written
 SCRIPTS = ("LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE", "COPTIC")  # alphabets whose letters look alike
@@ -29,7 +28,8 @@ def decoded_name(raw: bytes) -> tuple[str, bool]:
 
 
 def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
-    """Returns the name in UTF-8 that Info-ZIP writes beside one in another encoding, where it belongs to ``raw``."""
+    """Returns the name in UTF-8 from Info-ZIP's extra field, or None. The field counts only if its checksum is that of
+    the name ``raw``."""
     at = 0
     while at + 4 <= len(extra):
         kind, size = struct.unpack_from("<HH", extra, at)
@@ -46,11 +46,13 @@ def unicode_path(extra: bytes, raw: bytes) -> bytes | None:
 
 
 def is_dropped(part: str) -> bool:
+    """Tells whether a file or folder of this name is never written: file managers add it."""
     return part.startswith("._") or part.casefold() in DROPPED
 
 
 def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[str, str]]) -> Message | None:
-    """Returns a name that another member has already, or that some file system or reader takes for another's."""
+    """Returns a fault if a name repeats another member's, or if some file system or reader would take both for the
+    same. Adds the name to ``seen``."""
     name = "/".join(parts)
     key = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
     other = seen.get(key)
@@ -65,7 +67,7 @@ def name_clash(parts: list[str], shown: str, kind: str, seen: dict[str, tuple[st
 
 
 def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[Message]:
-    """Returns what no member may be called, kept or not; messages call it ``shown``."""
+    """Returns faults of a member's path that no member may have, kept or not. Messages call the member ``shown``."""
     if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
         return [compose("member-name-invisible", member=shown)]
     if "\\" in name or re.match(r"^[A-Za-z]:", name):
@@ -84,7 +86,7 @@ def path_faults(name: str, shown: str, *, depth: int, name_length: int) -> list[
 
 
 def name_faults(part: str, shown: str, *, name_length: int) -> list[Message]:
-    """Returns what a file or folder that is kept may not be called."""
+    """Returns faults of one part of a path that a kept file or folder must not have."""
     faults = []
     if any(unicodedata.category(c) in ("Cf", "Co", "Cn", "Zl", "Zp") for c in part):
         faults.append(compose("member-name-invisible", member=shown))

@@ -1,10 +1,9 @@
-"""A script that puts a rig's cameras into a Blender scene: ``blender --python cameras.py``, or Blender's text editor.
+"""Writes a script that puts a rig's cameras into a Blender scene: ``blender --python cameras.py``, or its text editor.
 
-Blender's camera (https://docs.blender.org/api/current/bpy.types.Camera.html): with ``sensor_fit`` HORIZONTAL the
-focal length in pixels is ``lens width / sensor_width``; ``shift_x`` and ``shift_y`` move the frame to the right and up
-by shares of the width; no distortion. Axes: x right, y up, z backwards; lengths in metres. Photographs as backgrounds
-fit only where they are undistorted; what a lens bends at the corners is in each camera's note.
-"""
+Blender's camera (https://docs.blender.org/api/current/bpy.types.Camera.html): with ``sensor_fit`` HORIZONTAL the focal
+length in pixels is ``lens width / sensor_width``; ``shift_x`` and ``shift_y`` move the frame to the right and up by
+shares of the width; there is no distortion. Axes: x right, y up, z backwards; lengths in metres. Photographs fit as
+backgrounds only if they are undistorted; each camera's note says how far its lens moves the picture's corners."""
 
 import json
 from pathlib import Path
@@ -51,7 +50,7 @@ bpy.context.scene.camera = bpy.data.objects[CAMERAS[0]["name"]]
 
 
 def write_blender(rig: Rig, path: Path) -> None:
-    """Writes the script."""
+    """Writes the script to ``path``."""
     entries = ",\n".join(json.dumps(_entry(camera)) for camera in rig)
     write_atomically(path, _SCRIPT.replace("{cameras}", f"[{entries}]").encode())
 

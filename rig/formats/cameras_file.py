@@ -1,13 +1,14 @@
-"""Rigs in other programs' files: COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML,
-Metashape's XML, RealityCapture's XMP and CSV, nerfstudio's ``transforms.json``, OpenCV's YAML; and out to Blender.
+"""Reads and writes rigs in other programs' files.
 
-Every reader turns its file into the ``eigenhead-cameras/1`` document and lets ``rig_from_document`` judge it, so that
-all formats meet the same checks. Where each layout is described stands at its module's head.
+Read and written are COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML, Metashape's XML,
+RealityCapture's XMP and CSV, nerfstudio's ``transforms.json`` and OpenCV's YAML; Blender's script is only written.
+Every reader turns its file into the ``eigenhead-cameras/1`` document and passes it to ``rig_from_document``, so that
+all formats meet the same checks. Each format's module says where its layout is described.
 
-Pixels: this project and OpenCV put (0, 0) at the centre of the top-left pixel; COLMAP, Metashape, RealityCapture and
-nerfstudio (0.5, 0.5). Lengths become millimetres: caliscope, Metashape and RealityCapture are in metres; COLMAP's
-scale is free and taken as millimetres; aniposelib's, nerfstudio's and OpenCV's are told by the size of the rig.
-"""
+Pixels: in this project and OpenCV the centre of the top-left pixel is (0, 0); in COLMAP, Metashape, RealityCapture and
+nerfstudio it is (0.5, 0.5). Lengths become millimetres: caliscope, Metashape and RealityCapture are in metres; COLMAP's
+scale is free and taken as millimetres; the unit of aniposelib, nerfstudio and OpenCV follows from the size of the
+rig."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -42,14 +43,14 @@ WRITERS: dict[str, Callable[[Rig, Path], None]] = {
     "blender": write_blender,
 }
 FORMATS = tuple(WRITERS)
-FOLDER_FORMATS = ("colmap", "colmap-text", "realitycapture", "opencv-yaml")  # of several files
+FOLDER_FORMATS = ("colmap", "colmap-text", "realitycapture", "opencv-yaml")  # formats of several files
 NO_RIG = compose("no-rig-file")
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
-HEAD_BYTES = 1 << 16  # of an XMP file that other programs wrote to, the names of their formats come first
+HEAD_BYTES = 1 << 16  # read to recognise an XMP file; the names of the formats in it stand near its beginning
 
 
 def no_rig_fault(folder: Path) -> Message:
-    """Describes a folder without a rig's file, by the captures in it where there are some."""
+    """Returns the fault of a folder without a rig's file; if it contains captures instead, the fault names them."""
     inner = sorted(path for path in folder.iterdir() if path.is_dir() and not is_junk(path.name))
     captures = [path.name for path in inner if find_rig_file(path) is not None]
     return compose("captures-inside", captures=some_of(captures)) if len(captures) > 1 else NO_RIG
@@ -105,7 +106,7 @@ def read_rig_file(path: Path) -> Rig:
 
 
 def read_cameras(path: Path) -> CamerasRead:
-    """Returns the rig in a file of any known format, with what its reader noticed. Raises InputError naming every
+    """Returns the rig in a file of any known format, with its reader's remarks. Raises InputError naming every
     fault."""
     if path.name == "transforms.json":
         return read_transforms(path)
@@ -123,7 +124,7 @@ def read_cameras(path: Path) -> CamerasRead:
 
 
 def rig_file_parts(path: Path) -> tuple[Path, ...]:
-    """Returns the files from which ``read_rig_file`` reads ``path``: of most formats one."""
+    """Returns all files that ``read_rig_file`` reads for ``path``; most formats have one."""
     if path.suffix in (".bin", ".txt"):
         return path, path.with_stem("images")
     if path.suffix == ".xmp":
@@ -132,14 +133,15 @@ def rig_file_parts(path: Path) -> tuple[Path, ...]:
 
 
 def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
-    """Writes a rig in a format of ``FORMATS``; COLMAP's, XMP and YAML are folders. Raises InputError for another."""
+    """Writes a rig in the format ``kind``, one of ``FORMATS``; for ``FOLDER_FORMATS`` the path is a folder. Raises
+    InputError for another kind."""
     if kind not in WRITERS:
         raise InputError("format", [compose("none-of", value=f"{kind!r}", known=FORMATS)])
     WRITERS[kind](rig, path)
 
 
 def _head(path: Path) -> bytes:
-    """The first bytes of a file that may be one of ours; none where it cannot be read."""
+    """Returns the first bytes of a file, by which its format is recognised; no bytes if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")

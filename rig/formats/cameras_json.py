@@ -1,4 +1,4 @@
-"""The project's own file for a rig's cameras: ``cameras.json`` (``eigenhead-cameras/1``)."""
+"""Reads and writes ``cameras.json`` (``eigenhead-cameras/1``), the project's own file for a rig's cameras."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,8 @@ class PoseDocument(TypedDict):
 
 
 class CameraDocument(TypedDict):
-    """``covariance``: 6 x 6, rotation (rad) then translation (mm); ``serial``: of the body, as EXIF has it."""
+    """Holds one camera. ``covariance`` is 6 x 6, rotation (rad) then translation (mm); ``serial`` is the body's serial
+    number as EXIF has it."""
 
     name: str
     width: int
@@ -41,7 +42,7 @@ class CameraDocument(TypedDict):
 
 
 class CamerasDocument(TypedDict):
-    """``cameras.json``."""
+    """Holds the content of ``cameras.json``."""
 
     format: str
     unit: str
@@ -49,19 +50,21 @@ class CamerasDocument(TypedDict):
 
 
 def read_rig(path: Path) -> Rig:
-    """Reads ``cameras.json``. Raises InputError naming every fault in it."""
+    """Returns the rig in ``cameras.json``. Raises InputError naming every fault in it."""
     try:
-        document = json.loads(path.read_bytes())  # of 8, 16 or 32 bits, as its first bytes tell
+        document = json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
     return rig_from_document(document, path.name)
 
 
 def write_rig(rig: Rig, path: Path) -> None:
+    """Writes ``cameras.json``, under a temporary name first."""
     write_atomically(path, json.dumps(document_from_rig(rig), indent=1).encode())
 
 
 def document_from_rig(rig: Rig) -> CamerasDocument:
+    """Returns the content of ``cameras.json`` for a rig."""
     return {"format": FORMAT, "unit": "mm", "cameras": [_camera_document(camera) for camera in rig]}
 
 
@@ -90,7 +93,7 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
 
 
 def _unit_fault(unit: Any) -> Message:
-    """A unit that is no millimetre, with the factor where it is known."""
+    """Returns the fault of a unit that is not millimetres, with the factor to millimetres where it is known."""
     written = f"{unit!r:.80}"
     factor = UNITS_MM.get(unit.lower()) if isinstance(unit, str) else None
     if factor is None:
@@ -99,7 +102,7 @@ def _unit_fault(unit: Any) -> Message:
 
 
 def _repeated(names: list[str]) -> list[Message]:
-    """One sentence for all names that several cameras have: a list written twice repeats every one of them."""
+    """Returns one fault for all names that several cameras have: a list written twice repeats every one of them."""
     repeated = [name for name in sorted(set(names)) if names.count(name) > 1]
     if not repeated:
         return []
@@ -155,7 +158,8 @@ def _lens_document(camera: Camera) -> dict[str, str | float]:
 
 
 def _read_lens(lens: Any, where: str, faults: list[Message]) -> tuple[Distortion, RecordedLens | None]:
-    """Our own lens, or a pinhole and the lens that its pictures are undistorted from."""
+    """Returns the camera's own distortion, or no distortion and the recorded lens that its pictures are undistorted
+    from."""
     model = lens.get("model", "brown-conrady") if isinstance(lens, dict) else "brown-conrady"
     known: LensModel | None = next((name for name in COEFFICIENTS if name == model), None)
     if known is None and model != "brown-conrady":

@@ -1,14 +1,14 @@
-"""One synchronised shot of every camera, and the folder that holds it.
+"""Reads and writes the folder of one synchronised shot of every camera.
 
-cameras.json                       (or a COLMAP, caliscope or aniposelib file: rig.formats.cameras_file)
+cameras.json                       (or another program's file: rig.formats.cameras_file)
 images/<camera>.png|jpg|jpeg|tif|webp|bmp|ppm|pgm, RAW, DNG or HEIC
 background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
 features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
 
-Without background/ and masks/ altogether the subject is the opaque part of pictures that were all cut out, else it is
-found from the photographs. Without images/ the pictures lie beside cameras.json. Which file is whose, where names
-differ, is found in ``rig.formats.shot_files``.
+Without background/ and masks/ the subject is the opaque part if every picture was cut out; otherwise it is segmented
+from the photographs. Without images/ the pictures lie beside cameras.json. ``rig.formats.shot_files`` decides which
+file belongs to which camera where names differ.
 """
 
 import hashlib
@@ -48,14 +48,16 @@ from rig.rig import Rig
 from rig.text import suggest
 
 SCALE = "scale.json"
-ENCLOSING_MOST = 3  # folders around a capture: of the archive, and of who packed a folder twice
-ALIKE_LEAST = 0.75  # of the names of two folders: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
+ENCLOSING_MOST = 3  # levels of single folders around a capture, as nested packing leaves them
+ALIKE_LEAST = 0.75  # likeness of two folders' names: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 
 
 def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
-    """Reads a capture folder; pictures and feature points of a ``recorded`` lens come undistorted. Pictures of more
-    than ``pixels_most`` pixels come smaller, and so do their cameras (``rig.formats.work_size``). Raises InputError
-    that names every fault in it."""
+    """Reads a capture folder and returns its capture and cameras.
+
+    Pictures and feature points of a ``recorded`` lens are undistorted. Pictures of more than ``pixels_most`` pixels are
+    reduced, and their cameras with them (``rig.formats.work_size``). Raises InputError naming every fault of the
+    folder."""
     faults: list[Message] = []
     folder = capture_root(folder)
     rigs = [*rig_files(folder)]
@@ -94,7 +96,7 @@ def read_rig_of(rig_file: Path) -> CamerasRead:
 
 
 def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
-    """Returns pictures that belong to no camera, and folders of pictures that are nobody's."""
+    """Returns remarks on pictures that belong to no camera, and on folders of pictures that are not read."""
     remarks = [stray_sentence(files.strays, rig)] if files.strays else []
     known = ("images", *BESIDE_PICTURES, *rig.names)
     for path in sorted(folder.iterdir()):
@@ -106,7 +108,7 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
-    """Cameras of another program: files that do nothing here."""
+    """Returns remarks on the files of further rigs in the folder: only the first of ``rigs`` is read."""
     read, *others = (path.relative_to(folder).as_posix() for path in rigs)
     others += _other_models(folder, rigs[0])
     remarks = [compose("cameras-unread", file=other, read=read) for other in others]
@@ -114,7 +116,8 @@ def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
 
 
 def _other_models(folder: Path, rig_file: Path) -> list[str]:
-    """COLMAP models beside the one that is read: the same in another encoding, and cameras that joined no other."""
+    """Returns further COLMAP models: the same one in the other encoding, and those of images that were registered
+    separately."""
     if rig_file.suffix not in (".bin", ".txt"):
         return []
     twin = rig_file.with_suffix(".txt" if rig_file.suffix == ".bin" else ".bin")
@@ -125,13 +128,16 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
 
 
 def has_known_length(folder: Path) -> bool:
-    """Tells whether a length beside cameras tells their unit: scale.json, unless it told that when the cameras were
-    found."""
+    """Tells whether scale.json fixes the unit of the cameras. It does not where it was used already when the cameras
+    were calibrated from the photographs."""
     return (folder / SCALE).is_file() and not (folder / "calibration.json").is_file()
 
 
 def capture_root(folder: Path) -> Path:
-    """Returns ``folder``, or the single folder in it, and in that: an archive may hold enclosing folders."""
+    """Returns the capture's own folder: ``folder``, or the single folder in it, and so on, as archives have enclosing
+    folders.
+
+    Raises InputError if ``folder`` is no folder."""
     if not folder.is_dir():
         raise InputError(str(folder.name or folder), [compose("no-capture-folder")])
     for _ in range(ENCLOSING_MOST):
@@ -145,8 +151,9 @@ def capture_root(folder: Path) -> Path:
 
 
 def check_folders(folder: Path, rig: Rig) -> None:
-    """Raises InputError for folders that nobody would read, and that are meant to be one of a capture's own: without a
-    word the subject would be found without its plates, or every picture be missing."""
+    """Raises InputError for folders whose names nearly are one of a capture's own, such as "backgrounds".
+
+    They would not be read, and the subject would be segmented without its clean plates, or every picture be missing."""
     kinds = ("images", *BESIDE_PICTURES)
     folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
     others = {name.casefold(): name for name in folders if name not in (*kinds, *rig.names)}
@@ -169,8 +176,9 @@ def read_shot(
     with_features: bool = True,
     with_cut_outs: bool = True,
 ) -> Capture:
-    """Returns the images of a folder for a known rig, as ``work_rig`` sees them; appends every fault to ``faults``, but
-    those of ``files``, which were found before."""
+    """Returns the images of a folder for a known rig, at the size and undistorted as ``work_rig`` describes them.
+
+    Every fault is appended to ``faults``, except those of ``files``, which its finder has reported already."""
     if files is None:
         files = find_files(folder, rig)
         faults += files.faults
@@ -219,8 +227,10 @@ def read_shot(
 def _cut_outs(
     folder: Path, jobs: Sequence[tuple[str, str, Path]], rig: Rig, pixels_most: int | None
 ) -> MaskSubjects | None:
-    """The masks of pictures that were all cut out, of their alpha; None where one was not, or has an alpha that is no
-    mask: nobody said that it is one, so it is no fault."""
+    """Returns masks made of the alpha channel, if the subject was cut out in every picture.
+
+    Returns None if one picture is not cut out, or its alpha is no valid mask. That is no fault, since nobody declared
+    the alpha to be a mask."""
     found = {}
     for _, name, path in jobs:
         alpha, k = cut_out_alpha(path), rig[name].intrinsics
@@ -235,7 +245,8 @@ def _cut_outs(
 def _sample_bits(
     jobs: Sequence[tuple[str, str, Path]], faults: list[Message]
 ) -> tuple[Mapping[str, int], list[Message]]:
-    """Bits that the files of each kind use of 16, and what is said of fewer; undeveloped mosaics are a fault."""
+    """Returns, for each kind of files, how many of 16 bits are used, and a remark where they are fewer. Sensor mosaics
+    that were not developed are appended to ``faults``."""
     kinds = ("images", "background")
     samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
     mosaics = [f"{kind}/" for kind in kinds if samples[kind].mosaic]
@@ -256,8 +267,8 @@ def _grey_remarks(images: Mapping[str, np.ndarray]) -> list[Message]:
 
 
 def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
-    """Writes a capture folder of PNG files, the pictures as ``rig``'s cameras took them; every file under a temporary
-    name first."""
+    """Writes a capture folder of PNG files, each under a temporary name first. ``rig`` are the cameras of these
+    pictures."""
     write_rig(rig, folder / "cameras.json")
     files: list[tuple[Path, np.ndarray]] = []
     for name, image in capture.images.items():
@@ -277,7 +288,8 @@ def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
 
 
 def _in_read_pictures(features: Features, rig: Rig) -> Features:
-    """Points that were picked in the files, where the pictures are undistorted as they are read."""
+    """Moves feature points from the pictures in the files to the pictures as they are read, where these are
+    undistorted."""
 
     def moved(name: str, pixel: np.ndarray) -> np.ndarray:
         lens = rig[name].recorded
@@ -300,7 +312,7 @@ def _decode(
     size = (pixels.shape[1], pixels.shape[0]) if whole or share == 1.0 else picture_size(path)
     if size != wanted:
         return None, "", size_fault(where, size, camera.intrinsics)
-    if whole:  # what its numbers mean is asked of all masks together, and before pixels are averaged
+    if whole:  # masks are interpreted together, and before pixels are averaged
         return pixels, digest, fault
     if camera.recorded is not None:
         matrix = work_rig(rig.subset([name]), pixels_most)[name].intrinsics.matrix()

@@ -1,9 +1,8 @@
-"""The masks of a capture, read together: what their numbers mean, which of two levels is the subject, and its outline
-in the pictures that cameras are taken to have made.
+"""Reads the masks of one capture together: what their values mean, and which of two levels is the subject.
 
-Enters: a plane a camera, as ``rig.formats.images`` decodes it. Leaves: masks (True = subject), the greys of those whose
-edges are soft, and what was noticed. Faults are appended, one sentence for files that share one.
-"""
+Enters: one plane a camera, as ``rig.formats.images`` decodes it. Leaves: masks (True = subject) of the size of the
+pictures that are worked on, the grey values of masks with soft edges, and remarks. Faults are appended to a list; files
+with the same fault share one sentence."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,14 +17,15 @@ from rig.mask_polarity import inverted_masks
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
-SPECK_SHARE = 0.02  # of the largest piece: less is no part of a subject; a head above a collar is 0.3 of a torso
-HOLE_SHARE = 3e-4  # of the subject: whites of eyes; gaps in hair are larger, as in ``pipeline.segmentation.segment``
-SPECKS_TOLD = 0.011  # of the subject's area; 0.0004 to 0.0103 in true masks, in strands of hair
+SPECK_SHARE = 0.02  # of the largest piece's area: smaller pieces are dropped; a head above a collar has 0.3 of a torso
+HOLE_SHARE = 3e-4  # of the subject's area: smaller holes are filled (whites of eyes); gaps in hair are larger
+SPECKS_TOLD = 0.011  # of the subject's area: a remark from here on; strands of hair in true masks make 0.0004 to 0.0103
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskSubjects:
-    """``masks``: True where the subject is; ``soft``: its share of a pixel, 0 to 255, where edges are soft."""
+    """Holds the masks of a capture by camera. ``masks`` are True where the subject is; ``soft`` has the subject's share
+    of each pixel, 0 to 255, of masks with soft edges; ``remarks`` are warnings."""
 
     masks: Mapping[str, Bool[np.ndarray, "_ _"]]
     soft: Mapping[str, UInt8[np.ndarray, "_ _"]]
@@ -35,13 +35,13 @@ class MaskSubjects:
 def mask_subjects(
     planes: Mapping[str, tuple[str, Plane]], rig: Rig, faults: list[Message], *, pixels_most: int | None = None
 ) -> MaskSubjects:
-    """Reads the masks of one capture as ``work_rig`` sees them.
+    """Reads the masks of one capture, at the size that ``work_rig`` describes.
 
     Args:
-        planes: by camera the file's name, for faults, and its pixels, of the camera's size.
+        planes: by camera, the file's name (for faults) and its pixels, of the camera's size.
         rig: the cameras as calibrated.
-        faults: what cannot be used is appended.
-        pixels_most: as of ``rig.formats.work_size``.
+        faults: receives a fault for each mask that cannot be used.
+        pixels_most: as in ``rig.formats.work_size``.
     """
     readings = read_masks({name: plane for name, (_, plane) in planes.items()})
     files = {name: file for name, (file, _) in planes.items()}
@@ -70,13 +70,14 @@ def mask_subjects(
 
 
 def _without_specks(share: Share) -> tuple[Share, float]:
-    """A mask without small pieces apart from the subject and without small holes, and their area by the subject's.
+    """Removes small pieces apart from the subject and fills small holes; returns the mask, and the changed area
+    relative to the subject's.
 
-    One speck at the border of the picture would be part of the outline that cameras are compared by."""
+    A single speck at the picture's border would otherwise become part of the outline by which cameras are compared."""
     white = share > 127
     changed, area, lost = share, max(int(np.count_nonzero(white)), 1), 0
     for fill in (0, 255):
-        of = changed > 127 if fill == 0 else changed <= 127  # holes of specks went with them
+        of = changed > 127 if fill == 0 else changed <= 127  # after the specks, whose holes are gone with them
         _, labels, stats, _ = cv2.connectedComponentsWithStats(of.astype(np.uint8), connectivity=8 if fill == 0 else 4)
         labels, areas = np.asarray(labels, np.int32), np.asarray(stats, np.int64)[:, cv2.CC_STAT_AREA]
         largest = int(areas[1:].max(initial=0))
@@ -92,14 +93,15 @@ def _without_specks(share: Share) -> tuple[Share, float]:
     if lost == 0:
         return share, 0.0
     near = cv2.dilate((changed != share).astype(np.uint8), np.ones((5, 5), np.uint8)).view(bool)
-    changed = np.where(near, np.where(changed > 127, np.uint8(255), np.uint8(0)), changed)  # their soft rims, too
+    # The soft edges of removed specks and filled holes are removed too.
+    changed = np.where(near, np.where(changed > 127, np.uint8(255), np.uint8(0)), changed)
     return changed, lost / area
 
 
 def _in_picture(
     share: Share, reading: MaskReading, name: str, rig: Rig, pixels_most: int | None
 ) -> UInt8[np.ndarray, "_ _"]:
-    """A mask of a file as large as the picture that is worked on, and undistorted like it."""
+    """Returns a mask as large as the pictures that are worked on, and undistorted like them."""
     camera = rig[name]
     scale = work_share(camera.intrinsics, pixels_most)
     pixels = at_share(share, (share.shape[1], share.shape[0]), scale)
@@ -110,7 +112,7 @@ def _in_picture(
 
 
 def _middles(rig: Rig) -> dict[str, np.ndarray]:
-    """Where each camera sees the point that all look at; nothing where they are too few to have one."""
+    """Returns the pixel at which each camera sees the point that all cameras look at; nothing for a single camera."""
     if len(rig) < 2:
         return {}
     point = rig.centre_world()[None]
@@ -120,7 +122,7 @@ def _middles(rig: Rig) -> dict[str, np.ndarray]:
 
 
 def _by_cause(messages: Mapping[str, Message | None]) -> list[Message]:
-    """One message for all files of which the same is true."""
+    """Groups equal messages: one for all files that share it."""
     files: dict[Message, list[str]] = {}
     for file, message in messages.items():
         if message is not None:

@@ -1,8 +1,8 @@
-"""COLMAP models, text and binary (https://colmap.github.io/format.html; parameter order of
+"""Reads and writes COLMAP models, text and binary (https://colmap.github.io/format.html; parameter order of
 ``src/colmap/sensor/models.h``).
 
-COLMAP puts pixel (0.5, 0.5) at the centre of the top-left pixel, this project (0, 0): half a pixel is taken off on the
-way in and added on the way out. Its scale is free and taken as millimetres."""
+In COLMAP the centre of the top-left pixel is (0.5, 0.5), in this project (0, 0): half a pixel is subtracted on reading
+and added on writing. COLMAP's scale is free and taken as millimetres."""
 
 import math
 import struct
@@ -52,7 +52,8 @@ COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 
 def read_colmap(folder: Path, suffix: str = ".bin") -> CamerasRead:
-    """Returns the rig in a COLMAP model: every image is a camera of this project, named after the image file."""
+    """Returns the rig in a COLMAP model: each image becomes a camera of this project, named after the image file.
+    Raises InputError naming every fault."""
     files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
     subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
     binary = suffix == ".bin"
@@ -81,7 +82,7 @@ def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = 
 
 
 class _Records:
-    """Little-endian records read one after the other; ``struct.error`` where the bytes end too early."""
+    """Reads little-endian records one after the other. Raises ``struct.error`` if the bytes end too early."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.at = data, 0
@@ -92,8 +93,8 @@ class _Records:
         return values
 
     def count(self, least_bytes: int) -> int:
-        """Returns a count whose records can still fit in the file; a larger one is damage, found before it costs
-        anything."""
+        """Reads a number of records of at least ``least_bytes`` each. Raises Malformed if so many cannot fit in the
+        rest of the file, before memory is spent on them."""
         (count,) = self.take("Q")
         if count * least_bytes > len(self.data) - self.at:
             raise Malformed(compose("records-promised", records=str(count)))
@@ -113,7 +114,7 @@ class _Records:
 
 @dataclass(frozen=True, slots=True)
 class ColmapCamera:
-    """``values``: the model's parameters, in its order."""
+    """Holds a camera of a COLMAP model; ``values`` are its parameters in the order of that model."""
 
     model: str
     width: int
@@ -123,7 +124,8 @@ class ColmapCamera:
 
 @dataclass(frozen=True, slots=True)
 class ColmapImage:
-    """``pose``: quaternion and translation; ``camera``: its number."""
+    """Holds an image of a COLMAP model: quaternion and translation of camera_from_world, and the number of its
+    camera."""
 
     pose: list[float]
     camera: int
@@ -174,7 +176,7 @@ def _text_cameras(data: bytes) -> dict[int, ColmapCamera]:
 
 
 def _text_images(data: bytes) -> list[ColmapImage]:
-    """An image is a line, and the line after it holds its points; files that are written by hand often have none."""
+    """Reads images: one line each, followed by a line with its points, which files written by hand often lack."""
     images: list[ColmapImage] = []
     after_image = False
     for line in _text_lines(data):
@@ -194,8 +196,11 @@ def _text_images(data: bytes) -> list[ColmapImage]:
 
 
 def _is_of_points(line: str) -> bool:
-    """Whether a line after an image's is that of its points: X, Y and a whole number each, or nothing. An image's
-    line has ten words and more, of which a name that is no number is one; ten numbers are not three to a point."""
+    """Tells whether a line lists points, as X, Y and a whole number each, or is empty; it may as well be the next
+    image's.
+
+    An image's line has ten words or more and among them a name; ten numbers cannot be points, since 3 does not divide
+    10."""
     words = line.split()
     try:
         return len(words) % 3 == 0 and all(
@@ -254,7 +259,7 @@ def _unit_quaternion(values: list[float]) -> tuple[float, ...]:
 
 
 def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
-    """The model's name and its parameters."""
+    """Returns the name and the parameters of COLMAP's model for a camera."""
     k, lens = camera.intrinsics, camera.recorded
     frame = [k.fx, k.fy, k.cx + 0.5, k.cy + 0.5]
     if lens is None:

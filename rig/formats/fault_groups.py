@@ -1,19 +1,19 @@
-"""Faults that have one cause, said once: a file that is wrong is wrong in every camera."""
+"""Groups faults with one cause, so that an error in all cameras of a file is reported once."""
 
 import re
 from collections.abc import Iterable, Sequence
 
 from rig.messages.message import Message, compose, message_of
 
-NAMED_MOST = 4  # cameras or keys that one sentence names
-SAME_LEAST = 3  # faults that differ in names alone, from which on they are one cause
+NAMED_MOST = 4  # cameras or keys that one message names
+SAME_LEAST = 3  # from so many faults on that differ in names alone, one message stands for all
 MEASURED = re.compile(r"(?<![\w.])-?(?:\d+\.\d+(?:e[+-]?\d+)?(?![\w.])|\d+(?=%))")
-# no size in pixels, which tells cameras apart
+# matches no sizes in pixels: cameras that differ in size stay apart
 
 
 def say_once(faults: Sequence[Message | str], names: Iterable[str], *, named_most: int = NAMED_MOST) -> list[Message]:
-    """Returns faults that differ only in the names of cameras and of their files, and in what was measured of each, as
-    one sentence that names the first and how many others there are."""
+    """Groups faults that differ only in the names of cameras and files, and in the values measured for each. Each group
+    becomes one message that names the first and counts the others."""
     ordered = sorted(set(names), key=len, reverse=True)
     name = re.compile(r"(?<![^\W_])(" + "|".join(map(re.escape, ordered)) + r")(?![^\W_])") if ordered else None
     plate = re.compile(r"\b(background/)\S+")
@@ -35,6 +35,6 @@ def say_once(faults: Sequence[Message | str], names: Iterable[str], *, named_mos
 
 
 def some_of(names: Sequence[str], most: int = NAMED_MOST) -> Sequence[str] | Message:
-    """Returns a few names, and how many more there are, for a message."""
+    """Returns the first few names, and a note of how many more there are, for use in a message."""
     more = len(names) - most
     return compose("names-and-more", names=names[:most], more=more) if more > 0 else names

@@ -1,4 +1,4 @@
-"""Feature points in a file: ``features.json`` (``eigenhead-features/1``)."""
+"""Reads and writes ``features.json`` (``eigenhead-features/1``): feature points, pixels of landmarks by camera."""
 
 import json
 from typing import Any, TypedDict
@@ -68,6 +68,7 @@ def _of_point(landmark: str, fault: Message) -> Message:
 
 
 def document_from_features(features: Features) -> FeaturesDocument:
+    """Returns the content of ``features.json``."""
     points = {k: {name: [float(x) for x in pixel] for name, pixel in views.items()} for k, views in features.items()}
     return {"format": FEATURES_FORMAT, "points": points}
 

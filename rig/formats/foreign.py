@@ -1,4 +1,5 @@
-"""What all readers of other programs' files share: damage becomes an InputError, names and lenses become ours."""
+"""Holds what all readers of other programs' files share: errors for damaged files, cameras' names, conversion of
+lenses."""
 
 import re
 import struct
@@ -17,14 +18,14 @@ from rig.recorded_lens import COEFFICIENTS, LensModel
 
 T = TypeVar("T")
 MATRIX_PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
-LENS_LOSS_PX = 0.02  # a lens may lose so much on the way in: a tenth of what a camera's place is known by
+LENS_LOSS_PX = 0.02  # allowed error of a converted lens: a tenth of a calibration's error
 LENS_KEY = re.compile(r"[kpst]\d")  # coefficients of OpenCV's lenses, among other parameters of a camera
-METRES_MOST = 30.0  # the widest head rig, in metres; in millimetres it would fit in a hand
-BYTES_MOST = 1 << 29  # a sparse model of a rig is a few megabytes; its 2D points may be many
+METRES_MOST = 30.0  # files with all cameras within 30 units are in metres: no rig is 30 mm wide
+BYTES_MOST = 1 << 29  # far above the few megabytes of a rig's sparse model, whose 2D points may be many
 
 
 class Malformed(ValueError):
-    """Reports what a parser of this project finds wrong with the bytes of a file."""
+    """Reports a fault that one of this project's parsers finds in the bytes of a file."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -32,7 +33,8 @@ class Malformed(ValueError):
 
 
 def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
-    """Applies ``parse`` to the file's bytes, with whatever damage it meets reported as InputError."""
+    """Applies ``parse`` to the bytes of a file. Raises InputError for a damaged file, whatever ``parse`` raises for
+    it."""
     try:
         if path.stat().st_size > BYTES_MOST:
             raise InputError(path.name, [compose("file-large", most_mib=BYTES_MOST >> 20)])
@@ -63,9 +65,10 @@ def camera_names(files: list[str]) -> list[str]:
 def lens_entry(
     parameters: Mapping[str, float], where: str, faults: list[Message], *, fisheye: bool = False
 ) -> dict[str, str | float]:
-    """Returns the ``distortion`` of ``eigenhead-cameras/1`` of coefficients in OpenCV's names; those that are missing
-    are 0. The one place where a foreign lens gets its model: a coefficient that it does not have is a fault, unless
-    0."""
+    """Returns the ``distortion`` entry of ``eigenhead-cameras/1`` for coefficients under OpenCV's names; missing ones
+    are 0.
+
+    All foreign lenses get their model here. A coefficient other than 0 that the model does not have is a fault."""
     model: LensModel | None = "kannala-brandt" if fisheye else None
     if model is None and any(parameters.get(key, 0.0) for key in ("k4", "k5", "k6")):
         model = "rational"
@@ -78,8 +81,8 @@ def lens_entry(
 
 
 def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: list[Message]) -> np.ndarray:
-    """Converts ``value`` to an array; on a fault, to one of NaN of the wanted shape, so that the other faults are still
-    found."""
+    """Converts ``value`` to an array. If that fails, a fault is appended and an array of NaN of the wanted shape
+    returned, so that the remaining faults are still found."""
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -92,7 +95,8 @@ def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: 
 
 
 def xml_root(data: bytes) -> ElementTree.Element:
-    """Returns the root of an XML file without declarations of its own: entities may unfold to any size."""
+    """Returns the root of an XML file. Raises Malformed for a file with declarations, because entities can expand to
+    any size."""
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise Malformed(compose("xml-declares"))
     try:
@@ -102,8 +106,10 @@ def xml_root(data: bytes) -> ElementTree.Element:
 
 
 def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
-    """Returns width and height of camera ``name``'s picture in ``folder`` or its ``images``: some formats do not hold
-    them. Where there is none, a fault that says where to put it."""
+    """Returns width and height of the picture of camera ``name`` in ``folder`` or its ``images``, for formats without
+    sizes.
+
+    If there is no picture, a fault is appended that says where to put it, and a placeholder size is returned."""
     from rig.formats.images import picture_size  # decoders, which most formats do without
 
     for place in (folder, folder / "images", folder.parent / "images"):
@@ -122,11 +128,12 @@ def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
 def brown_conrady(
     radial: Sequence[float], radius: float, focal: float, where: str, faults: list[Message]
 ) -> list[float]:
-    """Computes k1 k2 k3 of a radial polynomial k1 k2 k3 k4 ..., fitted over the picture where k4 is not zero.
+    """Fits k1 k2 k3 to a radial polynomial k1 k2 k3 k4 ... over the picture; copies them if k4 and higher are zero.
 
     Args:
-        radius: how far the picture reaches, of ``X / Z``.
-        focal: px; the fit may miss by ``LENS_LOSS_PX`` of it.
+        radial: coefficients of the polynomial.
+        radius: radius (of ``X / Z``) of the picture's corner.
+        focal: focal length, px; the fit may be wrong by ``LENS_LOSS_PX`` at most, otherwise a fault is appended.
     """
     if not any(radial[3:]) or not np.isfinite([*radial, radius, focal]).all():
         return list(radial[:3])
@@ -141,6 +148,6 @@ def brown_conrady(
 
 
 def corner_radius(size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float]) -> float:
-    """Returns how far the corners lie from the axis, of ``X / Z``."""
+    """Returns the radius (of ``X / Z``) of the picture's farthest corner from the optical axis."""
     across, down = (max(c, n - c) / f if f > 0 else np.nan for n, f, c in zip(size, focal, centre, strict=True))
     return float(np.hypot(across, down))

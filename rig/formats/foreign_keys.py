@@ -1,10 +1,9 @@
-"""What becomes of each key of another program's file of cameras: the one table that readers obey and documents show.
+"""Declares what becomes of each key of another program's file of cameras; readers obey this table.
 
-``read``: the reader uses it. ``refused``: it changes what a camera is in a way that nothing here holds; the file is
-refused where it says anything. ``told``: it says something that is not used; a warning (``unknown-key``) names it.
-``nothing``: it has no bearing on where cameras stand and what their lenses do. A key that the table does not have is
-told, too. ``docs/foreign-cameras.md`` is made of this table; a test plants each key, and another holds the page to it.
-"""
+A key is ``read``: the reader uses it. ``refused``: it changes a camera in a way that this project cannot represent; the
+file is refused if the key has a value that matters. ``told``: its value is not used, and a warning (``unknown-key``)
+names it. ``nothing``: it has no influence on poses and lenses. A key that is missing from the table is warned of too.
+``docs/foreign-cameras.md`` is generated from this table; a test plants each key, and another compares the page."""
 
 from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
@@ -15,8 +14,9 @@ Treatment = Literal["read", "refused", "told", "nothing"]
 
 
 class ForeignKey(NamedTuple):
-    """``why``: what it is read as, or why it is not; a message where a reader tells it. ``silent``: values
-    at which a refused or told key says nothing, beside a missing one; of lists, that all their elements have."""
+    """Holds the rule of one key. ``why``: what the key is read as, or why it is not read (a message if a reader reports
+    it). ``silent``: values at which a refused or told key has no effect, as if it were missing; of a list, all elements
+    must be among them."""
 
     treatment: Treatment
     why: str | Message
@@ -27,7 +27,7 @@ Table = Mapping[str, ForeignKey]
 
 
 def says_nothing(value: object, rule: ForeignKey) -> bool:
-    """Tells whether ``value`` is missing, or is one of those at which the key has no meaning."""
+    """Tells whether ``value`` is missing or one of those at which the key has no effect."""
     return all(_is_one_of(part, rule.silent) for part in _parts(value))
 
 
@@ -49,7 +49,7 @@ def _is_one_of(part: object, silent: tuple[str | float | bool, ...]) -> bool:
 
 
 def _plain(value: object) -> str | float:
-    """Numbers and truths as they compare, however a file writes them."""
+    """Returns numbers and truth values in a comparable form, however a file writes them."""
     text = str(value).strip().casefold()
     try:
         return {"true": 1.0, "false": 0.0}[text] if text in ("true", "false") else float(text)
@@ -255,7 +255,7 @@ FOREIGN_KEYS: Mapping[str, tuple[str, Table]] = {
 
 
 def markdown_table(table: Table) -> str:
-    """Returns the table for ``docs/foreign-cameras.md``: a row for all keys of which the same is to be said."""
+    """Returns the table for ``docs/foreign-cameras.md``, with one row for all keys that share a description."""
     rows: dict[tuple[Treatment, str | Message], list[str]] = {}
     for key, rule in table.items():
         rows.setdefault((rule.treatment, rule.why), []).append(f"`{key}`")

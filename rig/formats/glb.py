@@ -1,4 +1,4 @@
-"""glTF binary with vertex colours or a texture. The writer is our own: trimesh's bytes differ between versions."""
+"""Writes binary glTF with vertex colours or a texture. It does not use trimesh, whose bytes differ between versions."""
 
 import json
 import struct
@@ -14,7 +14,7 @@ from rig.atomic_write import write_atomically
 from rig.colour_space import linear_from_srgb
 from rig.mesh import Mesh
 
-ROUGHNESS = 0.55  # of skin: 0.4 on an oily nose, 0.7 on a cheek
+ROUGHNESS = 0.55  # glTF's roughness of skin: 0.4 on an oily nose, 0.7 on a cheek
 WEBP = "image/webp"  # glTF 2.0 itself knows JPEG and PNG alone: EXT_texture_webp
 FLOAT, UINT, USHORT = 5126, 5125, 5123
 VERTICES, INDICES = 34962, 34963
@@ -22,8 +22,10 @@ VERTICES, INDICES = 34962, 34963
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skin:
-    """Holds a texture: coordinates a vertex, from the image's upper left corner, v downwards; the encoded image. Where
-    there is a normal map (PNG, linear, +Y up), the tangents that it is given in, with the bitangents' signs."""
+    """Holds a texture: one coordinate a vertex (from the image's upper left corner, v downwards) and the encoded image.
+
+    With a normal map (PNG, linear, +Y up) ``tangents`` are the tangents that it refers to, with the bitangents'
+    signs."""
 
     uv: Float[np.ndarray, "v 2"]
     image: bytes
@@ -83,7 +85,8 @@ Part = tuple[bytes, int, dict[str, Any]]  # data, what they are for, and their a
 def _parts(
     mesh: Mesh, normals: np.ndarray, colours: np.ndarray | None, skin: Skin | None
 ) -> tuple[list[Part], dict[str, int]]:
-    """Positions, normals, faces and looks; and which of them is which attribute."""
+    """Returns the buffers of positions, normals, faces and colours or texture, and which buffer serves which
+    attribute."""
     position, index = (mesh.vertices / 1000.0).astype("<f4"), mesh.faces.astype("<u4").ravel()
     unit = normals.astype("<f4")
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
@@ -116,7 +119,8 @@ def _bumps(skin: Skin | None) -> dict[str, Any]:
 
 
 def _texture(skin: Skin, view: int) -> dict[str, Any]:
-    """Images, from buffer view ``view`` on, and how they are read: the skin's, then its normal map."""
+    """Returns glTF's images, textures and samplers, with images from buffer view ``view`` on: the texture, then its
+    normal map."""
     webp, bumps = skin.mime == WEBP, skin.normal_map is not None
     source = {"extensions": {"EXT_texture_webp": {"source": 0}}} if webp else {"source": 0}
     used = ["EXT_texture_webp"]

@@ -1,9 +1,8 @@
-"""Picture files: read by their content, written so that no reader meets half of one.
+"""Reads picture files by their content, and writes them so that no reader meets a half-written file.
 
 Ordinary pictures (8 or 16 bits) are decoded by OpenCV, RAW and DNG by LibRaw, HEIC by libheif; all become 8-bit sRGB.
-Of Netpbm's maps the header says which value is white (4095 of 12 bits), and that becomes 255.
-An EXIF flag of orientation is not obeyed: calibrations hold for the sensor's own rows and columns.
-"""
+For Netpbm's maps the header states the value of white (4095 for 12 bits), which becomes 255. EXIF's orientation is
+ignored, since calibrations refer to the sensor's own rows and columns."""
 
 import hashlib
 import re
@@ -36,11 +35,11 @@ PictureKind = Literal["colour", "grey", "mask"]
 JPEG = b"\xff\xd8\xff"
 NETPBM = re.compile(
     rb"P[2356](?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+(\d+)\s"
-)  # its last number is white
-PNG_COLOUR_TYPE, PNG_WITH_ALPHA = 25, (4, 6)  # where the header holds it, and which values have an alpha
-CUT_AWAY_LEAST = 0.25  # of a picture from which the subject was cut out; an undistorted one has a rim of 0.1 at most
+)  # its last number is the value of white
+PNG_COLOUR_TYPE, PNG_WITH_ALPHA = 25, (4, 6)  # offset of the header's colour type, and its values with alpha
+CUT_AWAY_LEAST = 0.25  # transparent share of a cut-out picture; the empty rim of an undistorted one is 0.1 at most
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
-FTYP = slice(4, 12)  # of files whose kind stands behind their first box's length
+FTYP = slice(4, 12)  # bytes that name the kind of a HEIC, AVIF or video file
 HEIC_BRANDS = (b"ftypheic", b"ftypheix", b"ftypmif1")  # in telephones' .jpg files, too
 OTHER_BRANDS = {b"ftypavif": "AVIF", b"ftypisom": "video", b"ftypmp42": "video", b"ftypqt  ": "video"}
 OTHER_BEGINNINGS = {b"GIF8": "GIF", b"%PDF": "PDF", b"8BPS": "Photoshop", b"\xff\x0a": "JPEG XL"}
@@ -50,7 +49,7 @@ GREY_FLAGS = (
     cv2.IMREAD_REDUCED_GRAYSCALE_4,
     cv2.IMREAD_REDUCED_GRAYSCALE_8,
 )
-COLOUR_FLAGS = (  # those that reduce know no order but OpenCV's own
+COLOUR_FLAGS = (  # the reducing ones give BGR; OpenCV has no RGB variant of them
     cv2.IMREAD_COLOR_RGB,
     cv2.IMREAD_REDUCED_COLOR_2,
     cv2.IMREAD_REDUCED_COLOR_4,
@@ -59,7 +58,7 @@ COLOUR_FLAGS = (  # those that reduce know no order but OpenCV's own
 PIXELS_MOST = 100_000_000  # 100 Mpx, the largest studio backs; more is a decompression bomb
 
 
-# Sensor noise has no repeats to search for: one filter and run lengths take half the time and a sixth less space.
+# Sensor noise does not repeat, so a search for repeats is useless: this halves the time and saves a sixth of space.
 PNG_OPTIONS = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG),
@@ -68,8 +67,7 @@ PNG_OPTIONS = [
 
 
 def is_picture(path: Path) -> bool:
-    """Tells whether it is a file (no folder, pipe or link to nothing) that is named as a picture, and not a hidden
-    one."""
+    """Tells whether a path is a visible file (no folder, pipe or broken link) whose suffix is a picture's."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
@@ -80,7 +78,8 @@ def write_image(
     *,
     parents: bool = True,
 ) -> None:
-    """Writes RGB or grey pixels as the format of the suffix; ``parents`` makes the folder, too."""
+    """Writes RGB or grey pixels in the format of the suffix. ``quality`` is JPEG's; ``parents`` makes the folder if
+    need be."""
     image = np.ascontiguousarray(image)
     pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if path.suffix == ".jpg" else PNG_OPTIONS
@@ -90,7 +89,7 @@ def write_image(
 
 
 def read_image(path: Path) -> ImageRgb:
-    """Returns an RGB image. Raises InputError."""
+    """Returns an RGB image. Raises InputError for a file that is no picture or damaged."""
     pixels, _, fault = decode_image_file(path, path.name, "colour")
     if pixels is None:
         assert fault is not None
@@ -99,14 +98,14 @@ def read_image(path: Path) -> ImageRgb:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Returns width and height as the header says: a small file may claim any size. Raises InputError where there is
-    none."""
+    """Returns width and height from the header, without decoding: a small file may claim any size. Raises InputError if
+    there is no such header."""
     with _faults_of(path.name):
         return _header_size(path.read_bytes(), path.suffix.lower())[0]
 
 
 def open_picture(path: Path) -> Image.Image:
-    """Returns the picture for Pillow, decoded as far as it must be: for thumbnails. Raises InputError."""
+    """Opens a picture with Pillow, which decodes only as much as a thumbnail needs. Raises InputError."""
     if path.suffix.lower() in (*RAW_SUFFIXES, *HEIC_SUFFIXES):
         return Image.fromarray(read_image(path))
     with _faults_of(path.name):
@@ -116,11 +115,16 @@ def open_picture(path: Path) -> Image.Image:
 def decode_image_file(
     path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Returns the pixels at ``share`` of their number across (a mask's are all there), the sha256 of the file, and the
-    fault (then no pixels).
+    """Decodes a picture file. Returns its pixels, the sha256 of the file, and a fault (then there are no pixels).
 
-    Pixels are RGB (``colour``), one channel (``grey``), or of a ``mask`` the one channel that holds it, in the file's
-    own numbers (``rig.formats.mask_values``). ``bits``: that samples of 16 use (``rig.formats.picture_samples``)."""
+    Args:
+        path: the file.
+        where: its name in messages.
+        kind: ``colour`` gives RGB, ``grey`` one channel, ``mask`` the channel that holds the mask, in the file's own
+            values (``rig.formats.mask_values``).
+        share: scale of width and height, 1 or less; masks keep all their pixels.
+        bits: how many bits the samples of a 16-bit file use (``rig.formats.picture_samples``).
+    """
     data, suffix = path.read_bytes(), path.suffix.lower()
     try:
         with _faults_of(where):
@@ -132,7 +136,7 @@ def decode_image_file(
         pixels = _plane(pixels, where) if kind == "mask" else at_share(pixels, (width, height), share)
     except InputError as error:
         return None, "", compose("of-file", file=where, fault=error.faults[0])
-    if data.startswith(PNG) and PNG_END not in data:  # OpenCV fills up what is cut off
+    if data.startswith(PNG) and PNG_END not in data:  # OpenCV silently fills the missing part of a truncated file
         return None, "", compose("of-file", file=where, fault=compose("picture-damaged"))
     if profile and kind == "colour":
         pixels = _in_srgb(pixels, profile)
@@ -140,11 +144,11 @@ def decode_image_file(
 
 
 def cut_out_alpha(path: Path) -> Plane | None:
-    """Returns the alpha of a picture from which the subject was cut out, in the file's own numbers.
+    """Returns the alpha channel, in the file's own values, of a picture from which the subject was cut out.
 
-    None where the file has no alpha, is too large or damaged, or its alpha shows no subject: one that stands in the
-    middle, with at least ``CUT_AWAY_LEAST`` of the picture transparent around it. Rounded corners and the empty rim of
-    an undistorted picture are no cut-out."""
+    Returns None if the file has no alpha, is too large or damaged, or if its alpha shows no subject. A subject stands
+    in the middle, with at least ``CUT_AWAY_LEAST`` of the picture transparent around it; rounded corners and the empty
+    rim of an undistorted picture do not count."""
     data, suffix = path.read_bytes(), path.suffix.lower()
     if data.startswith(PNG):
         if len(data) <= PNG_COLOUR_TYPE or data[PNG_COLOUR_TYPE] not in PNG_WITH_ALPHA:
@@ -170,7 +174,7 @@ def cut_out_alpha(path: Path) -> Plane | None:
 
 @contextmanager
 def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
-    """What decoders raise for a damaged file, as InputError."""
+    """Raises InputError in place of the errors that decoders raise for a damaged file."""
     said = fault or compose("no-picture")
     try:
         yield
@@ -181,7 +185,7 @@ def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
 
 
 def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
-    """Width and height, and the colour profile (empty: sRGB)."""
+    """Returns width and height, and the colour profile (empty for sRGB)."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
             return (raw.sizes.width, raw.sizes.height), b""
@@ -196,10 +200,11 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
 
 
 def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: int) -> np.ndarray:
-    """``halved``: how often a JPEG is, which costs its decoder less than none at all; others come as they are."""
+    """Returns the decoded pixels. ``halved``: how often a JPEG is halved while decoding, which is faster than full
+    size; other formats are never halved."""
     if suffix in RAW_SUFFIXES:
         with _raw(data) as raw:
-            # As the camera balanced it, no brightness of each picture's own: eleven cameras must stay comparable.
+            # The camera's white balance, and no automatic brightness: pictures of all cameras must stay comparable.
             pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8, user_flip=0)
     elif suffix in HEIC_SUFFIXES or data[FTYP] in HEIC_BRANDS:
         pixels = np.asarray(heif_header(data).to_pillow().convert("RGB"))
@@ -224,7 +229,7 @@ def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: 
 
 
 def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:
-    """One of Netpbm's maps whose white is neither 255 nor 65535. Raises ValueError."""
+    """Decodes a Netpbm map whose white is neither 255 nor 65535. Raises ValueError."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or not 0 < white < 65536:
         raise ValueError("not decoded")
@@ -256,7 +261,7 @@ def _raw(data: bytes) -> Iterator[Any]:
 
 
 def heif_header(data: bytes) -> Any:
-    """Returns a HEIC file, of which nothing is decoded yet. Raises InputError without the extra."""
+    """Opens a HEIC file without decoding it. Raises InputError if the extra ``heic`` is not installed."""
     try:
         import pi_heif
     except ModuleNotFoundError:
@@ -265,7 +270,7 @@ def heif_header(data: bytes) -> Any:
 
 
 def _in_srgb(pixels: ImageRgb, profile: bytes) -> ImageRgb:
-    """Colours of another profile (Display P3, Adobe RGB) as sRGB; a profile that cannot be read is taken for it."""
+    """Converts colours of another profile (Display P3, Adobe RGB) to sRGB. An unreadable profile is treated as sRGB."""
     from PIL import ImageCms
 
     try:

@@ -1,13 +1,12 @@
-"""What a mask's file says, as the share of the subject in every pixel.
+"""Interprets the values of mask files as the share of the subject in every pixel.
 
 Programs write masks as 0 and 1, 0 and 255, 16 bits, two colours, the alpha of a cut-out, soft greys, and through JPEG,
-whose ringing leaves values of 1 to 40 ten pixels outside an outline. All of these have two levels that fill areas; what
-lies half way between them is the outline. Levels are measured over all masks of a capture, so that one in which nothing
-is seen is not stretched to hold a subject. Files that hold something else (labels, depth, a photograph, one value) are
-named.
+whose ringing leaves values of 1 to 40 ten pixels outside an outline. All of these have two levels that fill areas, and
+the outline is half way between them. Levels are measured over all masks of a capture, so that a mask that shows nothing
+is not stretched until noise becomes a subject. Files that hold something else (labels, depth, a photograph, a single
+value) are faults.
 
-Which of the two levels is the subject is another question: ``rig.mask_polarity``.
-"""
+Which of the two levels is the subject is decided in ``rig.mask_polarity``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,29 +21,31 @@ Pixels = Num[np.ndarray, "h w *channels"]
 Plane = Num[np.ndarray, "h w"]
 Share = UInt8[np.ndarray, "h w"]
 
-BINS = 256  # of the range that masks use
-PLATEAU_SHARE = 0.005  # of a picture: a value that fills an area; one of a soft edge 40 px wide has 0.0006
-AREA_WITHIN = 0.2  # of an area's pixels whose eight neighbours are of it, too: 0 on soft edges, 0.4 in a band 5 px wide
+BINS = 256  # of the histogram over the range that the masks use
+PLATEAU_SHARE = 0.005  # of the picture, from which a value fills an area; one of a soft edge 40 px wide has 0.0006
+AREA_WITHIN = 0.2  # share of an area's pixels whose 8 neighbours are of it too: 0 on soft edges, 0.4 in a band of 5 px
 PLATEAU_APART = 0.1  # of the range: nearer values are one plateau; ringing of JPEG 50 to 98 scatters by 0.08
 NEAR_LEVEL = 0.03  # of the range, to both sides of a level
 AREAS_LEAST = 0.7  # of a picture that its levels must hold: 0.85 with soft edges of 40 px, 0.2 of a smooth ramp
 BETWEEN = (0.15, 0.85)  # of the range: neither subject nor background
-BETWEEN_MOST = 0.35  # of the smaller of both areas that is neither: a soft edge of 20 px has 0.15, a depth map 0.9
+BETWEEN_MOST = 0.35  # pixels between, relative to the smaller area: 0.15 with a soft edge of 20 px, 0.9 in a depth map
 SOFT_PER_PX = 0.35  # pixels between by the outline's length: 0.9 where edges were averaged, 0.0 to 0.2 in JPEG 50 to 98
 BAND_MOST_PX = 24.0  # half width of a band that a trimap leaves undecided
-FAINT = 0.25  # of the capture's range: a file with less of it, and more than two values, shows noise
+FAINT = 0.25  # of the capture's range: a file with a smaller range and more than two values shows only noise
 LABELS_MOST = 32  # values that are counted one by one: finer than JPEG leaves them
 COLOURS_TWO = 0.95  # share of a picture that its two most frequent colours hold
-COLOURS_FEW = 64  # a picture of labels has no more, a photograph thousands
+COLOURS_FEW = 64  # a picture of labels has at most so many colours, a photograph thousands
 CUT_OUT_LEAST = 0.1  # share of a picture that a cut-out leaves in exactly one colour
 VALUES_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskReading:
-    """Holds a mask as it was read: ``share`` of the subject, 0 to 255, and whether its edges are ``soft``, so that the
-    greys tell where the outline lies. ``fault``: why it is none (then the share is empty). ``remark``: what was
-    noticed."""
+    """Holds a mask as it was read.
+
+    ``share`` is the share of the subject in each pixel, 0 to 255. ``soft`` tells that edges are soft, so that grey
+    values place the outline within a pixel. ``fault`` says why the file is no mask (then the share is 0); ``remark`` is
+    a warning."""
 
     share: Share
     soft: bool = False
@@ -53,10 +54,10 @@ class MaskReading:
 
 
 def mask_plane(pixels: Pixels) -> Plane | Message:
-    """Returns the one channel of decoded pixels (BGR order) that holds the mask, or why there is none.
+    """Returns the one channel of decoded pixels (BGR order) that holds the mask, or a fault if there is none.
 
-    That is the alpha of a cut-out; of two colours the channel in which they differ most; of a picture that was cut out
-    on one colour 1 where it has another."""
+    It is the alpha of a cut-out, or of a picture of two colours the channel in which they differ most. A picture that
+    was cut out on one colour becomes 1 where it has another colour and 0 elsewhere."""
     channels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     if channels.shape[2] in (2, 4):
         alpha = channels[:, :, -1]
@@ -86,7 +87,7 @@ def _plane_of_colours(channels: Num[np.ndarray, "h w c"]) -> Plane | Message:
 
 
 def read_masks(planes: Mapping[str, Plane]) -> dict[str, MaskReading]:
-    """Reads the masks of one capture. Files of one type of numbers show what a capture's black and white are."""
+    """Reads the masks of one capture. All files with the same data type together determine the range of values."""
     ranges: dict[str, tuple[float, float]] = {}
     for plane in planes.values():
         low, high = _range(plane)
@@ -130,7 +131,7 @@ def _constant_fault(value: float, common: tuple[float, float]) -> Message:
 
 
 def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
-    """The values that fill areas, rising; near ones count as the most frequent of them."""
+    """Returns the values that fill areas, in rising order. Of values close together the most frequent one counts."""
     low, high = span
     exact = plane.dtype.kind in "ui" and high - low < BINS
     count = int(high - low) + 1 if exact else BINS
@@ -151,13 +152,14 @@ def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
 
 
 def _is_area(pixels: Bool[np.ndarray, "h w"]) -> bool:
-    """Whether most pixels lie among their like; those of one level of a soft edge are a line."""
+    """Tells whether most of the pixels have only such pixels around them; the pixels of one level of a soft edge do
+    not."""
     within = cv2.erode(pixels.astype(np.uint8), np.ones((3, 3), np.uint8))
     return bool(np.count_nonzero(within) > AREA_WITHIN * np.count_nonzero(pixels))
 
 
 def _fills_areas(plane: Plane, levels: list[float], span: float) -> bool:
-    """Whether two levels or more hold most of a picture."""
+    """Tells whether there are at least two levels, and they hold most of the picture."""
     near = sum(np.count_nonzero(np.abs(plane.astype(np.float64) - level) <= NEAR_LEVEL * span) for level in levels)
     return len(levels) > 1 and bool(near >= AREAS_LEAST * plane.size)
 
@@ -168,7 +170,8 @@ def _share_between(plane: Plane, black: float, white: float) -> Share:
 
 
 def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
-    """A trimap's undecided band is narrow and lies between black and white: the outline is in its middle."""
+    """Reads a trimap: the outline is placed in the middle of its undecided band, which must be narrow and lie between
+    black and white."""
     named = [f"{level:g}" for level in levels[:VALUES_NAMED]] + ["..."] * (len(levels) > VALUES_NAMED)
     labels = compose("mask-of-labels", count=len(levels), values=named)
     if len(levels) > 3:
@@ -189,10 +192,10 @@ def _distance_to(area: np.ndarray) -> Float32[np.ndarray, "h w"]:
 
 
 def _separates(black: np.ndarray, white: np.ndarray) -> bool:
-    """Whether white touches no black."""
+    """Tells whether white nowhere touches black."""
     return not (cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & black).mean() > 1e-4
 
 
 def _outline_px(inside: np.ndarray) -> int:
-    """Pixels of the subject beside one that is not."""
+    """Counts the pixels of the subject that lie beside a background pixel."""
     return int(np.count_nonzero(inside & (cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)))

@@ -1,4 +1,4 @@
-"""Meshes of other programs: PLY, OBJ and GLB through trimesh."""
+"""Reads meshes of other programs: PLY, OBJ and GLB, through trimesh."""
 
 from pathlib import Path
 

@@ -1,10 +1,9 @@
-"""Agisoft Metashape's XML of cameras (File > Export > Export Cameras, format Agisoft XML).
+"""Reads and writes Agisoft Metashape's XML of cameras (File > Export > Export Cameras, format Agisoft XML).
 
-Each camera has its transform to the chunk (4 x 4, axes as OpenCV's); the transform of their component or of the chunk
-takes them to the world, in metres. The lens (user manual, appendix "Camera models"): ``u = w / 2 + cx + x' f + x' b1 +
-y' b2`` with the corner of the picture at 0, so that half a pixel is taken off; p1 and p2 stand the other way
-round than OpenCV's; type ``fisheye`` is equidistant, which with k1 to k4 is Kannala and Brandt's lens.
-"""
+Each camera has a transform to the chunk (4 x 4, axes as OpenCV's); the transform of its component or of the chunk leads
+on to the world, in metres. The lens (user manual, appendix "Camera models") is ``u = w / 2 + cx + x' f + x' b1 + y'
+b2`` with the corner of the picture at 0, so that half a pixel is subtracted. p1 and p2 have OpenCV's meanings
+exchanged. Type ``fisheye`` is equidistant; with k1 to k4 it is Kannala and Brandt's lens."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -32,14 +31,14 @@ from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 KEYS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-TYPES = {"frame": False, "fisheye": True, "equidistant_fisheye": True}  # whether equidistant
+TYPES = {"frame": False, "fisheye": True, "equidistant_fisheye": True}  # sensor types, and whether they are equidistant
 SWITCHES = {"true": True, "1": True, "false": False, "0": False}
 Similarity = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]  # rotation, translation (mm), scale
 
 
 def read_metashape(path: Path) -> CamerasRead:
-    """Returns the aligned cameras of a Metashape export that are switched on, named by their labels or, where those
-    repeat, by their groups. Raises InputError naming every fault."""
+    """Returns the cameras of a Metashape export that are aligned and enabled. Their names are their labels or, where
+    labels repeat, those of their groups. Raises InputError naming every fault."""
     root = parsed(path, xml_root)
     reading = Reading(path.name)
     chunk = _chunk(root, reading)
@@ -68,7 +67,7 @@ def read_metashape(path: Path) -> CamerasRead:
 
 
 def _chunk(root: ElementTree.Element, reading: Reading) -> ElementTree.Element:
-    """The one chunk that has aligned cameras. Raises InputError."""
+    """Returns the only chunk with aligned cameras. Raises InputError if there is none or more than one."""
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
     if not chunks:
         raise InputError(reading.subject, [compose("no-chunk")])
@@ -80,7 +79,7 @@ def _chunk(root: ElementTree.Element, reading: Reading) -> ElementTree.Element:
 
 
 def _cameras(chunk: ElementTree.Element, reading: Reading) -> Iterator[tuple[str, ElementTree.Element]]:
-    """Each camera with the label of its group, or nothing."""
+    """Yields each camera with the label of its group, which is empty without a group."""
     holder = chunk.find("cameras")
     for node in holder if holder is not None else ():
         if node.tag == "camera":
@@ -108,10 +107,10 @@ def _takes_part(name: str, camera: ElementTree.Element, reading: Reading) -> boo
 def _judge(
     node: ElementTree.Element, place: str, whose: str, reading: Reading, *, children: bool = True, tags: tuple = ()
 ) -> None:
-    """Asks the table about attributes and, but for ``tags``, what stands within."""
+    """Checks attributes and child elements against the table of keys; children in ``tags`` are skipped."""
     keys: dict[str, object] = {f"{place}@{name}": text for name, text in node.attrib.items()}
     if place in ("sensor", "camera") and node.get("master_id") == node.get("id"):
-        keys.pop(f"{place}@master_id", None)  # its own master
+        keys.pop(f"{place}@master_id", None)  # a camera that is its own master is no slave
     for child in node if children else ():
         if child.tag not in tags:
             named = place == "sensor" and child.tag == "property"
@@ -181,7 +180,8 @@ def _entry(name: str, sensor: ElementTree.Element, matrix: np.ndarray, world: Si
 
 
 def _similarity(node: ElementTree.Element, faults: list[Message]) -> Similarity:
-    """The chunk's transform to the world, metres made mm; without one, its free scale is taken as millimetres."""
+    """Returns the transform from the chunk to the world (mm). Without one the chunk's free scale is taken as
+    millimetres."""
     found = node.find("transform")
     if found is None or not len(found):
         return np.eye(3), np.zeros(3), 1.0
@@ -233,8 +233,8 @@ def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, 
 def _name_lost(
     values: dict[str, float], size: tuple[int, int], name: str, faults: list[Message], *, fisheye: bool
 ) -> None:
-    """Names what of a lens neither Brown-Conrady nor Kannala-Brandt hold and a pixel would show, and forgets the rest
-    of it."""
+    """Appends a fault if the skew ``b2`` moves a border of the picture visibly, and drops a fisheye's ``p1`` and ``p2``
+    if they move a corner by less than ``LENS_LOSS_PX``."""
     skewed_px = abs(values["b2"]) * size[1] / 2 / values["f"] if values["f"] > 0 else 0.0
     if skewed_px > LENS_LOSS_PX:
         faults.append(compose("picture-skewed", key=f"{name}.b2", skewed_px=skewed_px))

@@ -1,8 +1,7 @@
-"""Morph targets in a glTF binary: sparse accessors, for a face moves in one place at a time.
+"""Adds morph targets to a binary glTF. Accessors are sparse, since an expression moves only a part of the face.
 
-https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#morph-targets. Names stand in ``extras.targetNames``, where
-three.js, Blender and others look for them.
-"""
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#morph-targets. Names are stored in ``extras.targetNames``,
+where three.js, Blender and others look for them."""
 
 import json
 import struct
@@ -14,8 +13,8 @@ from jaxtyping import Float
 
 from rig.mesh import vertex_normals
 
-LEAST_MM = 0.005  # a vertex that moves by less stays
-LEAST_TURN = 1e-3  # of a normal
+LEAST_MM = 0.005  # smaller displacements are left out
+LEAST_TURN = 1e-3  # smaller changes of a unit normal are left out
 
 
 def with_morphs(
@@ -54,7 +53,7 @@ def with_morphs(
 def _sparse(
     document: dict[str, Any], payload: bytearray, values: Float[np.ndarray, "v 3"], least: float, *, bounds: bool
 ) -> int:
-    """Appends an accessor of what is not nearly zero; its number."""
+    """Appends a sparse accessor of the values that are not nearly zero, and returns its index."""
     rows = np.flatnonzero(np.abs(values).max(axis=1) > least)
     moved = values[rows].astype("<f4")
     accessor: dict[str, Any] = {"componentType": 5126, "count": len(values), "type": "VEC3"}

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: with vertex colours, or with texture coordinates, normals and a material."""
+"""Writes Wavefront OBJ: with vertex colours, or with texture coordinates, normals and a material."""
 
 import io
 

@@ -1,6 +1,6 @@
-"""Caliscope's ``camera_array.toml`` (metres; https://mprib.github.io/caliscope) and aniposelib's TOML (the unit of its
-board, see
-``_aniposelib_unit``; https://anipose.readthedocs.io). Both follow OpenCV's pixels and need no shift."""
+"""Reads and writes caliscope's ``camera_array.toml`` (metres; https://mprib.github.io/caliscope) and aniposelib's TOML
+(in the unit of its board, see ``_aniposelib_unit``; https://anipose.readthedocs.io). Both use OpenCV's pixels, so
+nothing is shifted."""
 
 import json
 import tomllib
@@ -25,7 +25,8 @@ UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}  # millimetres in each
 
 
 def read_toml(path: Path) -> CamerasRead:
-    """Returns the rig in caliscope's ``camera_array.toml`` or in an aniposelib calibration."""
+    """Returns the rig in caliscope's ``camera_array.toml`` or in an aniposelib calibration. Raises InputError naming
+    every fault."""
     document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
     tables, reading = document.get("cameras"), Reading(path.name)
     if isinstance(tables, dict):
@@ -84,7 +85,7 @@ def write_aniposelib(rig: Rig, path: Path) -> None:
 
 
 def _switch(table: Mapping[str, Any], key: str, name: str, faults: list[Message]) -> bool:
-    """What is true or false; absent is false."""
+    """Returns a truth value; an absent one is false."""
     value = table.get(key, False)
     if not isinstance(value, bool) and value not in (0, 1):
         faults.append(compose("no-switch", key=f"{name}.{key}", value=shown(value)))
@@ -118,8 +119,10 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
 
 
 def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]], reading: Reading) -> float:
-    """Millimetres in one unit of the file. Its ``metadata.unit`` says so; without it, the size of the rig does:
-    aniposelib takes the unit of the board, and cameras within 30 of each other are a rig in metres."""
+    """Returns how many millimetres the unit of an aniposelib file has.
+
+    ``metadata.unit`` states it. Without it the size of the rig decides, since aniposelib takes over the unit of the
+    board: cameras within 30 units of each other are in metres."""
     metadata = document.get("metadata")
     unit = metadata.get("unit") if isinstance(metadata, dict) else None
     if isinstance(metadata, dict):
@@ -133,11 +136,12 @@ def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]
         for _, table in pairs
         if isinstance(table, dict)
     ]
-    # |t| is the distance of the world's origin, which lies at a camera or at the board: never beyond the rig.
+    # |t| is the distance to the world's origin, which lies at a camera or at the board and so within the rig.
     return 1000.0 if lengths and max(lengths) < METRES_MOST else 1.0
 
 
 def looks_like_aniposelib(path: Path) -> bool:
+    """Tells whether a TOML file consists of aniposelib's camera tables."""
     try:
         document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
     except InputError:

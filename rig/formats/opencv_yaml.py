@@ -1,10 +1,10 @@
-"""OpenCV's YAML of several cameras, as EasyMocap lays it out (https://chingswy.github.io/easymocap-public-doc).
+"""Reads and writes OpenCV's YAML of several cameras, as EasyMocap lays it out
+(https://chingswy.github.io/easymocap-public-doc).
 
-``names``, ``K_<name>`` and ``dist_<name>`` in ``intri.yml``, ``Rot_<name>`` (or ``R_<name>``, a rotation vector) and
-``T_<name>`` in ``extri.yml``, camera_from_world; or all of them in one file of any other name. Lengths are metres where
-the cameras lie within 30 of the origin, else mm. ``W_<name>`` and ``H_<name>`` are the size; without them the pictures
-tell it.
-"""
+``names``, ``K_<name>`` and ``dist_<name>`` are in ``intri.yml``; ``Rot_<name>`` (or ``R_<name>``, a rotation vector)
+and ``T_<name>`` are in ``extri.yml`` and give camera_from_world. All may also be in one file of another name. Lengths
+are metres if all cameras lie within 30 units of the origin, otherwise millimetres. ``W_<name>`` and ``H_<name>`` are
+the size; without them it is read from the pictures."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -86,7 +86,8 @@ def read_yaml(path: Path) -> CamerasRead:
 
 
 def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) -> list[str]:
-    """The cameras that ``names`` has, where there is one; those of it that the file does not hold are a fault."""
+    """Returns the cameras listed in ``names``, or all if there is no such list. A listed camera that the file lacks is
+    a fault."""
     if not listed:
         return held
     lacking = [name for name in listed if name not in held]
@@ -99,7 +100,7 @@ def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) ->
 
 
 def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) -> None:
-    """Asks the table about every key, whose camera's name becomes ``<name>``."""
+    """Checks every key against the table of keys, with ``<name>`` in place of a camera's name."""
     for key, value in values.items():
         name = next((name for name in sorted(held, key=len, reverse=True) if key.endswith(f"_{name}")), "")
         general = key.removesuffix(name) + "<name>" if name else key
@@ -109,7 +110,7 @@ def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) 
 
 
 def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> None:
-    """Both ways of writing a rotation may stand there; one that was changed alone is a fault."""
+    """Appends a fault if a camera's rotation vector and rotation matrix are both given and disagree."""
     vector, matrix = poses.get(f"R_{name}"), poses.get(f"Rot_{name}")
     if vector is None or matrix is None or vector.size not in (3, 9) or matrix.shape != (3, 3):
         return
@@ -119,7 +120,8 @@ def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> 
 
 
 def write_yaml(rig: Rig, folder: Path) -> None:
-    """Writes ``intri.yml`` and ``extri.yml`` into a folder. Raises InputError for a fisheye, which they do not tell."""
+    """Writes ``intri.yml`` and ``extri.yml`` into a folder. Raises InputError for a fisheye lens, which the format
+    cannot state."""
     fisheyes = [c.name for c in rig if c.recorded is not None and c.recorded.model == "kannala-brandt"]
     if fisheyes:
         raise InputError("opencv-yaml", [compose("yaml-fisheye", cameras=fisheyes)])
@@ -158,7 +160,7 @@ def _written(rig: Rig, fill: "Callable[[cv2.FileStorage], None]") -> bytes:
 
 
 def _matrices(data: bytes) -> dict[str, Any]:
-    """Every matrix and number of a file by its key, and of a list of words the words. Raises ValueError."""
+    """Returns all matrices and numbers of a file by key, and lists of words. Raises ValueError for damaged YAML."""
     import cv2
 
     try:

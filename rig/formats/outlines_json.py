@@ -1,8 +1,7 @@
-"""outlines.json: a subject's outline drawn by hand in photographs, as polygons.
+"""Reads outlines.json: outlines of the subject drawn by hand in photographs, as polygons.
 
-``{"format": "eigenhead-outlines/1", "outlines": {"IMG_01": [[[x, y], ...], ...]}}``: by camera the polygons, in pixels,
-(0, 0) the centre of the top-left one; an even number of them around a pixel leaves it out.
-"""
+``{"format": "eigenhead-outlines/1", "outlines": {"IMG_01": [[[x, y], ...], ...]}}`` lists by camera its polygons, in
+pixels; (0, 0) is the centre of the top-left pixel. A pixel inside an even number of polygons is background."""
 
 import json
 from pathlib import Path
@@ -17,7 +16,7 @@ from rig.messages.message import compose
 from rig.rig import Rig
 
 OUTLINES_FORMAT = "eigenhead-outlines/1"
-FRACTION_BITS = 4  # of a pixel, in which polygons are filled
+FRACTION_BITS = 4  # corners are rounded to 1/16 pixel for filling
 
 
 def read_outlines(path: Path, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:

@@ -1,9 +1,8 @@
-"""Endings of picture files, and whose picture a file is by its name alone. Knows no decoder, so that it costs nothing.
+"""Lists the suffixes of picture files, and matches files to cameras by their names. It needs no decoder.
 
-Programs call the mask of "cam00.png" "cam00.png.png" (COLMAP), "cam00.png.mask.png" (RealityScan) or
-"cam00_mask.png", and number a picture of "cam00" "shot_0001_cam00.tif". Such names are read as words: runs of
-letters, and numbers without their leading zeros. Signs between them, their case and endings of pictures do not count.
-"""
+Programs call the mask of "cam00.png" "cam00.png.png" (COLMAP), "cam00.png.mask.png" (RealityScan) or "cam00_mask.png",
+and number a picture of "cam00" "shot_0001_cam00.tif". Names are therefore compared as words: runs of letters, and
+numbers without leading zeros. Separators, case and suffixes of pictures do not count."""
 
 import re
 import unicodedata
@@ -40,7 +39,7 @@ UNREAD_PICTURES = {
     ".avi": "video",
 }
 """What pictures are kept in and nobody here reads, by ending: such a file is called what it is, not missing."""
-JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")  # what file managers add
+JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")  # files and folders that file managers add
 WORD = re.compile(r"\d+|[^\W\d_]+")
 
 
@@ -50,17 +49,19 @@ def is_junk(name: str) -> bool:
 
 
 def picture_stem(name: str) -> str:
-    """Returns a file's name without a picture's ending; a dot that begins no such ending belongs to the name."""
+    """Returns a file's name without a picture's suffix. A dot that begins no such suffix belongs to the name."""
     stem, dot, ending = name.rpartition(".")
     return stem if dot and stem and f".{ending.lower()}" in (*IMAGE_SUFFIXES, *UNREAD_PICTURES) else name
 
 
 def match_names(names: Iterable[str], cameras: Sequence[str], *, several: bool = False) -> dict[str, list[str]]:
-    """Returns the file names of each camera that has none of exactly its own name, where they leave no doubt.
+    """Matches files by similar names to the cameras that have no file of exactly their own name. Returns the matched
+    files by camera; doubtful ones are left out.
 
     Args:
-        names: of files (with their endings) or of folders.
-        several: whether a camera may have more than one.
+        names: names of files (with their suffixes) or of folders.
+        cameras: names of all cameras.
+        several: whether a camera may have more than one file.
     """
     files = sorted(set(names))
     exact = {picture_stem(name) for name in files} | {name for name in files if name in cameras}
@@ -92,14 +93,15 @@ def _words(name: str) -> Words:
 
 
 def _equal(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Files that say the camera's words and no more: "CAM_0.png" of cam00."""
+    """Matches files whose words are exactly those of a camera: "CAM_0.png" to cam00."""
     times = Counter(cameras.values())
     owners = {words: camera for camera, words in cameras.items() if words and times[words] == 1}
     return _by_owner((owners[words], name) for name, words in strays.items() if words in owners)
 
 
 def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Files that say the same before and after the words of each camera, where one such pair fits most cameras."""
+    """Matches files that have the same words before and after the words of each camera. Of all such pairs of words that
+    which fits most cameras counts."""
     fitting: dict[tuple[Words, Words], dict[str, list[str]]] = {}
     for name, words in strays.items():
         for camera, known in cameras.items():
@@ -113,12 +115,13 @@ def _alike_about(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> F
     owners = Counter((camera, name) for found in best for camera, known in found.items() for name in known)
     claimed = Counter(name for _, name in owners)
     if most == 1 and any(not _is_telling(cameras[camera]) for camera, _ in owners):
-        return {}  # a number in one file's name may be anything
+        return {}  # a number in a single file's name proves nothing
     return _by_owner((camera, name) for camera, name in owners if claimed[name] == 1)
 
 
 def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Files that name one camera alone, whatever else each says: times, exposures, counters."""
+    """Matches files whose words contain those of a single camera, whatever else they contain: times, exposures,
+    counters."""
     pairs = []
     for name, words in strays.items():
         said = [camera for camera, known in cameras.items() if _is_telling(known) and _places(known, words)]
@@ -128,7 +131,8 @@ def _naming_one(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Fo
 
 
 def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Found:
-    """Files that say only what tells the cameras apart ("00.png" of cam00), where every camera has one."""
+    """Matches files that have only the words in which the cameras differ ("00.png" to cam00), if every camera has
+    one."""
     ways = list(cameras.values())
     head = next((i for i, said in enumerate(zip(*ways, strict=False)) if len(set(said)) > 1), None)
     if head is None or len(cameras) < 2:
@@ -139,7 +143,7 @@ def _numbered(strays: Mapping[str, Words], cameras: Mapping[str, Words]) -> Foun
 
 
 def _places(known: Words, words: Words) -> list[int]:
-    """Where the words of a camera stand among those of a file."""
+    """Returns the positions at which the words of a camera begin among the words of a file."""
     return [i for i in range(len(words) - len(known) + 1) if known and words[i : i + len(known)] == known]
 
 
@@ -148,7 +152,7 @@ def _within(known: Words, other: Words) -> bool:
 
 
 def _is_telling(words: Words) -> bool:
-    """Whether the words hold more than numbers, which may also be counters and dates."""
+    """Tells whether the words contain more than numbers, which may also be counters or dates."""
     return any(not word.isdecimal() for word in words)
 
 

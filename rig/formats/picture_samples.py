@@ -1,10 +1,10 @@
-"""How the samples of picture files are held, judged before anything is measured in the pictures.
+"""Finds how the samples of picture files are stored, before anything is measured in the pictures.
 
-Machine vision writes 10 or 12 bits into files of 16: read as they are, such pictures are nearly black, and a backdrop
-would be blamed. It also writes the sensor's mosaic, a quarter of the pixels red and a quarter blue, as a grey picture.
+Machine vision software writes 10 or 12 bits into files of 16 bits: read as they are, such pictures are nearly black. It
+also writes the sensor's mosaic, a quarter of whose pixels is red and a quarter blue, as a grey picture.
 
-Enters: files of one kind (photographs, or clean plates) of all cameras. Leaves: how many bits they use.
-"""
+Enters: files of one kind (photographs or clean plates) of all cameras. Leaves: how many bits they use, and whether they
+are mosaics."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,9 +17,9 @@ from jaxtyping import Float32, Num
 from PIL import Image
 
 WHOLE_BITS = 16
-USED_BITS = (8, 10, 12, 14)  # that devices and programs leave in files of 16
+USED_BITS = (8, 10, 12, 14)  # numbers of bits that occur in files of 16 bits
 BITS_PER_SAMPLE, SAMPLES_PER_PIXEL = 258, 277  # TIFF's tags
-MOSAIC_RATIO = 1.35  # differences of next neighbours by those of next but one: 1.9 in mosaics of a grey backdrop, 6 and
+MOSAIC_RATIO = 1.35  # difference of neighbours over that of second neighbours: 1.9 in mosaics of a grey backdrop, 6 and
 # more of a face; 0.6 to 1.0 in grey pictures, 1.0 in noise alone
 TINY = 1e-6  # levels: a picture of one value is no mosaic
 HEADER_BYTES = 32
@@ -29,15 +29,15 @@ TIFF = (b"II*\x00", b"MM\x00*")
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Describes what the files of one kind hold: ``bits`` that their samples of 16 use (None: they have 8), and whether
-    they are a sensor's mosaic."""
+    """Describes how the files of one kind are stored. ``bits``: how many of 16 bits are used, None for files of 8 bits;
+    ``mosaic``: whether they hold a sensor's mosaic."""
 
     bits: int | None
     mosaic: bool
 
 
 def measure_samples(paths: Sequence[Path]) -> Samples:
-    """Measures the samples of files of one kind: the largest over all of them tells the bits."""
+    """Measures the samples of files of one kind. The largest sample of all files determines the number of bits."""
     with ThreadPoolExecutor(max_workers=4) as pool:
         measured = [*pool.map(_measure, paths)]
     largest = [most for most, _ in measured if most is not None]
@@ -47,13 +47,13 @@ def measure_samples(paths: Sequence[Path]) -> Samples:
 
 
 def used_bits(largest: int) -> int:
-    """Returns the bits that samples up to ``largest`` use, of those that devices have; all where only a few are
-    unused."""
+    """Returns the smallest number of bits in ``USED_BITS`` that holds ``largest``, or 16 if no such number does."""
     return next((bits for bits in USED_BITS if largest < 2**bits), WHOLE_BITS)
 
 
 def _measure(path: Path) -> tuple[int | None, bool]:
-    """The largest sample of a file of 16 bits, else None, and whether it is a mosaic; of damaged ones nothing."""
+    """Returns the largest sample of a 16-bit file (otherwise None), and whether it is a mosaic; (None, False) for
+    damaged files."""
     try:
         depth, channels = _depth_and_channels(path)
         if depth != WHOLE_BITS and channels != 1:
@@ -69,7 +69,8 @@ def _measure(path: Path) -> tuple[int | None, bool]:
 
 
 def _depth_and_channels(path: Path) -> tuple[int, int]:
-    """Bits of a sample and samples of a pixel, as the header says; of other formats than PNG and TIFF 8 and 3."""
+    """Returns bits per sample and samples per pixel from the header of a PNG or TIFF file; 8 and 3 for other
+    formats."""
     with path.open("rb") as file:
         data = file.read(HEADER_BYTES)
     if data.startswith(PNG) and len(data) > 25:
@@ -83,8 +84,8 @@ def _depth_and_channels(path: Path) -> tuple[int, int]:
 
 
 def is_mosaic(pixels: Num[np.ndarray, "h w"]) -> bool:
-    """Tells whether a grey picture is a sensor's mosaic: a pixel is more like the next but one, which has its own
-    filter."""
+    """Tells whether a grey picture is a sensor's mosaic: its pixels resemble their second neighbours, which have the
+    same colour filter, more than their neighbours."""
     values = pixels.astype(np.float32)
     if min(values.shape) < 3:
         return False

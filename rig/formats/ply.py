@@ -1,5 +1,5 @@
-"""PLY as docs/capture-format.md fixes it. The writer is our own: trimesh writes neither the extra vertex properties nor
-the same bytes in every version."""
+"""Writes PLY as docs/capture-format.md defines it, and reads it back. It does not use trimesh, which lacks the
+additional vertex properties and whose bytes differ between versions."""
 
 import re
 from collections.abc import Sequence
@@ -41,10 +41,18 @@ def ply_bytes(
     corner_uv: Float[np.ndarray, "f 3 2"] | None = None,
     comments: Sequence[str] = (),
 ) -> bytes:
-    """Encodes a binary little-endian PLY. ``quality`` is the standard deviation (mm), ``views`` how many images
-    coloured it, ``part`` what a vertex belongs to (a property more, where it is given). ``corner_uv``: texture
-    coordinates of the faces' corners, v downwards; as MeshLab has them, ``texcoord`` is a list of six with v
-    upwards."""
+    """Encodes a binary little-endian PLY.
+
+    Args:
+        mesh: the surface, mm.
+        normals: unit normals of its vertices.
+        colours: sRGB.
+        quality: standard deviation of each vertex along its normal, mm.
+        views: number of images that coloured each vertex.
+        part: what each vertex shows (skin, hair, clothes), written as one more property if it is given.
+        corner_uv: texture coordinates of the faces' corners, v downwards; written as MeshLab's ``texcoord``, v upwards.
+        comments: lines of the header.
+    """
     kind = PLY_VERTEX if part is None else np.dtype([*PLY_VERTEX.descr, ("part", "u1")])
     vertices = np.empty(len(mesh.vertices), kind)
     for i, axis in enumerate("xyz"):
@@ -81,10 +89,10 @@ def write_ply(path: Path, mesh: Mesh, **properties: Any) -> None:
 
 
 def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
-    """Returns a head.ply of ours: the mesh (mm, world frame), and every vertex's standard deviation (mm) along its
-    normal.
+    """Reads a head.ply of this project. Returns the mesh (mm, world frame) and each vertex's standard deviation (mm)
+    along its normal.
 
-    Raises InputError for a file that is cut short, or another program's."""
+    Raises InputError for a file that is truncated or another program's."""
     try:
         header, end, body = path.read_bytes().partition(b"end_header\n")
     except OSError as error:

@@ -1,7 +1,8 @@
-"""Wavefront OBJ with its polygons as the file has them: vertex order, quads, texture coordinates, groups and materials.
+"""Reads and writes Wavefront OBJ with its polygons kept: vertex order, quads, texture coordinates, groups and
+materials.
 
-``mesh_file`` reads triangles through trimesh, which splits polygons and may reorder vertices; a template must not be.
-"""
+``mesh_file`` reads triangles through trimesh, which splits polygons and may reorder vertices; templates need both
+kept."""
 
 import io
 import math
@@ -15,7 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from rig.errors import InputError
 from rig.messages.message import Message, compose
 
-MOST_VERTICES = 200_000  # eight times a film's head: 4 minutes and 2 GB to register; what is larger is a scan
+MOST_VERTICES = 200_000  # 8 times a film's head; registering it takes 4 minutes and 2 GB. Larger files are scans
 MOST_CORNERS = 8 * MOST_VERTICES
 MOST_BYTES = 256 << 20
 FAULTS_TOLD = 12
@@ -24,7 +25,7 @@ KEPT_STATEMENTS = ("o", "g", "s", "usemtl")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolygonMesh:
-    """Holds a mesh as its file describes it. Polygons lie one after the other in ``corners``; v of ``uv`` points
+    """Holds a mesh as its file describes it. ``corners`` concatenates the corners of all polygons; v of ``uv`` points
     upwards."""
 
     vertices: Float[np.ndarray, "v 3"]
@@ -40,7 +41,7 @@ class PolygonMesh:
 
 
 def fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "f 3"]:
-    """Returns rows of ``corners`` that make triangles of polygons of these sizes."""
+    """Returns, for polygons of the given sizes, rows of ``corners`` that form their triangles."""
     first = np.cumsum(sizes) - sizes
     count = sizes - 2
     owner = np.repeat(np.arange(len(sizes)), count)
@@ -67,7 +68,7 @@ def read_polygons(path: Path) -> PolygonMesh:
 
 
 def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
-    """Lines by number; one that ends with a backslash goes on in the next."""
+    """Yields lines with their numbers; lines that end with a backslash are joined with the next."""
     begun = ""
     for number, raw in enumerate(file, start=1):
         line = raw.rstrip()
@@ -82,7 +83,7 @@ def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
 
 @dataclass(slots=True)
 class _Reading:
-    """What has been read so far."""
+    """Collects what has been read of an OBJ file."""
 
     vertices: list[tuple[float, ...]] = field(default_factory=list)
     uv: list[tuple[float, ...]] = field(default_factory=list)
@@ -128,7 +129,8 @@ class _Reading:
         self.sizes.append(len(named))
 
     def _row(self, number: int, index: int | None, count: int) -> int:
-        """OBJ counts from 1, and backwards from -1. What lies ahead in the file is checked at its end."""
+        """Returns the row of an index. OBJ counts from 1, and backwards from -1. An index beyond the rows read so far
+        is checked at the end of the file."""
         row = -1 if index is None else index - 1 if index > 0 else count + index
         if not index or row < 0:
             self.faults.append(compose("line-strange-row", line=number, row=f"{index}"))
@@ -157,7 +159,7 @@ class _Reading:
         ):
             if rows.size and rows.max() >= count and count:
                 faults.append(compose(code, row=rows.max() + 1, held=count))
-        if rows_without(corner_uv) and not self.uv:
+        if _has_texture_coordinates(corner_uv) and not self.uv:
             faults.append(compose("faces-without-texture"))
         if faults:
             raise InputError(name, faults)
@@ -167,7 +169,7 @@ class _Reading:
         )
 
 
-def rows_without(corner_uv: Int[np.ndarray, " c"]) -> bool:
+def _has_texture_coordinates(corner_uv: Int[np.ndarray, " c"]) -> bool:
     """Tells whether any corner has a texture coordinate."""
     return bool(corner_uv.size and corner_uv.max() >= 0)
 
@@ -181,13 +183,12 @@ def polygon_obj_bytes(
     comments: Iterable[str] = (),
     library: str | None = None,
 ) -> bytes:
-    """Returns the same file with other vertex positions: order, polygons, texture coordinates, groups and materials are
-    kept.
+    """Encodes an OBJ with other vertex positions; order, polygons, texture coordinates, groups and materials are kept.
 
     Args:
-        mesh: what the file had.
-        vertices: of the mesh, in its order.
-        normals: unit, of the vertices.
+        mesh: the mesh as it was read.
+        vertices: new positions of its vertices, in its order.
+        normals: unit normals of the vertices.
         colours: sRGB, written after the position as MeshLab and Blender read it.
         comments: lines at the top.
         library: name of an .mtl file beside it.

@@ -1,4 +1,4 @@
-"""STL and 3MF of a closed mesh, for slicers. Both are in millimetres; 3MF says so, an STL cannot."""
+"""Writes closed meshes as STL and 3MF, for 3D printing. Both are in millimetres; only 3MF can state so."""
 
 import io
 import zipfile
@@ -33,8 +33,8 @@ def stl_bytes(mesh: Mesh) -> bytes:
 
 
 def threemf_bytes(mesh: Mesh) -> bytes:
-    """Encodes 3MF core 1.3 (https://github.com/3MFConsortium/spec_core), one object, no times: the same mesh is the
-    same bytes."""
+    """Encodes 3MF core 1.3 (https://github.com/3MFConsortium/spec_core) with one object and no times, so that equal
+    meshes give equal bytes."""
     text = io.StringIO()
     text.write(
         '<?xml version="1.0" encoding="UTF-8"?>\n<model unit="millimeter" xml:lang="en-US" '

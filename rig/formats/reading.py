@@ -1,4 +1,4 @@
-"""What a reader of another program's cameras finds on its way: faults, unused keys, cameras that take no part."""
+"""Collects what a reader of another program's cameras finds: faults, unused keys, cameras that take no part."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,13 +11,12 @@ from rig.formats.foreign_keys import ForeignKey, Table, says_nothing
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
-VALUE_MOST = 40  # characters of a value
+VALUE_MOST = 40  # characters of a value in a message
 
 
 @dataclass(frozen=True, slots=True)
 class CamerasRead:
-    """Holds a rig, what its reader noticed and accepted, and the cameras of the file that take no part, with
-    reasons."""
+    """Holds a rig, warnings of its reader, and the cameras of the file that take no part, each with the reason."""
 
     rig: Rig
     remarks: tuple[Message, ...] = ()
@@ -26,7 +25,7 @@ class CamerasRead:
 
 @dataclass(slots=True)
 class Reading:
-    """Collects while the file named ``subject`` is read."""
+    """Collects findings while the file named ``subject`` is read."""
 
     subject: str
     faults: list[Message] = field(default_factory=list)
@@ -35,8 +34,10 @@ class Reading:
     _unknown: dict[str, None] = field(default_factory=dict)
 
     def judge(self, table: Table, values: Mapping[str, object], whose: str, *, place: str = "") -> None:
-        """Notes the keys of ``values`` that the table refuses, tells or does not have. ``whose``: the camera's name, or
-        nothing where they are the whole file's; ``place``: what comes before each key in the table."""
+        """Notes the keys of ``values`` that the table refuses, wants reported or does not contain.
+
+        ``whose`` is the camera's name, empty for keys of the whole file; ``place`` is the prefix of the keys in the
+        table."""
         for key, value in values.items():
             rule = table.get(place + key)
             if rule is None:
@@ -45,11 +46,12 @@ class Reading:
                 self._meant.setdefault((place + key, rule), []).append((whose, value))
 
     def leave_out(self, name: str, why: Message) -> None:
-        """Notes a camera that takes no part, for the reason ``why``."""
+        """Notes that a camera takes no part, and why."""
         self.left_out[name] = why
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> CamerasRead:
-        """Returns the rig of ``eigenhead-cameras/1`` entries. Raises InputError naming every fault."""
+        """Builds the rig from ``eigenhead-cameras/1`` entries and returns it with all notes. Raises InputError naming
+        every fault."""
         warnings: list[Message] = []
         for (key, rule), cases in self._meant.items():
             whose, value = _whose([name for name, _ in cases], key), shown(cases[0][1])
@@ -86,7 +88,7 @@ class Reading:
 
 
 def shown(value: object, most: int = VALUE_MOST) -> str:
-    """Returns a value as Python writes it, cut within its quotation marks and not through them."""
+    """Returns a value as Python writes it, shortened to ``most`` characters inside its quotation marks."""
     if isinstance(value, str):
         return repr(value if len(value) <= most else value[: most - 3] + "...")
     text = repr(value)
@@ -94,7 +96,7 @@ def shown(value: object, most: int = VALUE_MOST) -> str:
 
 
 def _whose(names: Sequence[str], key: str) -> str | Message:
-    """A key and the cameras that have it, or the key alone where it is the whole file's."""
+    """Names a key together with the cameras that have it; a key of the whole file is named alone."""
     cameras = [name for name in names if name]
     if len(cameras) == 1:
         return key.replace("<name>", cameras[0]) if "<name>" in key else f"{cameras[0]}.{key}"

@@ -1,13 +1,12 @@
-"""RealityCapture's and RealityScan's cameras: XMP files beside the pictures, and the CSV "Internal/External camera
-parameters".
+"""Reads and writes RealityCapture's and RealityScan's cameras: XMP files beside the pictures, and the CSV
+"Internal/External camera parameters".
 
-XMP (https://support.capturingreality.com/hc/en-us/articles/360017783459): ``Rotation`` is camera_from_world, axes as
-OpenCV's, ``Position`` the camera's centre in metres; the focal length is that of a film whose longer side is 36 mm;
-the principal point is off the middle, in longer sides. CSV: the same focal length, the principal point in millimetres
-of that film, and heading, pitch and roll (degrees) of a camera that at 0 0 0 looks down, its top to the north. Neither
-holds the picture's size, which the pictures beside it tell. Distortion, of ``X / Z``: k1 to k4; t1, t2 are OpenCV's
-p1, p2.
-"""
+XMP (https://support.capturingreality.com/hc/en-us/articles/360017783459): ``Rotation`` is camera_from_world with
+OpenCV's axes; ``Position`` is the camera's centre in metres; the focal length is that of a film whose longer side is 36
+mm; the principal point is relative to the middle, in longer sides. CSV: the same focal length, the principal point in
+millimetres of that film, and heading, pitch and roll (degrees) of a camera that at 0 0 0 looks down, its top to the
+north. Neither contains the picture's size, which is read from the pictures beside it. Distortion, of ``X / Z``: k1 to
+k4; t1 and t2 are OpenCV's p1 and p2."""
 
 import csv
 import io
@@ -31,7 +30,7 @@ XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 FILM_MM = 36.0
 MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
-NO_LENS = "division"  # the default of a file that has no coefficients
+NO_LENS = "division"  # model named in files that have no coefficients
 COLUMNS = ("#name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 DOWN = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes from those of the CSV: x right, y up, z backwards
 
@@ -51,8 +50,8 @@ _XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 
 
 def read_xmp(folder: Path) -> CamerasRead:
-    """Returns the rig in a folder of XMP files, a camera each, but for those that are not aligned or not used for
-    meshing. Raises InputError naming every fault."""
+    """Returns the rig in a folder of XMP files, one camera each. Cameras that are not aligned or not used for meshing
+    take no part. Raises InputError naming every fault."""
     reading = Reading(f"{folder.name}/*.xmp")
     entries = []
     components = set()
@@ -77,7 +76,8 @@ def read_xmp(folder: Path) -> CamerasRead:
 
 
 def write_xmp(rig: Rig, folder: Path) -> None:
-    """Writes ``<camera>.xmp`` into the folder of the pictures. Raises InputError for a foreign lens."""
+    """Writes ``<camera>.xmp`` into the folder of the pictures. Raises InputError for a lens that the format cannot
+    state."""
     for camera in _held(rig, "realitycapture"):
         k, d, side = camera.intrinsics, camera.intrinsics.distortion, _side(camera)
         text = _XMP.format(
@@ -124,7 +124,7 @@ def read_csv(path: Path) -> CamerasRead:
 
 
 def write_csv(rig: Rig, path: Path) -> None:
-    """Writes the CSV. Raises InputError for pixels that are not square, or a foreign lens."""
+    """Writes the CSV. Raises InputError for pixels that are not square, and for a lens that the format cannot state."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -146,7 +146,8 @@ def write_csv(rig: Rig, path: Path) -> None:
 
 
 def _attitude(values: Mapping[str, float]) -> Float[np.ndarray, "3 3"]:
-    """``world_from_camera`` of the CSV's axes: heading about z, clockwise, then pitch about x, then roll about y."""
+    """Returns ``world_from_camera`` in the CSV's axes: heading about z, clockwise, then pitch about x, then roll about
+    y."""
     heading, pitch, roll = np.radians([-values["heading"], values["pitch"], values["roll"]])
     z = np.array([[np.cos(heading), -np.sin(heading), 0], [np.sin(heading), np.cos(heading), 0], [0, 0, 1]])
     x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
@@ -155,7 +156,7 @@ def _attitude(values: Mapping[str, float]) -> Float[np.ndarray, "3 3"]:
 
 
 def _xmp_values(path: Path) -> dict[str, str]:
-    """``xcr`` values by name, whether written as attributes or as elements."""
+    """Returns the values of the namespace ``xcr`` by name, whether written as attributes or as elements."""
     described = parsed(path, xml_root).find(f".//{RDF}Description")
     if described is None:
         raise InputError(path.name, [compose("no-rdf-description")])

@@ -1,9 +1,8 @@
-"""rig.toml: which cameras, trigger box and lights make up a rig, and what a good shot is.
+"""Reads rig.toml: the cameras, trigger box and lights of a rig, and the limits that a shot must keep.
 
-Every table is a frozen dataclass whose fields are the keys; unknown keys are refused with the nearest known one. A
-camera is named by what survives a reboot (serial number, /dev/v4l/by-id or by-path, address), never by an index:
-indices swap. deploy/rig.example.toml shows every key.
-"""
+Every table is a frozen dataclass whose fields are the keys. An unknown key is refused, and the nearest known one is
+suggested. A camera is identified by something that survives a reboot (serial number, /dev/v4l/by-id or by-path,
+address), never by an index, since indices change. deploy/rig.example.toml shows every key."""
 
 import dataclasses
 import math
@@ -26,7 +25,7 @@ FORMAT = "eigenhead-rig/1"
 DriverName = Literal["opencv", "gphoto", "genicam", "replay", "simulated"]
 TriggerMode = Literal["external", "software", "free"]
 
-# Kernel numbers are given out in the order of discovery, so they change with a reboot or another port.
+# The kernel numbers devices in the order of discovery, so numbers change with a reboot or another port.
 _INDEXED_CAMERA = re.compile(r"\d{1,2}|/dev/video\d+|usb:\d+,\d+|(fake_?|cam(era)?)?#\d+", re.IGNORECASE)
 _INDEXED_PORT = re.compile(r"\d{1,2}|/dev/tty(USB|ACM|S)\d+|COM\d+", re.IGNORECASE)
 
@@ -52,12 +51,12 @@ _SHOT_MOST = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfig:
-    """One [[cameras]] table. What is None is left as the camera has it."""
+    """Holds one [[cameras]] table. Settings that are left out stay as they are in the camera."""
 
     name: str
     driver: DriverName
     identity: str
-    trigger: TriggerMode = "external"  # external: the box's output; software: a command at the shot; free: it runs
+    trigger: TriggerMode = "external"  # external: the box's output; software: a command; free: not synchronised
     channel: int | None = None  # output of the trigger box
     delay_us: int = 0  # of that output
     latency_ms: float = 0.0  # from exposure to arrival: readout and transport, by `rig check`
@@ -73,7 +72,7 @@ class CameraConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriggerConfig:
-    """[trigger]: the box. ``port`` is a path under /dev/serial/by-id, or a link that a udev rule makes."""
+    """Holds [trigger], the trigger box. ``port`` is a path under /dev/serial/by-id, or a link made by a udev rule."""
 
     port: str
     baud: int = 115200
@@ -83,7 +82,7 @@ class TriggerConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightsConfig:
-    """[lights]: which light outputs of the box are on during a shot."""
+    """Holds [lights]: which light outputs of the box are on during a shot."""
 
     outputs: tuple[int, ...] = ()
     settle_s: float = 0.3  # halogen and LED drivers reach their level well within it
@@ -92,7 +91,7 @@ class LightsConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShotConfig:
-    """[shot]: how long to wait and what to accept."""
+    """Holds [shot]: waiting times, and limits beyond which a shot has a fault."""
 
     timeout_s: float = 2.0
     open_timeout_s: float = 10.0
@@ -108,7 +107,7 @@ class ShotConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigConfig:
-    """A whole rig.toml. ``folder`` is where it lies: relative paths in it start there."""
+    """Holds a whole rig.toml. ``folder`` is the file's folder, to which relative paths in it refer."""
 
     format: Literal["eigenhead-rig/1"]
     cameras: tuple[CameraConfig, ...]
@@ -123,7 +122,7 @@ class RigConfig:
 
     @property
     def plates_folder(self) -> Path:
-        """Returns where the clean plates are kept."""
+        """Returns the folder of the clean plates."""
         return self.folder / self.plates
 
     @property
@@ -162,8 +161,10 @@ def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject:
 def adjusted(
     config: RigConfig, cameras: Mapping[str, Mapping[str, float | None]], outputs: tuple[int, ...] | None
 ) -> RigConfig:
-    """Returns the rig with other ``exposure_ms``, ``gain_db`` and ``white_balance_k`` of cameras, and other lamps
-    (None: those of rig.toml). Raises InputError that names every fault."""
+    """Returns the rig with other settings of cameras (``exposure_ms``, ``gain_db``, ``white_balance_k``) and other
+    lamps.
+
+    ``outputs`` None keeps the lamps of rig.toml. Raises InputError naming every fault."""
     changed = dataclasses.replace(
         config,
         cameras=tuple(dataclasses.replace(camera, **cameras.get(camera.name, {})) for camera in config.cameras),
@@ -263,7 +264,8 @@ def _shot_faults(shot: ShotConfig) -> list[Message]:
 
 
 def _read_table(kind: type, table: Any, where: str, faults: list[Message]) -> Any:
-    """A dataclass from a table; None, with the faults noted, where a value is missing or of a wrong type."""
+    """Builds a dataclass from a table. Returns None, and appends the faults, if a value is missing or of a wrong
+    type."""
     if not isinstance(table, Mapping):
         faults.append(compose("located", where=where or "document", fault=compose("is-no-table")))
         return None
@@ -327,6 +329,6 @@ def _allowed(hint: Any) -> tuple[str, ...]:
 
 
 def _hinted(fault: Message, word: Any, known: Iterable[Any]) -> Message:
-    """The fault and what the word may have meant, if anything is like it."""
+    """Adds to a fault the known word that was probably meant, if one is similar."""
     near = suggest(str(word), map(str, known), min_likeness=0.5)
     return compose("did-you-mean", fault=fault, nearest=f"{near[0]!r}") if near else fault

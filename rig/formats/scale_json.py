@@ -1,4 +1,4 @@
-"""What makes a scene's unit millimetres: ``scale.json``, one of three ways to know a length in it.
+"""Reads ``scale.json``: a known length that gives a scene its scale, in one of three forms.
 
 {"points": {"a": {CAMERA: [x, y], ...}, "b": {...}}, "distance_mm": 62.0}     two points, seen by two cameras or more
 {"tag": {"dictionary": "DICT_4X4_50", "size_mm": 40.0}}                       printed ArUco tags, their black side
@@ -53,7 +53,7 @@ KnownLength = PointDistance | TagSize | CameraDistance
 def read_scale(path: Path, cameras: Collection[str]) -> KnownLength:
     """Reads ``scale.json`` for photographs of ``cameras``. Raises InputError naming every fault."""
     try:
-        document = json.loads(path.read_bytes())  # of 8, 16 or 32 bits, as its first bytes tell
+        document = json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
     return scale_from_document(document, cameras, path.name)
@@ -118,7 +118,7 @@ def _tag(document: dict[str, Any], cameras: Collection[str], faults: list[Messag
 
 
 def dictionaries() -> dict[str, int]:
-    """OpenCV's predefined ArUco dictionaries by name."""
+    """Returns OpenCV's predefined ArUco dictionaries by name."""
     import cv2
 
     return {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}

@@ -1,9 +1,8 @@
-"""Which camera took a picture, by the serial number of the body that cameras write into their files.
+"""Identifies the camera that took a picture by the serial number that camera bodies write into their files.
 
-Read: EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431) of JPEG, TIFF, PNG, WebP and HEIC, of RAW files that are built
-like TIFF, and of Canon's CR3 (its box CMT2); DNG's CameraSerialNumber (0xC62F). A camera of ``cameras.json`` names its
-body by ``serial``, or has the serial for a name.
-"""
+Read are EXIF's BodySerialNumber (CIPA DC-008, tag 0xA431) of JPEG, TIFF, PNG, WebP and HEIC, of RAW files built like
+TIFF, and of Canon's CR3 (its box CMT2), and DNG's CameraSerialNumber (0xC62F). A camera of ``cameras.json`` states its
+body's serial number as ``serial``, or has it as its name."""
 
 import re
 from collections.abc import Mapping
@@ -24,7 +23,7 @@ CR3_EXIF = re.compile(rb"CMT2(?=II\*\0|MM\0\*)")
 
 
 def camera_serial(path: Path) -> str | None:
-    """Returns the serial number in a picture file; None where there is none, or none that can be read."""
+    """Returns the serial number in a picture file; None if there is none or it cannot be read."""
     with suppress(Exception):  # damaged EXIF fails in more ways than Pillow's documentation has
         for tags in _tag_sets(path):
             for tag in (BODY_SERIAL, DNG_SERIAL):
@@ -57,8 +56,8 @@ def _exif(data: bytes) -> Image.Exif:
 
 
 def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
-    """Returns the rig with the serial of each camera's picture, unless two of them share it: then one body took
-    both."""
+    """Returns the rig with each camera's ``serial`` read from its picture. Serials that two pictures share are left
+    out, since then one body took both."""
     serials = {name: camera_serial(path) for name, path in pictures.items()}
     recorded = [serial for serial in serials.values() if serial is not None]
     unique = {name: serial for name, serial in serials.items() if serial is not None and recorded.count(serial) == 1}
@@ -66,10 +65,10 @@ def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
 
 
 def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[str, Path]:
-    """Returns the pictures of ``folder`` that no camera has for a name, each under the camera that took it.
+    """Returns pictures of ``folder`` by camera, matched by serial number, for pictures whose names are no camera's.
 
-    Nothing is looked at where every camera has a picture of its name; appends a fault for each picture that cannot be
-    told, and for two of one body."""
+    Nothing is read if every camera has a picture of its name. Appends a fault for each picture that cannot be matched,
+    and for two pictures of one body."""
     here = sorted(path for path in folder.iterdir() if is_picture(path))
     inside = {path.name for path in folder.iterdir() if path.is_dir()}
     lacking = [camera for camera in rig if camera.name not in {path.stem for path in here} | inside]

@@ -1,10 +1,9 @@
-"""Which files of a capture folder are whose: each camera's picture, mask and clean plates, and those of no camera.
+"""Assigns the files of a capture folder to cameras: each camera's picture, mask and clean plates.
 
-A file belongs to the camera whose name it has. Where a camera has none of exactly that name, a name that can mean no
-other camera will do (``rig.formats.picture_names``), then the serial number of a body in EXIF
-(``rig.formats.serials``). A camera's file may also lie in a folder of the camera's name, and all
-of them in one folder more.
-"""
+A file belongs to the camera whose name it has. If a camera has no file of exactly its name, similar names are matched
+where only one camera can be meant (``rig.formats.picture_names``), then the body's serial number in EXIF
+(``rig.formats.serials``). A camera's file may also lie in a folder of the camera's name, and all files together in one
+more folder."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,13 +17,13 @@ from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 PLATES_MOST = 32  # clean plates read per camera
-BESIDE_PICTURES = ("masks", "background")  # folders of a capture that are no camera's
+BESIDE_PICTURES = ("masks", "background")  # folders of a capture that belong to no single camera
 
 
 @dataclass(frozen=True, slots=True)
 class ShotFiles:
-    """``strays``: pictures of no camera, relative to the capture's folder; ``faults``: of files that are
-    missing or cannot be told apart."""
+    """Holds the files of a shot by camera. ``strays`` are pictures of no camera, relative to the capture's folder;
+    ``faults`` are messages on files that are missing or ambiguous."""
 
     images: Mapping[str, Path]
     masks: Mapping[str, Path]
@@ -40,7 +39,7 @@ class ShotFiles:
 
 
 def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFiles:
-    """Returns the files of one shot. ``left_out``: cameras that take no part, whose files are nobody's and no
+    """Finds the files of one shot. Files of the cameras in ``left_out``, which take no part, are neither used nor
     strays."""
     names, faults = [*rig.names, *left_out], list[Message]()
     places = {"images": picture_folder(folder), **{kind: folder / kind for kind in BESIDE_PICTURES}}
@@ -63,24 +62,24 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
 
 
 def picture_folder(folder: Path) -> Path:
-    """Returns where a capture folder's photographs lie."""
+    """Returns the folder of a capture's photographs: images/ if it exists, otherwise the capture folder itself."""
     return folder / "images" if (folder / "images").is_dir() else folder
 
 
 def listed_pictures(folder: Path) -> list[Path]:
-    """Returns the pictures in a folder; none where there is no such folder."""
+    """Returns the pictures in a folder, sorted; an empty list if the folder does not exist."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if is_picture(path))
 
 
 def stray_sentence(strays: Sequence[str], rig: Rig) -> Message:
-    """Describes the pictures that belong to no camera."""
+    """Returns a message that names the pictures which belong to no camera."""
     return compose("pictures-strange", count=len(strays), pictures=some_of(strays), cameras=rig.names)
 
 
 def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[Message]) -> dict[str, list[Path]]:
-    """Files and folders of each camera in one of the capture's folders."""
+    """Returns the files and folders of each camera in one of the capture's folders."""
     if not place.is_dir():
         return {}
     inner = _unwrapped(place, names)
@@ -101,7 +100,8 @@ def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[
 
 
 def _unwrapped(place: Path, names: Sequence[str]) -> Path:
-    """The one folder in a folder without pictures, where it is no camera's: ``images/shot01/cam00.png``."""
+    """Returns the single enclosing folder in a folder without pictures, unless it is a camera's own:
+    ``images/shot01/cam00.png``."""
     folders = [path for path in _folders(place) if path.name not in (*BESIDE_PICTURES, "images")]
     alone = len(folders) == 1 and not listed_pictures(place) and place.name in ("images", *BESIDE_PICTURES)
     alone = alone and not match_names([folders[0].name], names) and folders[0].name not in names
@@ -113,7 +113,8 @@ def _folders(place: Path) -> list[Path]:
 
 
 def _one(paths: Sequence[Path], root: Path, faults: list[Message]) -> Path | None:
-    """A camera's one picture or mask: the file, or that in its folder."""
+    """Returns a camera's single picture or mask: the file itself, or the file in the camera's folder. More than one is
+    a fault."""
     files = [path for path in paths if path.is_file()]
     if len(files) > 1:
         where = files[0].parent.relative_to(root).as_posix()
@@ -127,12 +128,12 @@ def _one(paths: Sequence[Path], root: Path, faults: list[Message]) -> Path | Non
 
 
 def _flat(paths: Sequence[Path]) -> list[Path]:
-    """Files, and the pictures in folders."""
+    """Returns the files among the paths, and the pictures in the folders among them."""
     return [path for entry in paths for path in (listed_pictures(entry) if entry.is_dir() else [entry])]
 
 
 def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> list[Path]:
-    """Pictures, and what pictures of other kinds there are, in a folder of the capture that no camera has."""
+    """Returns pictures in a folder of the capture that belong to no camera, those of unreadable formats included."""
     if not place.is_dir():
         return []
     is_root = kind == "images" and place.name != "images"
@@ -155,8 +156,9 @@ def _missing(
     places: Mapping[str, Path],
     strays: Mapping[str, Sequence[Path]],
 ) -> tuple[list[Message], bool]:
-    """What cameras lack, and whether a sentence names strays for it: where no camera has a file of its name and
-    there are others, that is one cause."""
+    """Returns faults for missing files, and whether they name the strays already.
+
+    If no camera has a file of its name and other files are there, that is reported as one cause."""
     inside = "" if places["images"] == folder else "images/"
     faults, alone, named = list[Message](), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES), False
     lacking = [name for name in rig.names if name not in images]
@@ -189,7 +191,7 @@ def _of_other_kind(name: str, strays: Sequence[Path]) -> Path | None:
 
 
 def _broken_link(place: Path, name: str) -> Path | None:
-    """A link of the camera's name that leads nowhere."""
+    """Returns a symbolic link of the camera's name whose target is missing, or None."""
     links = (path for path in sorted(place.iterdir()) if path.is_symlink() and not path.exists())
     return next((path for path in links if picture_stem(path.name) == name), None)
 
@@ -197,7 +199,7 @@ def _broken_link(place: Path, name: str) -> Path | None:
 def _cause(
     rig: Rig, lacking: Sequence[str], strays: Sequence[Path], place: str | Message, what: Message
 ) -> Message | None:
-    """One sentence, where all cameras lack a file and as many others are there."""
+    """Returns one message if all cameras lack a file and at least as many other files are there; otherwise None."""
     strangers = [path for path in strays if is_picture(path)]
     if not len(lacking) == len(rig) > 1 or len(strangers) < max(len(lacking), 2):
         return None
@@ -211,7 +213,7 @@ def _cause(
 
 
 def _doubt(strangers: Sequence[Path], rig: Rig) -> Message | None:
-    """Why names that do hold the cameras' cannot be told: there are several of each."""
+    """Returns why names that contain those of cameras cannot be assigned: there are several for each camera."""
     several = match_names([path.name for path in strangers], rig.names, several=True)
     if len(several) < len(rig) or all(len(pictures) == 1 for pictures in several.values()):
         return None

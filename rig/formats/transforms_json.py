@@ -1,11 +1,10 @@
-"""``transforms.json``: nerfstudio's and instant-ngp's cameras, and what Blender's exporters for them write.
+"""Reads and writes ``transforms.json``: cameras of nerfstudio, instant-ngp and Blender's exporters for them.
 
 ``transform_matrix`` is world_from_camera with OpenGL's axes (x right, y up, z backwards;
-https://docs.nerf.studio/quickstart/data_conventions.html); the centre of the top-left pixel is (0.5, 0.5), as in
-COLMAP, whose numbers it takes over. Intrinsics stand at the top, or in a frame; Blender's files give ``camera_angle_x``
-and leave the size to the pictures. Lengths are metres where they could be (cameras within 30 of each other), else
-millimetres; ``applied_scale`` is taken back.
-"""
+https://docs.nerf.studio/quickstart/data_conventions.html). The centre of the top-left pixel is (0.5, 0.5), as in
+COLMAP, from which nerfstudio takes its intrinsics. Intrinsics are at the top or in a frame; Blender's files give
+``camera_angle_x``, and the size follows from the pictures. Lengths are metres if all cameras lie within 30 units of
+each other, otherwise millimetres; ``applied_scale`` is undone."""
 
 import json
 import math
@@ -26,11 +25,11 @@ from rig.rig import Rig
 OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes from OpenGL's
 MODELS = {"PINHOLE": False, "SIMPLE_PINHOLE": False, "OPENCV": False, "OPENCV_FISHEYE": True}
 LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
-PER_CAMERA = (*LENS, "k5", "k6", "rolling_shutter")  # what may stand at the top and means each camera
+PER_CAMERA = (*LENS, "k5", "k6", "rolling_shutter")  # keys at the top that hold for every camera
 
 
 def read_transforms(path: Path) -> CamerasRead:
-    """Returns the rig in a ``transforms.json``: a camera a frame. Raises InputError naming every fault."""
+    """Returns the rig in a ``transforms.json``: each frame is a camera. Raises InputError naming every fault."""
     document = parsed(path, json.loads)
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
@@ -113,7 +112,8 @@ def _entry(
 
 
 def _is_fisheye(values: dict[str, Any], name: str, faults: list[Message]) -> bool:
-    """Whether the lens is Kannala-Brandt's: nerfstudio says so by ``camera_model``, instant-ngp by ``is_fisheye``."""
+    """Tells whether the lens is Kannala-Brandt's: nerfstudio states it by ``camera_model``, instant-ngp by
+    ``is_fisheye``."""
     model, flag = values.get("camera_model"), values.get("is_fisheye", False)
     if not (model is None or (isinstance(model, str) and model in MODELS)):
         faults.append(compose("value-not-read", key=f"{name}.camera_model", value=shown(model), known=[*MODELS]))
@@ -127,8 +127,10 @@ def _is_fisheye(values: dict[str, Any], name: str, faults: list[Message]) -> boo
 
 
 def _check_applied(value: object, faults: list[Message]) -> None:
-    """Any world will do, so that a rotation that was applied to it need not be taken back; a scale would change
-    lengths, and a mirror what is left and right."""
+    """Appends a fault if the applied transform scales or mirrors, which would change lengths or exchange left and
+    right.
+
+    A rotation is accepted and not undone, since the world frame is free."""
     if value is None:
         return
     try:

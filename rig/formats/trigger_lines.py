@@ -1,4 +1,5 @@
-"""The trigger box's protocol, ``eigenhead-trigger/1``: one line a message (docs/trigger-protocol.md)."""
+"""Encodes and decodes the trigger box's protocol ``eigenhead-trigger/1``: one message a line
+(docs/trigger-protocol.md)."""
 
 from collections.abc import Iterator
 
@@ -30,7 +31,7 @@ def encode_line(start: bytes, sequence: int, body: str) -> bytes:
 
 
 def decode_payload(line: bytes) -> tuple[int, str] | None:
-    """Returns sequence and body of what stands between the start character and the newline, None where it is
+    """Returns sequence number and body of a line's content between start character and newline; None if it is
     damaged."""
     payload, star, digits = line.rpartition(b"*")
     if not star or len(payload) < 4 or payload[2:3] != b" " or not _is_hex(digits, 4) or not _is_hex(payload[:2], 2):
@@ -41,10 +42,9 @@ def decode_payload(line: bytes) -> tuple[int, str] | None:
 
 
 class LineReader:
-    """Cuts a byte stream into the valid lines that begin with ``start``; counts the damaged ones.
+    """Splits a byte stream into valid lines that begin with ``start``, and counts damaged ones.
 
-    What is no line at all (noise between lines, another device's talk) is kept in ``stray``, its last 80 bytes.
-    """
+    Bytes outside lines (noise, or another device's output) are kept in ``stray``, the last 80 of them."""
 
     def __init__(self, start: bytes) -> None:
         self._start = start[0]

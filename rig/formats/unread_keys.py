@@ -1,5 +1,8 @@
-"""Keys of ``cameras.json`` that nobody reads: a misspelt ``covarianse`` or a ``k4`` that the lens model has not is no
-fault, since files may carry what other programs put there, but who wrote it should know that it does nothing."""
+"""Finds keys of ``cameras.json`` that are not read, such as a misspelt ``covarianse`` or a ``k4`` that the lens model
+lacks.
+
+They are no faults, because files may carry other programs' keys, but a warning tells the author that they have no
+effect."""
 
 import json
 from collections import Counter
@@ -21,12 +24,12 @@ LENS_MODELS: dict[str, set[str]] = {
     "brown-conrady": {"model", "k1", "k2", "p1", "p2", "k3"},
     **{model: {"model", *keys} for model, keys in COEFFICIENTS.items()},
 }
-TOLD_MOST = 8
+TOLD_MOST = 8  # keys named one by one; the others are counted
 
 
 def unread_keys(path: Path) -> tuple[Message, ...]:
-    """Returns a message for every key of a rig file that is not read; nothing for the files of other programs, which
-    have keys of their own, and for a file that cannot be read at all, which its reader refuses."""
+    """Returns a message for every key of ``cameras.json`` that is not read. Returns nothing for other programs' files,
+    and for a file that cannot be parsed, which its reader refuses."""
     if path.suffix != ".json" or path.name == "transforms.json":
         return ()
     try:
@@ -37,12 +40,12 @@ def unread_keys(path: Path) -> tuple[Message, ...]:
 
 
 def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Message, ...]:
-    """Returns the same of a decoded file of this format. What many cameras have alike is said once, with their
-    number."""
+    """Returns messages for the keys of a decoded ``cameras.json`` that are not read; keys that many cameras share are
+    reported once, with their number."""
     counts = Counter(_unread(document))
     faults = []
     for (place, key), times in list(counts.items())[:TOLD_MOST]:
-        where = repr(f"{place}.{key}" if place else key)  # its signs may be none that a terminal shows
+        where = repr(f"{place}.{key}" if place else key)  # repr, since the key may contain unprintable characters
         faults.append(compose("key-unread", count=times, key=f"{where:.80}"))
     if len(counts) > TOLD_MOST:
         faults.append(compose("keys-unread-more", more=len(counts) - TOLD_MOST))
@@ -50,7 +53,7 @@ def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Messag
 
 
 def _unread(document: Any) -> Iterator[tuple[str, str]]:
-    """Place and name of each key."""
+    """Yields the place and name of each key that is not read."""
     if not isinstance(document, Mapping) or document.get("format") != FORMAT:
         return
     yield from _beside(document, "")

@@ -1,4 +1,4 @@
-"""USDZ of a textured mesh, through OpenUSD (the extra ``usd``)."""
+"""Writes USDZ of a textured mesh, through OpenUSD (the extra ``usd``)."""
 
 import importlib
 import tempfile
@@ -16,20 +16,20 @@ from rig.formats.glb import ROUGHNESS
 from rig.mesh import Mesh
 from rig.messages.message import compose
 
-ALIGNED = 64  # bytes: where a file of the package begins (https://openusd.org/release/spec_usdz.html)
+ALIGNED = 64  # files of the package begin at multiples of so many bytes (https://openusd.org/release/spec_usdz.html)
 HEADER = 30  # bytes of a zip entry's header before its name
-PADDING = 4  # bytes of a header of padding
+PADDING = 4  # bytes of the header of a zip entry's padding field
 
 
 class NoUsd(EigenheadError):
-    """Reports that the extra is not installed."""
+    """Reports that the extra ``usd`` is not installed."""
 
     def __init__(self) -> None:
         super().__init__(compose("usd-not-installed", remedy=how_to_install("usd")))
 
 
 def check_usd() -> None:
-    """Raises NoUsd where OpenUSD is not installed."""
+    """Raises NoUsd if OpenUSD is not installed."""
     try:
         from pxr import Usd  # noqa: F401
     except ImportError:
@@ -64,7 +64,7 @@ def usdz_bytes(
 
 
 def _module(name: str) -> Any:
-    """A module of OpenUSD, whose stubs name only half of what is there."""
+    """Imports a module of OpenUSD as Any, because its type stubs are incomplete."""
     return importlib.import_module(f"pxr.{name}")
 
 
@@ -120,7 +120,8 @@ def _write_layer(
 
 
 def _package(files: dict[str, bytes]) -> bytes:
-    """A zip without compression or times whose files begin at multiples of 64 bytes; the layer comes first."""
+    """Returns a zip without compression and times, whose files begin at multiples of 64 bytes; the USD layer comes
+    first."""
     data = BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():

@@ -1,9 +1,8 @@
-"""Large photographs are read smaller: pictures, masks and clean plates, and the cameras that see them so.
+"""Computes the reduced size at which large photographs are read, and the cameras for pictures of that size.
 
-A head fills 60 % of a picture's height, so that four megapixels put 0.24 mm of it on a pixel: finer than what depth is
-measured at (0.4 mm, ``DenseSettings.pixel_mm``) and than the vertices of any mesh. Limits in pixels were chosen on
-pictures of 0.8 Mpx: at 12 Mpx outlines still agree, at 24 they are told to contradict their cameras.
-"""
+A head fills 60 % of a picture's height, so with four megapixels a pixel covers 0.24 mm of it: finer than depth is
+measured (0.4 mm, ``DenseSettings.pixel_mm``) and than any mesh's vertices. Limits in pixels were chosen on pictures of
+0.8 Mpx. At 12 Mpx outlines still pass them; at 24 Mpx they are wrongly reported to contradict their cameras."""
 
 from dataclasses import replace
 
@@ -15,13 +14,13 @@ from rig.camera import Intrinsics
 from rig.capture import Features
 from rig.rig import Rig
 
-WORK_PIXELS = 4_000_000  # eleven with a plate each take 2.5 GB, at 6 Mpx 3.5 (tests.benchmarks.large_pictures)
-NEAR = 0.15  # a share this near to a half or a quarter becomes it: JPEG is decoded so at a third of the cost
-HALVINGS_MOST = 3  # that decoders know
+WORK_PIXELS = 4_000_000  # 11 pictures with a plate each take 2.5 GB, at 6 Mpx 3.5 GB (tests.benchmarks.large_pictures)
+NEAR = 0.15  # a scale so near to a half or a quarter becomes it, since JPEG is decoded so at a third of the cost
+HALVINGS_MOST = 3  # JPEG decoders reduce to 1/8 at most
 
 
 def work_share(intrinsics: Intrinsics, pixels_most: int | None) -> float:
-    """Returns how much smaller a camera's pictures are read, of 1; None: as they are."""
+    """Returns the scale, 1 or less, at which a camera's pictures are read. ``pixels_most`` None means full size."""
     pixels = intrinsics.width * intrinsics.height
     if pixels_most is None or pixels <= pixels_most:
         return 1.0
@@ -30,7 +29,7 @@ def work_share(intrinsics: Intrinsics, pixels_most: int | None) -> float:
 
 
 def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
-    """Returns the cameras of pictures that were read smaller."""
+    """Returns the cameras for pictures that are read at the reduced size."""
     shares = {camera.name: work_share(camera.intrinsics, pixels_most) for camera in rig}
     return Rig(
         tuple(
@@ -41,7 +40,7 @@ def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
 
 
 def work_features(features: Features, rig: Rig, work: Rig) -> Features:
-    """Returns points of the files, in the pictures as they were read."""
+    """Moves feature points from the files' pictures to the pictures of reduced size."""
 
     def moved(name: str, pixel: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"]:
         full, scaled = rig[name].intrinsics, work[name].intrinsics
@@ -51,8 +50,9 @@ def work_features(features: Features, rig: Rig, work: Rig) -> Features:
 
 
 def halvings(share: float, size: tuple[int, int]) -> int:
-    """Returns how often a decoder may halve a picture of ``size`` (width, height) that is wanted at ``share`` of it:
-    only where whole blocks of pixels become one, so that none is of half a block."""
+    """Returns how often a decoder may halve a picture of ``size`` (width, height) that is wanted at scale ``share``.
+
+    Only halvings that divide the picture into whole blocks count, so that no pixel averages half a block."""
     count = 0
     while count < HALVINGS_MOST and share <= 0.5 ** (count + 1) and not any(side % 2 ** (count + 1) for side in size):
         count += 1
@@ -62,8 +62,8 @@ def halvings(share: float, size: tuple[int, int]) -> int:
 def at_share(
     pixels: UInt8[np.ndarray, "h w *channels"], size: tuple[int, int], share: float
 ) -> UInt8[np.ndarray, "r c *channels"]:
-    """Returns the picture of a file of ``size`` (width, height) at ``share`` of it; decoders may have done some of
-    it."""
+    """Returns a picture at scale ``share`` of its file's ``size`` (width, height). The pixels may be reduced by a
+    decoder already."""
     wanted = (round(size[0] * share), round(size[1] * share))
     if wanted == (pixels.shape[1], pixels.shape[0]):
         return pixels

@@ -1,2 +1,4 @@
-"""Many captures, one result folder each: found or listed, shared out among processes and machines by files alone, and
-told in one table. What enters are captures on a disk; what leaves is ``OUT`` of docs/batch.md."""
+"""Reconstructs many captures, one result folder each, and lists all heads in one table.
+
+Captures are found below a folder or listed in a file. Processes and machines share the work through files alone.
+Enters: captures on a disk. Leaves: the folder ``OUT`` that docs/batch.md describes."""

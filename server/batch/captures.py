@@ -1,8 +1,7 @@
-"""The captures of a batch: those below a folder, or those that a list names with subject, session and settings.
+"""Finds the captures of a batch below a folder, or reads them from a list with subject, session and settings.
 
-A name is a path of its own below ``OUT``. A list is a text file with a capture a line (``#`` begins a remark), or a CSV
-file whose first row names its columns; its paths count from where the list lies.
-"""
+A capture's name is the path of its result below ``OUT``. A list is a text file with one capture a line (``#`` begins a
+comment), or a CSV file whose first row names its columns; relative paths start at the list's folder."""
 
 import csv
 import json
@@ -22,9 +21,9 @@ from server.tasks.settings_file import read_settings_file, reason_of
 
 ARCHIVES = (".tar.gz", ".tgz", ".tar", ".zip")
 COLUMNS = ("capture", "name", "subject", "session", "settings")
-MIN_PICTURES = 3  # of a folder of photographs alone: fewer are no capture, and perhaps somebody's notes
-TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html")  # of OUT itself
-MORE = "more"  # of a row: how many cells it has beyond the columns
+MIN_PICTURES = 3  # in a folder of photographs without cameras: fewer are no capture
+TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html")  # files of OUT, which no capture may be called
+MORE = "more"  # key of a row: how many cells it has beyond the columns
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 
 
@@ -108,7 +107,8 @@ def _walk(folder: Path, out: Path) -> Iterator[Path]:
 
 
 def _name(path: Path, folder: Path) -> str:
-    """The path below ``folder`` without an archive's ending, and where it is elsewhere its last part."""
+    """Returns a capture's name: its path below ``folder``, or its last part if it lies elsewhere, without an archive's
+    suffix."""
     below = path.relative_to(folder) if path.is_relative_to(folder) else Path(path.resolve().name)
     name = below.as_posix()
     if path.is_dir():
@@ -181,7 +181,7 @@ def _capture_of(row: Mapping[str, str], folder: Path, faults: list[Message]) -> 
 
 
 def _settings_of(text: str, folder: Path) -> dict[str, object]:
-    """A cell: a JSON object, or a file that holds one, or TOML."""
+    """Reads the settings in a cell: a JSON object, or the path of a JSON or TOML file."""
     if not text.startswith("{"):
         return read_settings_file(folder / text)
     try:
@@ -191,7 +191,8 @@ def _settings_of(text: str, folder: Path) -> dict[str, object]:
 
 
 def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Message]:
-    """Of names that cannot be folders below OUT, or would be one folder, or one within the other."""
+    """Returns faults of names that cannot be folders below OUT, that would be the same folder, or one inside
+    another."""
     faults: list[Message] = []
     folded: dict[str, list[str]] = {}
     for capture, place in zip(captures, places, strict=True):

@@ -1,14 +1,14 @@
-"""Who works on what, by files alone: a claim is a symbolic link of the claimed name to its owner's file.
+"""Decides through files alone which process works on what: a claim is a symbolic link of the claimed name to its
+owner's file.
 
-Making a link is atomic and refused where one is, on local disks and on NFS and Lustre, where ``flock`` may not reach
-other machines; and it says at once whose it is. An owner is one process. Its file is touched every ``BEAT_S`` seconds;
-whoever is silent for ``HEARTBEAT_TIMEOUT_S``, whose process is gone (same machine), or whose file is gone, has lost its
-claims.
+Making a link is atomic and fails where one exists, on local disks as on NFS and Lustre, where ``flock`` may not reach
+other machines; and the link names its owner. An owner is one process. It touches its file every ``BEAT_S`` seconds. An
+owner loses its claims if its file is untouched for ``HEARTBEAT_TIMEOUT_S``, if its process is gone (same machine), or
+if its file is gone.
 
-A lost claim is taken away by one process alone: that which claims the claim (its name and the loser's token) first.
-Nobody else removes the link, so that what is removed is never a newer one. A process that was stopped for longer than
-``HEARTBEAT_TIMEOUT_S`` and goes on asks ``Claims.holds`` before it lays a result down.
-"""
+A lost claim is removed by one process only: the one that first claims the removal (a claim named by the claim and the
+loser's token). So a newer claim is never removed by mistake. A process that was suspended for longer than
+``HEARTBEAT_TIMEOUT_S`` and continues asks ``Claims.holds`` before it publishes a result."""
 
 import json
 import os
@@ -76,7 +76,7 @@ class Claims:
             return False
         with suppress(OSError):
             os.utime(self._owner)
-            # Both are times of the file's server, and need no clocks that agree.
+            # Both times are the file server's, so clocks need not agree.
             return self._owner.stat().st_mtime - seen < self._silent_s
         return True
 
@@ -134,14 +134,14 @@ class Claims:
         while not self._ended.wait(BEAT_S):
             try:
                 os.utime(self._owner)
-            except FileNotFoundError:  # taken for dead: claims are lost, and new ones may be taken
+            except FileNotFoundError:  # others took this process for dead; its claims are lost, new ones are possible
                 self._show()
-            except OSError:  # a file server that does not answer; the next beat tries again
+            except OSError:  # the file server does not answer; the next beat tries again
                 continue
 
 
 def _holder(path: Path) -> str | None:
-    """The token of who has a claim; None where nobody has."""
+    """Returns the token of the process that has a claim; None if none has it."""
     try:
         return path.readlink().name.removesuffix(SUFFIX)
     except OSError:

@@ -1,4 +1,4 @@
-"""What a result follows from, as sha256: a capture's files, settings, and the model."""
+"""Computes the sha256 of what a result depends on: a capture's files, settings, and the model."""
 
 import hashlib
 import os
@@ -25,7 +25,8 @@ def files_sha256(files: Mapping[str, str]) -> str:
 
 
 def _files(folder: Path, prefix: str, within: frozenset[tuple[int, int]]) -> Iterator[tuple[str, Path]]:
-    """Files by their path below the capture, those behind links too; ``within``: folders above, against circles."""
+    """Yields the files below a capture with their paths, following links. ``within`` are the enclosing folders, to stop
+    at circular links."""
     state = folder.stat()
     if (here := (state.st_dev, state.st_ino)) in within:
         return

@@ -1,4 +1,4 @@
-"""Why a capture of a batch failed, in words that fit a batch."""
+"""Describes why a capture of a batch failed, in messages fit for a batch."""
 
 from pathlib import Path
 

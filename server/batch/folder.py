@@ -1,4 +1,4 @@
-"""The folder that a batch fills: results by name, each complete or absent, and beside them what is at work.
+"""Manages the folder that a batch fills: results by name, each complete or absent, and records of work in progress.
 
 NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it follows from
 heads.csv heads.parquet sheet.html
@@ -23,7 +23,7 @@ from server.storage.result_folder import RESULT_FILE
 RECORD = "batch.json"
 RECORD_FORMAT, FAILURE_FORMAT = "eigenhead-batch-result/1", "eigenhead-batch-failure/1"
 REPORT = "report.json"
-FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks")  # of captures of photographs alone
+FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks")  # kept for captures without cameras
 
 
 class ForeignFiles(EigenheadError):
@@ -60,7 +60,7 @@ class FailureRecord:
     message: Message
     faults: tuple[Message, ...]
     origin: Origin | None
-    trace: str = ""  # of a fault of the program's own
+    trace: str = ""  # stack trace of a bug in this program
 
 
 class BatchFolder:
@@ -73,6 +73,7 @@ class BatchFolder:
         self.claims, self.attempts = self.work / "claims", self.work / "attempts"
 
     def result(self, name: str) -> Path:
+        """Returns the folder of a capture's result."""
         return self.out / name
 
     def origin(self, name: str) -> Origin | None:
@@ -96,7 +97,7 @@ class BatchFolder:
         while True:
             attempt = self.attempts / f"{token}.{number}"
             try:
-                attempt.mkdir(parents=True)  # whoever leaves may take the empty folder above away meanwhile
+                attempt.mkdir(parents=True)  # a process that ends may remove the empty parent folder meanwhile
             except FileExistsError:
                 number += 1
                 continue
@@ -112,13 +113,13 @@ class BatchFolder:
         made, target = attempt / "result", self.result(name)
         self.check_replaceable(name)
         sizes = {path.relative_to(made).as_posix(): path.stat().st_size for path in _files(made)}
-        sizes.pop(REPORT, None)  # it tells seconds, so that its size is another one each time
+        sizes.pop(REPORT, None)  # it contains durations, so its size varies
         document = {"format": RECORD_FORMAT, "capture": name, **asdict(origin), "files": dict(sorted(sizes.items()))}
         write_atomically(made / RECORD, json.dumps(document, indent=1).encode())
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists():
             target.rename(attempt / "replaced")
-        made.rename(target)  # refused where a folder with files is
+        made.rename(target)  # fails if a folder with files exists there
         self.failure_file(name).unlink(missing_ok=True)
 
     def check_replaceable(self, name: str) -> None:
@@ -161,6 +162,7 @@ class BatchFolder:
         write_atomically(self.failure_file(name), json.dumps(document, indent=1).encode())
 
     def failure_file(self, name: str) -> Path:
+        """Returns the path of a capture's failure record."""
         return self.work / "failures" / f"{file_name(name)}.json"
 
     def forget_failures_but_of(self, names: set[str]) -> None:

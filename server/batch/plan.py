@@ -1,4 +1,4 @@
-"""What a batch is to make: each capture with its settings and model, all of it checked before any work begins."""
+"""Plans a batch: each capture with its settings and model, all checked before any work begins."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""How far a batch is, and how long it takes yet."""
+"""Measures how far a batch is, and estimates its remaining time."""
 
 import time
 from collections.abc import Callable
@@ -18,11 +18,12 @@ class BatchProgress:
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
         self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock
-        self._running: dict[str, tuple[float, float]] = {}  # since when, and how far
+        self._running: dict[str, tuple[float, float]] = {}  # by name: start time, share done
         self._took: list[float] = []
         self.ended = self.failed = 0
 
     def start(self, name: str) -> None:
+        """Records that work on a capture begins."""
         self._running[name] = self._clock(), 0.0
 
     def report(self, name: str, share: float) -> None:

@@ -1,8 +1,7 @@
-"""A batch at work: each worker takes one capture after the other, in a child process that keeps models and loops.
+"""Runs a batch: each worker takes one capture after the other, in a child process that keeps models and compiled loops.
 
-Whatever happens to a child or a capture is that capture's failure alone. Whatever happens to this process leaves
-results complete or absent; what it had begun is swept by whoever comes next.
-"""
+A crash of a child, or a fault of a capture, is a failure of that capture only. If this process ends at any moment,
+every result is complete or absent, and the next run removes what was left unfinished."""
 
 import os
 import shutil
@@ -29,9 +28,9 @@ from server.tasks.reconstruct_folder import reconstruct_beside
 if TYPE_CHECKING:
     from server.batch.plan import BatchTask
 
-POLL_S = 0.5  # between two questions whether a capture that another process has is done
+POLL_S = 0.5  # interval of checks whether another process has finished a capture
 EXAMINERS = 4  # captures whose files are compared at once: hashing releases the interpreter lock
-TABLE = "table"  # the claim of who writes the tables
+TABLE = "table"  # name of the claim on writing the table
 
 
 class FolderWork(Protocol):
@@ -63,7 +62,10 @@ class Outcome:
 
 
 class Observer(Protocol):
-    """Declares what is called as a batch goes on, from several threads but never two at a time."""
+    """Declares the methods that are called as a batch proceeds, from several threads but never two at a time.
+
+    ``begin`` gets the number of captures to make; ``start``, ``report`` (share done, 0 to 1) and ``end`` follow each
+    capture; ``leave`` tells that another process has it."""
 
     def begin(self, pending: int) -> None: ...
     def start(self, name: str) -> None: ...
@@ -115,12 +117,12 @@ class BatchRun:
         return [self._outcomes[task.capture.name] for task in self._tasks if task.capture.name in self._outcomes]
 
     def _examine(self) -> None:
-        """Tells what is there from what is missing."""
+        """Separates the captures whose results exist from those to be made."""
 
         def kept(task: "BatchTask") -> bool:
             try:
                 return self._is_done(task, None)
-            except OSError:  # said of the capture when its turn comes
+            except OSError:  # reported when the capture's turn comes
                 return False
 
         with ThreadPoolExecutor(EXAMINERS) as pool:
@@ -167,12 +169,13 @@ class BatchRun:
                 with self._lock:
                     self._pending.append(task)
                 passed_over += 1
-                if passed_over > left:  # others have all that are left
+                if passed_over > left:  # other processes have all remaining captures
                     passed_over = 0
                     self._stopped.wait(POLL_S)
 
     def _take(self, task: "BatchTask", child: Child) -> bool:
-        """Whether a capture has ended: False where another process has it, or where this one is to stop."""
+        """Works on a capture and tells whether it has ended. Returns False if another process has it, or if this one is
+        to stop."""
         name = task.capture.name
         claim = file_name(name)
         if not self._claims.take(claim):
@@ -200,16 +203,16 @@ class BatchRun:
                 return Outcome(name, "kept")
             failure = self._folder.failure(name)
             if failure is not None and failure.attempt != self._failed_before.get(name):
-                return Outcome(name, "failed", failure=failure)  # another process tried just now
+                return Outcome(name, "failed", failure=failure)  # another process has just tried
             self._make(task, origin, child, claim)
             return Outcome(name, "made", time.monotonic() - began)
         except Cancelled:
             return None
         except (EigenheadError, OSError) as error:
-            if not self._claims.holds(claim):  # another process took this one for dead, and the capture over
+            if not self._claims.holds(claim):  # another process took this one for dead and the claim from it
                 return None
             failure = failure_of(error, task.capture.path, self._claims.token, origin)
-        with suppress(OSError):  # on a full disk it is said on the terminal alone
+        with suppress(OSError):  # on a full disk only the terminal shows it
             self._folder.note_failure(name, failure)
         return Outcome(name, "failed", time.monotonic() - began, failure)
 

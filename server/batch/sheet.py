@@ -1,8 +1,8 @@
-"""The contact sheet of a batch: one HTML file that needs nothing beside it.
+"""Draws the contact sheet of a batch: one self-contained HTML file.
 
-Each head is three views of its turntable, its name, figures and warnings; what speaks against the head itself is red,
-what it was made without is amber, the rest is grey. It tells no times, so that its bytes repeat.
-"""
+Each head has three views of its turntable, its name, figures and warnings. Red marks warnings that question the head
+itself, amber those about missing input, grey the rest. The sheet contains no times, so that equal results give equal
+bytes."""
 
 import base64
 import html

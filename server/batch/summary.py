@@ -1,4 +1,4 @@
-"""Table and contact sheet of all that a batch has in its folder, whoever made it."""
+"""Writes table and contact sheet of all results in a batch's folder, whichever process made them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -69,7 +69,8 @@ def _outcome(folder: BatchFolder, task: BatchTask) -> Outcome:
 
 
 def _result(folder: BatchFolder, task: BatchTask) -> tuple[Origin | None, dict[str, Any] | None]:
-    """A result of these settings and this model; one of others is to be made again."""
+    """Returns origin and report of a capture's result if it was made with these settings and this model; otherwise
+    None, None."""
     origin = folder.origin(task.capture.name)
     wanted = task.settings_sha256, task.model_sha256
     if origin is None or (origin.settings_sha256, origin.model_sha256) != wanted:

@@ -1,8 +1,7 @@
-"""The table of a batch: a row a capture, by the columns of ``columns_of``.
+"""Builds the table of a batch: one row for each capture, with the columns of ``columns_of``.
 
-What enters are the reports of results and the records of failures; what leaves are plain values. Lengths are mm in the
-world frame, angles do not occur. A cell is None where its row has no such value.
-"""
+Enters: reports of results and records of failures. Leaves: plain values. Lengths are mm, in the world frame; there are
+no angles. A cell is None if its row has no such value."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -160,7 +159,8 @@ def _of_report(report: Mapping[str, Any]) -> Row:
 
 
 def _expression(report: Mapping[str, Any], columns: Sequence[Column]) -> Row:
-    """The model's expressions: a report names those alone that the face makes."""
+    """Returns weights and standard deviations of the model's expressions. Those missing from the report have weight
+    0."""
     row: Row = {
         column.name: 0.0
         for column in columns

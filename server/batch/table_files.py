@@ -1,4 +1,4 @@
-"""The table of a batch as files: CSV for everybody, Parquet with units where pyarrow is installed."""
+"""Writes the table of a batch as CSV and, if pyarrow is installed, as Parquet with units."""
 
 import csv
 import io
@@ -21,7 +21,7 @@ def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) ->
         files.append(folder / PARQUET)
         write_atomically(files[1], parquet_bytes(columns, rows))
     else:
-        (folder / PARQUET).unlink(missing_ok=True)  # of an earlier run, and of other rows
+        (folder / PARQUET).unlink(missing_ok=True)  # an earlier run's would contradict the CSV
     return files
 
 
@@ -73,5 +73,5 @@ def _cell(value: Value) -> str:
 
 
 def _encodable(value: Value) -> Value:
-    """Names of files need not be UTF-8."""
+    """Escapes text that UTF-8 cannot encode, since names of files need not be UTF-8."""
     return printable(value) if isinstance(value, str) else value

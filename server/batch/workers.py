@@ -1,9 +1,9 @@
-"""How many captures at once, by the memory and the processors that this process may use."""
+"""Computes how many captures are reconstructed at once, from the memory and processors that this process may use."""
 
 import os
 from pathlib import Path
 
-WORKER_BYTES = 2 << 30
+WORKER_BYTES = 2 << 30  # memory of one worker
 """Memory of a worker: 1.4 GB at the most in a default job of eleven cameras of 1024 x 768 (VmHWM of `eigenhead
 reconstruct scan-a`), and half as much again for larger pictures."""
 CGROUP = Path("/sys/fs/cgroup")
@@ -47,7 +47,7 @@ def _available(meminfo: Path) -> int:
 
 
 def _own_group() -> Path:
-    """The folder of this process's control group, version 2."""
+    """Returns the folder of this process's control group, version 2."""
     try:
         lines = Path("/proc/self/cgroup").read_text().splitlines()
     except OSError:
@@ -57,7 +57,7 @@ def _own_group() -> Path:
 
 
 def _number(path: Path) -> int | None:
-    """None for "max", and where there is no such file."""
+    """Returns the number in a file; None for "max", and if the file does not exist."""
     try:
         return int(path.read_text())
     except (OSError, ValueError):

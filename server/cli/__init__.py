@@ -1,1 +1,1 @@
-"""The command line ``eigenhead``: one module for each group of commands."""
+"""Implements the command line ``eigenhead``: one module for each group of commands."""

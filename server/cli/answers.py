@@ -1,4 +1,4 @@
-"""What every command shares: option types, the service's settings, a progress bar, and the answer on stdout."""
+"""Holds what all commands share: types of options, the service's settings, a progress bar, and the answer on stdout."""
 
 import errno
 import json
@@ -18,33 +18,33 @@ from rig.errors import EigenheadError, InputError
 from rig.messages.message import texts_of
 from rig.progress import Progress
 
-# Before OpenCV is loaded, here and in workers: what it has to say of a damaged picture, an error of ours says in words.
+# Set before OpenCV is loaded, here and in workers. OpenCV would log damaged pictures; our own errors name them better.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 
 class CannotWrite(EigenheadError):
-    """An output that cannot be written, found before the work."""
+    """Reports an output path that cannot be written. It is raised before the work begins."""
 
     def __init__(self, path: Path, error: OSError, option: str = "--out") -> None:
         super().__init__(f"{path} cannot be written ({error.strerror or error}); name another place with {option}")
 
 
 class SpoilsCapture(EigenheadError):
-    """An output that would be read as a part of its own input from then on."""
+    """Reports an output path that lies within the capture, where the next run would read the result as input."""
 
     def __init__(self, path: Path, option: str = "--out") -> None:
         super().__init__(f"{path} lies where the capture's own pictures do; name another place with {option}")
 
 
 class Overwrites(EigenheadError):
-    """An output that is there already."""
+    """Reports an output file that exists already, where ``--overwrite`` was not given."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path} is there already; name another place, or replace it with --overwrite")
 
 
 def _use_data(folder: Path | None) -> Path | None:
-    """``--data`` counts for all that looks for data, keys or models, in this process and in its children."""
+    """Sets the variable EIGENHEAD_DATA from ``--data``, so that this process and its children all use that folder."""
     if folder is not None:
         os.environ[DATA] = str(folder.resolve())
     return folder
@@ -64,7 +64,10 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is th
 
 
 def service_settings(**overrides: Any) -> Any:
-    """The service's settings: options over variables over defaults. A wrong variable is wrong usage."""
+    """Returns the service's ``ServiceSettings``. Options that are not None go before variables, variables before
+    defaults.
+
+    Raises typer.BadParameter (exit status 2) naming every option or variable with a wrong value."""
     from pydantic import ValidationError
     from pydantic_settings import SettingsError
 
@@ -80,7 +83,7 @@ def service_settings(**overrides: Any) -> Any:
 
 
 def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
-    """``fault`` as pydantic tells it, with the name by which its value came: an option's or a variable's."""
+    """Words a fault that pydantic found, naming the option or the environment variable that holds the wrong value."""
     from server.settings import PREFIX
 
     field, *inner = map(str, fault["loc"])
@@ -89,7 +92,9 @@ def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
 
 
 def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str | None]:
-    """A callback of an option that takes one of ``choices``, which are asked for when the option is given."""
+    """Returns a callback that refuses a value which is not among the choices.
+
+    ``choices`` is called only when the option is given: listing them may import heavy modules."""
 
     def check(value: str | None) -> str | None:
         if value is not None and value not in choices():
@@ -100,28 +105,29 @@ def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str
 
 
 def completing(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """What a shell offers for the begun word of such an option."""
-    return lambda incomplete: [choice for choice in choices() if choice.startswith(incomplete)]  # typer tells by name
+    """Returns a function that lists the choices beginning with what was typed so far, for completion by the shell."""
+    # The parameter's name tells typer what to pass.
+    return lambda incomplete: [choice for choice in choices() if choice.startswith(incomplete)]
 
 
 def chosen(help_text: str, choices: Callable[[], tuple[str, ...]], *names: str) -> Any:
-    """An option that takes one of ``choices``: asked for when it is given, or completed."""
+    """Returns a typer option that takes one of the choices and completes them in the shell."""
     return typer.Option(*names, help=help_text, callback=one_of(choices), autocompletion=completing(choices))
 
 
 def _finite(value: float | None) -> float | None:
-    if value is not None and not math.isfinite(value):  # no comparison with a limit says so of NaN
+    if value is not None and not math.isfinite(value):  # NaN passes every comparison with a limit
         raise typer.BadParameter(f"{value} is no finite number")
     return value
 
 
 def number(help_text: str, **limits: Any) -> Any:
-    """An option that takes a finite number between ``min`` and ``max``."""
+    """Returns a typer option that takes a finite number between the limits ``min`` and ``max``."""
     return typer.Option(help=help_text, callback=_finite, **limits)
 
 
 def model_names() -> tuple[str, ...]:
-    """Of the head models at hand."""
+    """Returns the names of all installed head models."""
     from pipeline.head_model.model_names import list_models
 
     return tuple(list_models())
@@ -129,7 +135,7 @@ def model_names() -> tuple[str, ...]:
 
 @contextmanager
 def wrong_usage(option: str) -> Iterator[None]:
-    """Faults of what an option says are wrong usage: status 2."""
+    """Turns an InputError of the block into typer.BadParameter of ``option``, which ends the command with status 2."""
     try:
         yield
     except InputError as error:
@@ -137,9 +143,9 @@ def wrong_usage(option: str) -> Iterator[None]:
 
 
 def prepare_file(path: Path, *, overwrite: bool = True, option: str = "--out") -> None:
-    """Makes the folder of an output file and tries whether it can be written, before the work that it takes.
+    """Makes the folder of an output file and checks that it can be written, before any work is done for it.
 
-    Raises CannotWrite, and Overwrites where the file is there and shall stay."""
+    Raises CannotWrite, and Overwrites if the file exists and ``overwrite`` is false."""
     if path.exists() and not overwrite:
         raise Overwrites(path)
     try:
@@ -153,7 +159,7 @@ def prepare_file(path: Path, *, overwrite: bool = True, option: str = "--out") -
 
 
 def prepare_folder(path: Path) -> None:
-    """Makes an output folder and tries whether it can be written. Raises CannotWrite."""
+    """Makes an output folder and checks that it can be written. Raises CannotWrite."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -166,7 +172,7 @@ def prepare_folder(path: Path) -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on standard error when that is a terminal."""
+    """Yields a function that reports progress as a bar on standard error; without a terminal it reports nothing."""
     if not sys.stderr.isatty():
         yield lambda stage, fraction: None
         return
@@ -180,16 +186,16 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def answer(document: Any, as_json: bool, lines: list[str]) -> None:
-    """One JSON object, or lines for people."""
+    """Prints the command's result on stdout: ``document`` as one JSON object, or ``lines`` for people."""
     print(json.dumps(document, allow_nan=False) if as_json else "\n".join(lines))
 
 
 def warn(message: str) -> None:
-    """A line on standard error that stops nothing."""
+    """Prints a warning on standard error; the command goes on."""
     print(f"eigenhead: {message}", file=sys.stderr)
 
 
 def fail(message: str) -> NoReturn:
-    """One clear line on standard error, and status 1."""
+    """Prints an error on standard error and exits with status 1."""
     print(f"eigenhead: {message}", file=sys.stderr)
     sys.exit(1)

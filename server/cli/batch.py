@@ -1,4 +1,4 @@
-"""``eigenhead batch``: many captures, one result folder each, and a table of all."""
+"""Implements ``eigenhead batch``: reconstructs many captures, one result folder each, and makes a table of all."""
 
 import signal
 import sys
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from server.batch.shards import Shard
 
 app = typer.Typer(rich_markup_mode=None)
-NAMED_MOST = 10  # captures that failed, in the last line; the table has all
+NAMED_MOST = 10  # failed captures that the last line names; the table lists all
 
 
 class CapturesFailed(EigenheadError):
-    """Some captures of a batch failed; the others are done."""
+    """Reports at the end of a batch that some captures failed; the results of the others are complete."""
 
     def __init__(self, failed: Sequence[str], count: int) -> None:
         names = [*failed[:NAMED_MOST], *(["..."] if len(failed) > NAMED_MOST else [])]
@@ -95,7 +95,7 @@ def batch(
     requested = {name: value for name, value in outputs.items() if value}
     document = settings_document(settings, method=method, detail=detail, outputs=requested or None)
     with wrong_usage("FOLDER|LIST"):
-        found = _found(captures, out)
+        found = _captures_in(captures, out)
     with wrong_usage("settings"):
         tasks = plan_batch(found, document, model)
     prepare_folder(out)
@@ -109,8 +109,9 @@ def _share(text: str | None) -> "Shard":
         return WHOLE if text is None else read_shard(text)
 
 
-def _found(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
-    """The captures of a folder or list. Raises InputError, also where the results would lie within one."""
+def _captures_in(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
+    """Returns the captures of a folder or list. Raises InputError for a wrong list, and if ``out`` lies within a
+    capture."""
     from server.batch.captures import find_captures, is_archive, read_list
 
     if captures.is_file() and is_archive(captures):
@@ -141,7 +142,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     files: list[Path] = []
     with _terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
         display.prepare(share_tasks)
-        variables = {"EIGENHEAD_THREADS": str(threads_of_worker(cores, count))} | _given_threads()
+        variables = {"EIGENHEAD_THREADS": str(threads_of_worker(cores, count))} | _threads_variable()
         run = BatchRun(folder, share_tasks, workers=count, variables=variables, observer=display)
         outcomes = run.run(lambda: files.extend(write_summary(folder, tasks)))
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
@@ -153,8 +154,8 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
         fail(str(CapturesFailed([outcome.name for outcome in failed], len(share_tasks))))
 
 
-def _given_threads() -> dict[str, str]:
-    """EIGENHEAD_THREADS as somebody set it, who knows better."""
+def _threads_variable() -> dict[str, str]:
+    """Returns EIGENHEAD_THREADS if it is set in the environment: the user's choice goes before our own."""
     import os
 
     from pipeline.compute.threads import THREADS
@@ -197,7 +198,7 @@ def _document(
 
 @contextmanager
 def _terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM, which a scheduler sends some seconds before SIGKILL, ends the batch as Ctrl-C does."""
+    """Makes SIGTERM end the batch as Ctrl-C does. Schedulers send it some seconds before SIGKILL."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt

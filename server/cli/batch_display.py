@@ -1,4 +1,4 @@
-"""How a batch goes, for people: a bar on a terminal, else a line a capture, as the log of a scheduler keeps it."""
+"""Shows the progress of a batch: as a bar on a terminal, otherwise as one line a capture, for a scheduler's log."""
 
 import sys
 import time
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class BatchDisplay:
-    """An ``Observer`` of a run. ``bar``: rich's, where there is a terminal."""
+    """Shows the events of a batch run, as its ``Observer``. ``bar`` is rich's progress bar, None without a terminal."""
 
     def __init__(self, workers: int, expected_s: float, bar: Any = None) -> None:
         self._workers, self._expected_s, self._bar = workers, expected_s, bar
@@ -25,7 +25,7 @@ class BatchDisplay:
     @classmethod
     @contextmanager
     def opened(cls, workers: int, tasks: "Sequence[BatchTask]") -> "Iterator[BatchDisplay]":
-        """A display for as long as the block runs."""
+        """Yields a display that is closed at the end of the block."""
         expected_s = max((sum(task.expected_s.values()) for task in tasks), default=0.0)
         if not sys.stderr.isatty():
             yield cls(workers, expected_s)
@@ -39,7 +39,7 @@ class BatchDisplay:
             yield cls(workers, expected_s, bar)
 
     def prepare(self, tasks: "Sequence[BatchTask]") -> None:
-        """Compiles the loops that are missing once, before every worker would for itself."""
+        """Compiles the missing numerical loops once, so that not every worker compiles them for itself."""
         from pipeline.settings import settings_from_document
         from server.tasks.prepare import prepare_kernels
 
@@ -48,21 +48,26 @@ class BatchDisplay:
             prepare_kernels(self._prepared, settings_from_document(settings))
 
     def begin(self, pending: int) -> None:
+        """Begins to show progress of ``pending`` captures."""
         self._count, self._progress = pending, BatchProgress(pending, self._workers, self._expected_s)
         self._show()
 
     def start(self, name: str) -> None:
+        """Notes that work on a capture begins."""
         self._progress.start(name)
 
     def report(self, name: str, share: float) -> None:
+        """Shows that ``share`` (0 to 1) of a capture is done."""
         self._progress.report(name, share)
         self._show()
 
     def leave(self, name: str) -> None:
+        """Shows that another process has the capture."""
         self._progress.leave(name)
         self._show()
 
     def end(self, outcome: Outcome) -> None:
+        """Shows how a capture ended, and why if it failed."""
         self._progress.end(outcome.name, failed=outcome.state == "failed")
         self._show()
         if outcome.failure is not None:
@@ -72,6 +77,7 @@ class BatchDisplay:
             self._say(f"{ended} of {self._count}: {outcome.name} in {outcome.seconds:.0f} s, about {left} left")
 
     def seconds(self) -> float:
+        """Returns the seconds since the display was made."""
         return time.monotonic() - self._began
 
     def _prepared(self, stage: str, share: float) -> None:

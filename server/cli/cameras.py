@@ -1,4 +1,4 @@
-"""Commands about calibration: board, calibrate, refine, convert."""
+"""Implements the commands of calibration: board, calibrate, refine, convert."""
 
 from pathlib import Path
 from typing import Annotated

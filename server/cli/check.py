@@ -1,9 +1,10 @@
-"""``eigenhead check``: what is wrong with a capture, before anybody waits for a fit.
+"""Implements ``eigenhead check``: finds what is wrong with a capture without fitting a head.
 
-Files, cameras, plates and feature points are judged as at the service's door (``server.tasks.ingest``), but for
-pictures of no camera, which a reconstruction passes over; where they are in order, outlines are asked what they say of
-pictures and cameras (``pipeline.view_checks.usable_views``). What is wrong with this machine is no fault of the capture
-and is raised."""
+Files, cameras, clean plates and feature points are checked as the service checks an upload (``server.tasks.ingest``),
+with one difference: pictures that belong to no camera are only warned of, since a reconstruction ignores them. If these
+checks find no fault, the outlines are extracted and used to check pictures and cameras
+(``pipeline.view_checks.usable_views``). A fault of this machine is no fault of the capture and is raised as an
+error."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,8 @@ RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz
 
 
 class Checked(TypedDict):
-    """What `eigenhead check --json` prints: with ``faults`` a reconstruction fails, with ``warnings`` it goes on."""
+    """Describes what `eigenhead check --json` prints: ``faults`` make a reconstruction fail, ``warnings`` do not;
+    ``will`` lists in English what a reconstruction will do with photographs that have no cameras."""
 
     capture: str
     cameras: list[str]
@@ -44,8 +46,9 @@ class Checked(TypedDict):
 
 
 def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> Checked:
-    """Every fault and warning of a capture folder or archive that needs no fit. Raises InputError for settings that are
-    none, WrongVariable and WorkFailed."""
+    """Returns every fault and warning of a capture folder or archive that can be found without a fit.
+
+    Raises InputError for wrong settings, and WrongVariable and WorkFailed for faults of this machine."""
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
@@ -53,15 +56,15 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     try:
         with folder_of(capture) as folder:
             if photographs_alone(folder):
-                found["cameras"], found["will"] = _told_by_photographs(folder, report)
+                found["cameras"], found["will"] = _plan_for_photographs(folder, report)
                 _check_front(chosen.front, found["cameras"])
                 return found
-            found["warnings"] = _told_by_files(capture_root(folder))
+            found["warnings"] = _file_warnings(capture_root(folder))
             content = check_capture(capture_root(folder), service_settings().image_pixels, report, strays_pass=True)
             found["cameras"] = [camera.name for camera in content.cameras]
             _check_front(chosen.front, found["cameras"])
             found["front"] = chosen.front or content.front
-            seen = _told_by_outlines(folder, chosen, report)
+            seen = _outline_warnings(folder, chosen, report)
             found["warnings"] += [warned for warned in seen if warned not in found["warnings"]]
     except (WrongVariable, WorkFailed):
         raise
@@ -77,9 +80,9 @@ def _check_front(front: str | None, cameras: list[str]) -> None:
         raise InputError("front", [compose("front-of-other-capture", front=f"{front!r:.80}", cameras=cameras)])
 
 
-def _told_by_files(root: Path) -> list[MessageDocument]:
-    """What the reader of a capture folder notices and does not mind; nothing where its cameras cannot be read, which
-    ``check_capture`` tells."""
+def _file_warnings(root: Path) -> list[MessageDocument]:
+    """Returns warnings about the files of a capture folder. It is empty where the cameras cannot be read, since
+    ``check_capture`` reports that fault."""
     rigs = [*rig_files(root)]
     try:
         read = read_cameras(rigs[0]) if rigs else None
@@ -88,13 +91,15 @@ def _told_by_files(root: Path) -> list[MessageDocument]:
     if read is None:
         return []
     files = find_files(root, read.rig, read.left_out)
-    strays = () if files.faults else unread_pictures(root, files, read.rig)  # what is missing is said with them
+    # Where a picture is missing, that fault names the strays already.
+    strays = () if files.faults else unread_pictures(root, files, read.rig)
     return documents_of([*read.remarks, *unread_files(root, rigs), *strays])
 
 
-def _told_by_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:
-    """Names of the photographs of a folder that has no cameras, and what a reconstruction will do with them. Raises
-    InputError for photographs, or a scale.json, that cannot be used."""
+def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:
+    """Returns the names of the photographs of a folder without cameras, and sentences on what a reconstruction will do.
+
+    Raises InputError for photographs, or a scale.json, that cannot be used."""
     from calibration.scene.photographs import find_photographs
     from rig.formats.scale_json import read_scale
 
@@ -118,7 +123,7 @@ def _told_by_photographs(folder: Path, report: Progress) -> tuple[list[str], lis
 
 
 def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
-    """Decodes one after the other. Raises InputError naming every one that cannot be, or is too large."""
+    """Decodes the pictures one after the other. Raises InputError naming every one that is damaged or too large."""
     faults = []
     for number, path in enumerate(files):
         report("check", number / len(files))
@@ -128,7 +133,7 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
         raise InputError("photographs", faults)
 
 
-def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
+def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
     from pipeline.texturing.chart_colours import chart_colours
@@ -148,7 +153,7 @@ def _told_by_outlines(folder: Path, chosen: "Settings", report: Progress) -> lis
 
 
 def lines(found: Checked) -> list[str]:
-    """The same for people."""
+    """Returns the findings as lines of text for people."""
     findings = [f"fault    {fault}" for fault in found["faults"]]
     findings += [f"warning  {warning['code']}: {warning['message']}" for warning in found["warnings"]]
     findings += [f"will     {step}" for step in found["will"]]

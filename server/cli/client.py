@@ -1,4 +1,4 @@
-"""A Python client of the service: uploads that resume, waiting with progress, downloads that are checked.
+"""Provides a Python client of the service: it resumes uploads, waits with progress, and checks downloads.
 
 with Client("http://127.0.0.1:8600") as client:
     capture = client.upload(Path("capture"))
@@ -34,7 +34,8 @@ RETRY_STATUSES = (429, 502, 503, 504)
 
 
 class ServiceError(EigenheadError):
-    """The service said no. ``status``, ``kind`` and ``errors`` are those of its problem document."""
+    """Reports a request that the service refused. ``status``, ``kind`` and ``errors`` are those of its problem
+    document."""
 
     def __init__(self, status: int, kind: str, detail: str, errors: list[str]) -> None:
         super().__init__(detail + "".join(f"\n  - {error}" for error in errors))
@@ -42,13 +43,15 @@ class ServiceError(EigenheadError):
 
 
 class Unreachable(EigenheadError):
+    """Reports a service that could not be reached within the client's patience."""
+
     def __init__(self, url: str, error: Exception) -> None:
         why = str(error) or type(error).__name__
         super().__init__(f"{url} does not answer ({why}); is `eigenhead serve` running there?")
 
 
 class JobEnded(EigenheadError):
-    """A job that ended without a result; ``job`` is its document."""
+    """Reports a job that failed or was cancelled; ``job`` is its document."""
 
     def __init__(self, job: JobDocument) -> None:
         error = job.get("error")
@@ -60,7 +63,7 @@ class JobEnded(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of a job's stream: a progress, or at the end the whole job."""
+    """Holds one event of a job's stream: its progress, or at the end the document of the whole job."""
 
     kind: str
     id: str
@@ -68,7 +71,8 @@ class Event:
 
 
 class Client:
-    """One service. What was cut off is tried again for ``patience_s``; what the service refused is not."""
+    """Calls one service. Requests that a broken connection or a busy service stopped are repeated for ``patience_s``
+    seconds; refused requests are not."""
 
     def __init__(self, url: str, key: str | None = None, *, patience_s: float = 30.0, timeout_s: float = 300.0) -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
@@ -83,18 +87,23 @@ class Client:
         self._http.close()
 
     def get(self, path: str, **query: Any) -> Any:
+        """Returns the JSON answer to a GET; query parameters that are None are left out."""
         return self._request("GET", path, params={k: v for k, v in query.items() if v is not None}).json()
 
     def post(self, path: str, document: Any = None, headers: dict[str, str] | None = None) -> Any:
-        """Not repeated when the connection breaks, unless ``headers`` hold an Idempotency-Key: it may have been
-        done."""
+        """Returns the JSON answer to a POST.
+
+        A broken connection leaves open whether the service acted, so the request is repeated only if ``headers`` hold
+        an Idempotency-Key."""
         again = bool(headers and "Idempotency-Key" in headers)
         return self._request("POST", path, json=document, headers=headers, repeat=again).json()
 
     def put(self, path: str, document: Any) -> Any:
+        """Returns the JSON answer to a PUT of ``document``."""
         return self._request("PUT", path, json=document).json()
 
     def delete(self, path: str) -> None:
+        """Sends a DELETE. Raises ServiceError if the service refuses it."""
         self._request("DELETE", path)
 
     def upload(self, source: Path, *, report: Progress | None = None, **about: str) -> CaptureDocument:
@@ -117,14 +126,16 @@ class Client:
         settings: Mapping[str, object] | None = None,
         key: str | None = None,
     ) -> JobDocument:
-        """Queues a job. The idempotency ``key`` (one is made up) makes it safe to send again."""
+        """Queues a job and returns its document. ``key`` is the idempotency key, which makes the request safe to
+        repeat; a new one is made by default."""
         request = {"capture_id": capture_id, "model": model, "settings": settings}
         headers = {"Idempotency-Key": key or hashlib.sha256(f"{capture_id}{time.time_ns()}".encode()).hexdigest()}
         return self.post("/v1/jobs", request, headers)
 
     def events(self, job_id: str) -> Iterator[tuple[str, "JsonObject"]]:
-        """(kind, document) of the job's events up to the end, across broken connections. Raises Unreachable where no
-        connection comes about for ``patience_s``; how long a job is silent does not matter."""
+        """Yields (kind, document) for each event of a job until the job ends, reconnecting where the connection breaks.
+
+        Raises Unreachable if no connection succeeds for ``patience_s`` seconds; a job may be silent for any time."""
         last, deadline = "0", time.monotonic() + self._patience_s
         while True:
             try:
@@ -143,7 +154,7 @@ class Client:
             time.sleep(0.3)
 
     def wait(self, job_id: str, *, report: Progress | None = None) -> JobDocument:
-        """The succeeded job. Raises JobEnded for one that failed or was cancelled."""
+        """Waits until the job ends and returns its document. Raises JobEnded if it failed or was cancelled."""
         for kind, document in self.events(job_id):
             if kind == "end":
                 job = cast(JobDocument, document)
@@ -155,8 +166,8 @@ class Client:
         raise AssertionError("a stream of events ends with 'end'")
 
     def download(self, job_id: str, folder: Path) -> list[Path]:
-        """Writes the files of a job's result into ``folder``, each checked against its sha256, in place of those of an
-        earlier result."""
+        """Writes the files of a job's result into ``folder``, replacing those of an earlier result; returns their
+        paths. Each file is checked against its sha256."""
         job = self.get(f"/v1/jobs/{job_id}")
         with fresh_folder(folder) as fresh:
             for name, described in job["files"].items():
@@ -187,7 +198,8 @@ class Client:
         return self.get(capture)
 
     def _send_part(self, location: str, stream: Any, offset: int) -> tuple[int, str | None]:
-        """One PATCH. After a break the service says with HEAD where it stands."""
+        """Sends one PATCH and returns the new offset (bytes) and the capture's address once the upload is complete.
+        After a failure the service is asked by HEAD how much it has."""
         stream.seek(offset)
         data = stream.read(PART_BYTES)
         checksum = "sha256 " + base64.b64encode(hashlib.sha256(data).digest()).decode()
@@ -206,7 +218,7 @@ class Client:
 
     @contextmanager
     def _stream(self, job_id: str, last: str) -> Iterator[Iterator[Event]]:
-        """The events of one connection that came about. Raises httpx.TransportError for one that did not."""
+        """Opens one connection and yields its events. Raises httpx.TransportError if it cannot be opened."""
         headers = {"Last-Event-ID": last, "Accept": "text/event-stream"}
         timeout = httpx.Timeout(10.0, read=30.0)  # the service sends a comment every 15 s
         with self._http.stream("GET", f"/v1/jobs/{job_id}/events", headers=headers, timeout=timeout) as response:

@@ -1,5 +1,5 @@
-"""``eigenhead demo``: the main job through the real service, from the trigger to the head; beside the paper's
-simplex where that is asked for."""
+"""Implements ``eigenhead demo``: runs the main job through a real service, from the trigger to the head, and on request
+solves it by the paper's simplex too."""
 
 import json
 import subprocess
@@ -27,16 +27,19 @@ from server.settings import ServiceSettings
 from server.tasks.prepare import prepare_kernels
 
 START_S = 60.0
-STRIP = 60  # height of the headings, pixels
+STRIP = 60  # height of a heading, pixels
 
 
 class ServiceDied(EigenheadError):
+    """Reports that the demo's service process ended before its end was requested; ``log`` is its log file."""
+
     def __init__(self, log: Path) -> None:
         super().__init__(f"the service did not start:\n{log.read_text(errors='replace')[-2000:]}")
 
 
 class MethodDocument(TypedDict):
-    """One solver's result: where it lies and how far it is from the truth."""
+    """Describes one solver's result: its files, its distance from the truth (mm), and its cost in seconds and
+    evaluations."""
 
     ply: str
     error_mm: dict[str, float]
@@ -47,7 +50,7 @@ class MethodDocument(TypedDict):
 
 
 class DemoDocument(TypedDict):
-    """What ``demo --json`` prints; the contour solver's result, and by name that of each method."""
+    """Describes what ``demo --json`` prints: the contour solver's result, and under ``methods`` that of each solver."""
 
     ply: str
     contact_sheet: str
@@ -58,15 +61,15 @@ class DemoDocument(TypedDict):
 
 
 def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Progress) -> DemoDocument:
-    """Starts a service in a temporary data folder, triggers its simulated rig, submits a job, follows it, and fetches
-    its result into ``out``.
+    """Starts a service in a temporary data folder, triggers its simulated rig, submits a job, waits for it, and
+    downloads its result into ``out``.
 
     Args:
         out: folder of the result.
-        seed: of the subject.
-        full: the job that is run where nothing is asked, with the dense stage; else the head at level ``photo``.
-        compare: solve by the paper's simplex too, into ``out/simplex``, and lay both side by side.
-        report: told the stage and the share of the whole that is done.
+        seed: seed of the simulated subject.
+        full: run the default job, with the dense stage; otherwise a head at level ``photo``.
+        compare: solve by the paper's simplex too, into ``out/simplex``, and show both results side by side.
+        report: receives the stage and the share of the whole that is done.
 
     Returns:
         What ``demo --json`` prints.
@@ -82,7 +85,7 @@ def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Progres
             capture = client.post("/v1/captures", {"seed": seed, "label": "demo"})
             folders = {"contour": out} | ({"simplex": out / "simplex"} if compare else {})
             starts = {"contour": 0.1, "simplex": 0.4, "": 1.0}
-            for method, after in pairwise([*folders, ""]):  # one at a time: both draw
+            for method, after in pairwise([*folders, ""]):  # one at a time, since both render
                 start, share = starts[method], starts[after] - starts[method]
                 job = client.submit(capture["id"], settings=requested | {"method": method})
                 client.wait(job["id"], report=_part(report, f"{method}: ", start, share))
@@ -118,7 +121,8 @@ def _described(folder: Path, truth: Path) -> MethodDocument:
 
 
 def side_by_side(found: dict[str, MethodDocument], target: Path) -> None:
-    """The contact sheets of both results as one: input and start, then each solver's silhouettes and head."""
+    """Joins the contact sheets of all solvers to one, written to ``target``: input and start once, then each solver's
+    silhouettes and head."""
     columns = []
     for method, described in found.items():
         sheet = cv2.imread(str(Path(described["ply"]).with_name("contact_sheet.png")))
@@ -140,7 +144,7 @@ def _strip(width: int, text: str) -> np.ndarray:
 
 @contextmanager
 def _service(data: Path) -> Iterator[str]:
-    """A service process on a free port, which ends with the block."""
+    """Runs a service process on a free port and yields its address; the process ends with the block."""
     with listen("127.0.0.1", 0) as sock:
         port = sock.getsockname()[1]
     settings = ServiceSettings(data=data, port=port, host="127.0.0.1", free_bytes=0, console=False)

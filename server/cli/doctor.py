@@ -1,4 +1,4 @@
-"""``eigenhead doctor``: what is wrong with this machine, and what to do about it."""
+"""Implements ``eigenhead doctor``: finds what is wrong with this machine and says what to do about it."""
 
 import os
 import shutil
@@ -22,9 +22,9 @@ from server.settings import PREFIX, ServiceSettings
 from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_compute, try_egl
 
-OTHER_VARIABLES = frozenset({MODELS, THREADS, PREFIX + "DEBUG", CACHE})  # not read in ServiceSettings
-# The tables of server.storage.database and of the job engine in words of the databases' own: SQLAlchemy takes longer
-# to load than all checks.
+OTHER_VARIABLES = frozenset({MODELS, THREADS, PREFIX + "DEBUG", CACHE})  # valid, but not fields of ServiceSettings
+# Queries for the tables of server.storage.database and of the job engine in plain SQL: importing SQLAlchemy takes
+# longer than all checks.
 TABLES = {
     "sqlite": "SELECT name FROM sqlite_master WHERE name = '{}'",
     "postgresql": "SELECT tablename FROM pg_tables WHERE tablename = '{}'",
@@ -38,7 +38,7 @@ MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
 class Connection(Protocol):
-    """What the two databases' own connections have alike (PEP 249)."""
+    """Describes the methods that connections to SQLite and to PostgreSQL have in common (PEP 249)."""
 
     def cursor(self) -> Any: ...
 
@@ -46,12 +46,14 @@ class Connection(Protocol):
 
 
 class Finding(TypedDict):
+    """Describes the result of one check: whether it passed, and a sentence that says what was found or what to do."""
+
     ok: bool
     detail: str
 
 
 def examine(settings: ServiceSettings) -> dict[str, Finding]:
-    """Findings by name: ``ok`` and a ``detail`` that says what to do. Looks, and makes nothing."""
+    """Runs every check and returns the findings by name. Only reads: neither folders nor tables are made."""
     checks: dict[str, Callable[[ServiceSettings], tuple[bool, str]]] = {
         "python": _python,
         "egl": _egl,
@@ -97,7 +99,7 @@ def _gpu(settings: ServiceSettings) -> tuple[bool, str]:
     try:
         return True, child.remote(try_compute)()
     except WorkFailed as error:
-        return True, f"none: {error.message.text}"  # the processor does what a GPU would
+        return True, f"none: {error.message.text}"  # no fault: the processor computes instead
     finally:
         child.close()
 
@@ -151,7 +153,7 @@ def _cache(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _database(settings: ServiceSettings) -> tuple[bool, str]:
-    """Reads it where there is one."""
+    """Checks that the database can be read, if there is one."""
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
@@ -177,7 +179,8 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _results(settings: ServiceSettings) -> tuple[bool, str]:
-    """Names jobs that succeeded and whose folder is gone: removed by hand, or not in the backup that was restored."""
+    """Names the jobs that succeeded but whose result folder is missing: removed by hand, or not in a restored
+    backup."""
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
@@ -202,7 +205,7 @@ def _kind(settings: ServiceSettings) -> str:
 
 
 def _connected(settings: ServiceSettings) -> Connection | None:
-    """A connection to read with; None where the file of SQLite is not there."""
+    """Opens the database for reading; returns None if SQLite's file does not exist."""
     if _kind(settings) == "sqlite":
         return _read_only(_sqlite(settings)) if _sqlite(settings).is_file() else None
     import psycopg
@@ -221,12 +224,12 @@ def _rows(connection: Connection, query: str) -> list[tuple[Any, ...]]:
 
 
 def _read_only(path: Path) -> sqlite3.Connection:
-    closed = not path.with_name(path.name + "-wal").exists()  # then a reader need not make one
+    closed = not path.with_name(path.name + "-wal").exists()  # without a -wal file a reader must not create one
     return sqlite3.connect(f"file:{quote(str(path))}?mode=ro&immutable={int(closed)}", uri=True, timeout=10)
 
 
 def _variables(settings: ServiceSettings) -> tuple[bool, str]:
-    """Names the variables of ours that nobody reads."""
+    """Names the environment variables with the project's prefix that nothing reads, such as misspelt ones."""
     known = {PREFIX + name.upper() for name in ServiceSettings.model_fields} | OTHER_VARIABLES
     present = sorted(name for name in os.environ if name.startswith(PREFIX))
     faults = []

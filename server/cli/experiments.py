@@ -1,4 +1,4 @@
-"""The command that repeats the paper's experiments, and runs ours."""
+"""Implements ``eigenhead experiments``: repeats the paper's experiments and runs those of this project."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -90,7 +90,7 @@ def _check_options(name: str, folders: list[Path] | None, only: list[str] | None
 
 
 def check_research() -> None:
-    """Raises EigenheadError where this is a wheel, which carries no research."""
+    """Raises EigenheadError if this is an installed wheel, which does not contain the research code."""
     try:
         from pipeline import research  # noqa: F401
     except ImportError:

@@ -1,4 +1,4 @@
-"""Commands that make and judge heads: check, reconstruct, verify, simulate, demo."""
+"""Implements the commands that make and judge heads: check, reconstruct, verify, simulate, demo."""
 
 import shutil
 import sys
@@ -32,7 +32,8 @@ app = typer.Typer(rich_markup_mode=None)
 
 
 def of_setting(name: str) -> Callable[[], tuple[str, ...]]:
-    """What a setting of the pipeline may be."""
+    """Returns a function that lists the values which a setting of the pipeline may have, read from its type
+    annotation."""
 
     def choices() -> tuple[str, ...]:
         from pipeline.settings import Settings
@@ -44,7 +45,8 @@ def of_setting(name: str) -> Callable[[], tuple[str, ...]]:
 
 
 def of_output(name: str) -> Callable[[], tuple[str, ...]]:
-    """The same of a setting of the outputs."""
+    """Returns a function that lists the values which a setting of the outputs may have, read from its type
+    annotation."""
 
     def choices() -> tuple[str, ...]:
         from pipeline.settings import OutputSettings
@@ -61,7 +63,8 @@ def _templates() -> tuple[str, ...]:
 
 
 def format_names(value: str | None) -> str | None:
-    """A callback: names of ``FORMATS`` with commas between."""
+    """Checks a list of file formats separated by commas and returns it without blanks. Raises typer.BadParameter for a
+    name that is none of ``FORMATS``."""
     from pipeline.settings import FORMATS
 
     names = [] if value is None else [name.strip() for name in value.split(",")]
@@ -106,7 +109,9 @@ def reconstruct(
         bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
     ] = False,
     chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in clean plates.")] = False,
-    obj: Annotated[bool, typer.Option("--obj", hidden=True)] = False,  # of earlier versions, and told so in a warning
+    obj: Annotated[
+        bool, typer.Option("--obj", hidden=True)
+    ] = False,  # from earlier versions; a warning says what replaced it
     atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
     normal_map: Annotated[
         bool, typer.Option("--normal-map", help="head.glb of few triangles, with a normal map of what they leave out.")
@@ -150,7 +155,7 @@ def reconstruct(
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
     for warning in written["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
-    names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # as they should be looked at
+    names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
     made = [out / name for name in names if (out / name).is_file()]
     answer(written, json_out, [str(path) for path in made])
 
@@ -282,7 +287,8 @@ def simulate(
 
 
 def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
-    """The studio's preset with what was chosen. A realism that nobody knows is wrong usage."""
+    """Returns the studio's preset with the chosen values. Raises typer.BadParameter for an unknown name in
+    ``realism``."""
     from dataclasses import replace
 
     from rig.studio.sensor.preset import PRESET
@@ -296,7 +302,7 @@ def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
 
 
 def _check_planted(faults: list[str], expression: list[str]) -> None:
-    """Faults and expressions that nobody knows are wrong usage."""
+    """Raises typer.BadParameter for faults or expressions that are unknown."""
     from rig.studio.sensor.faults import fault_from_text
 
     with wrong_usage("--fault"):
@@ -311,7 +317,7 @@ def _check_planted(faults: list[str], expression: list[str]) -> None:
 
 
 def _make_way(out: Path, overwrite: bool) -> None:
-    """Removes an earlier simulated capture where that was asked for. Raises Overwrites and CannotWrite."""
+    """Removes an earlier simulated capture if ``overwrite`` is true. Raises Overwrites and CannotWrite."""
     there = out.exists() and (not out.is_dir() or any(out.iterdir()))
     if there and not (overwrite and (out / "cameras.json").is_file()):
         raise Overwrites(out)
@@ -322,7 +328,7 @@ def _make_way(out: Path, overwrite: bool) -> None:
 
 
 def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
-    """Serves until Ctrl-C, which is how it ends well."""
+    """Serves the simulated studio until Ctrl-C, which ends it with status 0."""
     from contextlib import ExitStack, suppress
 
     from server.cli.studio import OpenStudio, serve_studio

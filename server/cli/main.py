@@ -1,4 +1,5 @@
-"""The command ``eigenhead``. Everything heavy is imported inside the commands, so that --help answers at once."""
+"""Implements the command ``eigenhead``. Everything heavy is imported inside the commands, so that --help answers at
+once."""
 
 import os
 import sys
@@ -42,8 +43,9 @@ def of_all(
 
 
 def main() -> None:
-    """Entry point: 0 done, 1 failed with one clear line on stderr, 2 wrong usage."""
-    # Before NumPy is loaded, here and in workers: on small systems BLAS threads spin longer than they work, and beside
+    """Runs the command line. The exit status is 0 if it succeeded, 1 if it failed (one line on stderr), 2 for wrong
+    usage."""
+    # Set before NumPy is loaded, here and in workers. On small systems BLAS threads spin longer than they work: beside
     # another busy process a fit took five times the processor time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:

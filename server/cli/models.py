@@ -1,4 +1,4 @@
-"""Commands about head models: model list, info, import, build, fetch, show, remove."""
+"""Implements the commands about head models: model list, info, import, build, fetch, show, remove."""
 
 from pathlib import Path
 from typing import Annotated
@@ -34,7 +34,7 @@ def model_info(
 
 
 def _as_text(value: object) -> str:
-    """A value of the description, for people."""
+    """Returns a value of a model's description as text for people."""
     if isinstance(value, dict):
         return "; ".join(f"{key}: {_as_text(inner)}" for key, inner in value.items())
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

@@ -1,4 +1,5 @@
-"""``eigenhead experiments real FOLDER...``: captures with more views than are used, calibrated first where needed."""
+"""Implements ``eigenhead experiments real FOLDER...``: judges real captures by views that the fit did not use. Cameras
+are calibrated first where a folder has none."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,8 +29,10 @@ def judge_folders(
     kept: Path | None,
     report: Progress,
 ) -> "Outcome":
-    """Figures of every folder. ``outlines``: drawn masks of the only folder, else its own outlines.json; ``kept``:
-    where cameras that had to be found stay. Raises InputError."""
+    """Computes the experiment's figures for every folder.
+
+    ``outlines`` is a file of masks drawn by hand, allowed for a single folder only; by default a folder's own
+    outlines.json is read. In ``kept`` the estimated cameras and the table of figures are stored. Raises InputError."""
     if outlines is not None and len(folders) > 1:
         raise InputError("--outlines", ["belongs to one folder; put outlines.json into each of several"])
     from pipeline.head_model.model import load_model
@@ -53,13 +56,14 @@ def judge_folders(
 def read_real_capture(
     folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Progress
 ) -> "RealCapture":
-    """A folder as ``real`` takes it: masks and outlines that it has judge, and feature points are left out."""
+    """Reads a folder for the experiment ``real``. Its masks and drawn outlines serve as reference; its feature points
+    are dropped."""
     from pipeline.research.faults.real import RealCapture
 
     prepared = read_or_calibrate(folder, kept, front=front, report=report)
     default = capture_root(folder) / OUTLINES
     path = outlines or (default if default.is_file() else None)
     drawn = {} if path is None else read_outlines(path, prepared.rig)
-    # Plates and masks that a folder has are its own; a mask that is there judges, too.
+    # A mask that the folder has serves as reference too; an outline drawn by hand replaces it.
     drawn = {**prepared.capture.masks, **drawn}
     return RealCapture(folder.name, replace(prepared.capture, features={}), prepared.rig, drawn, front)

@@ -1,4 +1,4 @@
-"""``eigenhead reconstruct``: one capture without the service, in this process."""
+"""Implements ``eigenhead reconstruct``: reconstructs one capture in this process, without the service."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -31,10 +31,11 @@ def reconstruct_locally(
     report: Progress,
     trace: Path | None = None,
 ) -> "ReportDocument":
-    """Reconstructs a capture folder or archive into ``out`` and returns report.json; cameras and masks that had to be
-    found are kept in ``out``, whatever comes after. What can be wrong with settings, model, template,
-    capture, ``out`` and ``trace`` is found before anything heavy is loaded. In ``trace`` is what ran when, also of
-    a job that failed."""
+    """Reconstructs a capture folder or archive into ``out`` and returns the content of report.json.
+
+    Estimated cameras and masks are kept in ``out`` even if a later stage fails. Settings, model, template, capture,
+    ``out`` and ``trace`` are checked before heavy modules are loaded. The file ``trace`` receives what ran when on
+    which thread, also for a job that fails."""
     from pipeline.settings import settings_from_document
     from pipeline.templates.header import check_template
 
@@ -71,22 +72,23 @@ def _reconstruct_folder(
 
 
 def _check_apart(out: Path, capture: Path, option: str = "--out") -> None:
-    """Raises SpoilsCapture where the pictures of a result would be taken for the capture's."""
+    """Raises SpoilsCapture if pictures of the result in ``out`` would be read as pictures of the capture."""
     from server.tasks.photographs import photographs_alone
 
     if not capture.is_dir():
         return
     place, whole, root = out.resolve(), capture.resolve(), capture_root(capture).resolve()
     pictures = [root / kind for kind in ("images", *BESIDE_PICTURES)]
-    pictures += [picture_folder(root)] if photographs_alone(root) else []  # any folder there is a camera's
-    beside_root = place.is_relative_to(whole) and not place.is_relative_to(root)  # which is told by being alone
+    pictures += [picture_folder(root)] if photographs_alone(root) else []  # there every folder counts as a camera's
+    # The root is recognised as the only folder within ``whole``: a result beside it would hide it.
+    beside_root = place.is_relative_to(whole) and not place.is_relative_to(root)
     if place == root or beside_root or any(place.is_relative_to(folder) for folder in pictures):
         raise SpoilsCapture(out, option)
 
 
 @contextmanager
 def _traced(path: Path | None) -> Iterator[None]:
-    """Records the block, and writes what ran in it to ``path``, however it ends."""
+    """Records what runs in the block and writes it to ``path``, also if the block raises."""
     if path is None:
         yield
         return

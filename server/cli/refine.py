@@ -1,4 +1,4 @@
-"""``eigenhead refine``: captures on disk to a refined calibration."""
+"""Implements ``eigenhead refine``: refines a calibration by the silhouettes of captures on disk."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,11 +28,10 @@ from server.tasks.reconstruct_folder import folder_of
 def refine_locally(
     captures: Sequence[Path], *, calibration: Path | None, focal: bool, model: str | None, report: Progress
 ) -> RefinementRun:
-    """Refines the calibration that the captures share, or ``calibration``, with the rims of ``model`` if it is given.
+    """Refines the calibration that the captures share, or ``calibration``; with a ``model`` its rims are used too.
 
-    A camera that the drift watch calls moved takes no part in that capture: it needs the board. Raises InputError,
-    TooFewCaptures, and what the alignment of a head raises.
-    """
+    A camera that the drift watch finds moved in a capture is left out of that capture: it must be calibrated anew with
+    the board. Raises InputError, TooFewCaptures, and the errors of the alignment of a head."""
     if len(captures) < 2:
         raise TooFewCaptures(len(captures))
     rig = None if calibration is None else read_rig(calibration)
@@ -74,7 +73,7 @@ def refine_locally(
 
 
 def _silent(stage: str, fraction: float) -> None:
-    """One progress bar is enough."""
+    """Discards progress, since another bar is shown already."""
 
 
 def _differences(recorded: Rig, rig: Rig, *, same_poses: bool) -> list[str]:

@@ -1,4 +1,4 @@
-"""Commands for a real rig: rig check, preview, capture, board, plates."""
+"""Implements the commands for a real rig: rig check, preview, capture, board, plates."""
 
 import sys
 from pathlib import Path

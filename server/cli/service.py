@@ -1,4 +1,4 @@
-"""Commands that run the service and look after it: serve, worker, prepare, doctor, keys."""
+"""Implements the commands that run and maintain the service: serve, worker, prepare, doctor, keys."""
 
 import sys
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""``eigenhead simulate --serve``: the simulated studio as devices, for as long as somebody tries things on it."""
+"""Implements ``eigenhead simulate --serve``: serves the simulated studio as network cameras and a trigger box."""
 
 import signal
 import threading
@@ -25,7 +25,7 @@ from server.tasks.subjects import subject_of
 
 @dataclass(frozen=True, slots=True)
 class OpenStudio:
-    """Where an operator finds the devices of a studio that is being served."""
+    """Holds the addresses and files by which an operator reaches the devices of a served studio."""
 
     url: str
     cameras: dict[str, str]
@@ -36,12 +36,13 @@ class OpenStudio:
 
     @classmethod
     def of(cls, devices: StudioDevices, truth: Path) -> "OpenStudio":
+        """Collects the addresses of devices that run. ``truth`` is the folder of the subject's truth."""
         link = devices.port_link
         cameras = {name: devices.streams.url(name) for name in devices.names}
         return cls(devices.streams.address, cameras, link, str(link.readlink()), devices.folder / "rig.toml", truth)
 
     def document(self) -> dict[str, object]:
-        """For ``--json``."""
+        """Returns what ``simulate --serve --json`` prints."""
         return {
             "url": self.url,
             "cameras": self.cameras,
@@ -51,7 +52,7 @@ class OpenStudio:
         }
 
     def lines(self) -> list[str]:
-        """What is there, and what to try on it."""
+        """Returns lines for people: the devices, and commands to try on them."""
         first = next(iter(self.cameras))
         return [
             "The simulated studio is open; Ctrl-C closes it.",
@@ -87,12 +88,11 @@ def serve_studio(
     ready: Callable[[OpenStudio], None],
     report: Progress,
 ) -> None:
-    """Serves the subject that ``eigenhead simulate`` draws for the same seed, until SIGINT or SIGTERM.
+    """Serves the same subject that ``eigenhead simulate`` draws for ``seed``, until SIGINT or SIGTERM.
 
-    ``folder`` receives rig.toml, cameras.json and clean plates, ``<folder>.truth`` the truth; ``ready`` is told once
-    everything can be used. Afterwards no thread, port or pseudo-terminal is left. Raises InputError for a folder that
-    is another rig's, a wrong fault or a port that is taken.
-    """
+    Writes rig.toml, cameras.json and clean plates into ``folder``, and the truth into ``<folder>.truth``. ``ready`` is
+    called once all devices can be used. Afterwards no thread, port or pseudo-terminal is left. Raises InputError for a
+    folder that belongs to another rig, a wrong fault, or a port that is in use."""
     planted = [device_fault_from_text(text) for text in faults]
     _check_folder(folder)
     for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background jobs are started with SIGINT ignored
@@ -118,7 +118,7 @@ def serve_studio(
 
 
 def _check_folder(folder: Path) -> None:
-    """A rig.toml in it is overwritten only where a studio has written it."""
+    """Raises InputError if the folder holds a rig.toml that no simulated studio has written."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     rig = folder / "rig.toml"

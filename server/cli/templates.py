@@ -1,4 +1,5 @@
-"""Commands about templates, meshes in whose vertex order results are written: template add, list, remove."""
+"""Implements the commands about templates, meshes in whose vertex order results are written: template add, list,
+remove."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``eigenhead verify``: captures of a mannequin, or their results, judged against its scan."""
+"""Implements ``eigenhead verify``: judges captures of a mannequin, or their results, by the mannequin's scan."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class LimitsMissed(EigenheadError):
-    """The studio does not reach what was asked; the papers are written."""
+    """Reports that a figure exceeds its limit. Report and certificate have been written by then."""
 
     def __init__(self, document: "VerificationReport", out: Path) -> None:
         missed = [
@@ -40,7 +40,7 @@ def verify_captures(
 ) -> "VerificationReport":
     """Writes report.json and certificate.pdf into ``out``, and the results of captures into ``out/results``.
 
-    What can be wrong with the reference is found before anything is reconstructed. Raises InputError."""
+    The reference is checked before anything is reconstructed. Raises InputError."""
     from pipeline.head_model.model import load_model
     from pipeline.verification.judgement import judge
     from pipeline.verification.measured import identity_of, is_result, read_measured
@@ -76,7 +76,7 @@ def verify_captures(
 
 
 def read_limits(path: Path | None) -> "Limits":
-    """Limits of a TOML or JSON file over the defaults. Raises InputError."""
+    """Returns the limits of a TOML or JSON file; those that it omits have their defaults. Raises InputError."""
     from pipeline.verification.limits import limits_from_document
     from server.tasks.settings_file import settings_document
 
@@ -84,7 +84,7 @@ def read_limits(path: Path | None) -> "Limits":
 
 
 def lines(document: "VerificationReport", out: Path) -> list[str]:
-    """For people: each figure beside its limit, then where the papers are."""
+    """Returns lines for people: each figure beside its limit, then the paths of report and certificate."""
     verdicts = {None: "not judged", True: "met", False: "missed"}
     found = [
         f"{name:<20} {'-' if check['value'] is None else format(check['value'], '.4g'):>8}   "
@@ -95,7 +95,7 @@ def lines(document: "VerificationReport", out: Path) -> list[str]:
 
 
 def _names(captures: Sequence[Path]) -> list[str]:
-    """The captures' own names, each once. Raises InputError."""
+    """Returns the captures' names. Raises InputError if two are alike."""
     names = [path.resolve().name.removesuffix(".gz").removesuffix(".tar").removesuffix(".zip") for path in captures]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
@@ -104,6 +104,7 @@ def _names(captures: Sequence[Path]) -> list[str]:
 
 
 def _head_alone(settings: Mapping[str, object]) -> dict[str, object]:
-    """The head is all that is judged: without the bust a capture takes ten seconds less."""
+    """Returns the settings with the bust switched off: only the head is judged, and a capture takes ten seconds
+    less."""
     outputs = settings.get("outputs")
     return {**settings, "outputs": {"surface": "head", **(outputs if isinstance(outputs, Mapping) else {})}}

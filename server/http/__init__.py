@@ -1,1 +1,1 @@
-"""The API: routes, their documents, resumable uploads; and ``serve``, which composes the service."""
+"""Implements the HTTP API: routes, their documents, resumable uploads. ``serve`` composes the service."""

@@ -1,4 +1,4 @@
-"""``create_app``: the API as an ASGI app."""
+"""Composes the API as an ASGI app: routers, middleware, and the tasks that run beside the requests."""
 
 import asyncio
 import time
@@ -35,8 +35,9 @@ log = structlog.get_logger()
 
 
 def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None) -> FastAPI:
-    """The service's ASGI app, perhaps with pages for operators. Opens the data folder and the database at startup, not
-    on import."""
+    """Builds the service's ASGI app. ``mount_pages`` adds the operator's pages to it.
+
+    Data folder and database are opened when the app starts, not when this function is called."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -80,13 +81,13 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
             expose_headers=EXPOSED,
         )
     app.add_middleware(Watch, metrics=metrics)
-    app.add_middleware(DrainRequestBody)  # outside Watch, which times the answer and not the client
+    app.add_middleware(DrainRequestBody)  # outside Watch, so that Watch does not time a slow client
     describe(app)
     return app
 
 
 class Watch:
-    """Gives every request an id, logs it, and counts it."""
+    """Gives every request an id (header X-Request-Id), logs it, and counts it in the metrics."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app, self._metrics = app, metrics
@@ -120,17 +121,18 @@ async def _look_around(service: Service) -> None:
 
 
 async def _sweep_forever(service: Service) -> None:
-    """A sweep now and every ``sweep_s``; a failing one is logged and tried again."""
+    """Removes expired data at once and then every ``sweep_s`` seconds. A sweep that fails is logged; the next one
+    runs."""
     while True:
         try:
             await service.threads.disk(sweep, service)
-        except Exception as error:  # a full or missing disk, a database that is away
+        except Exception as error:  # a full or missing disk, an unreachable database
             log.error("sweep failed", error=str(error)[:300])
         await asyncio.sleep(service.settings.sweep_s)
 
 
 async def _serve_batches(service: Service) -> None:
-    """Every ``poll_s``; a failing call is logged and tried again later."""
+    """Queues jobs of batches every ``poll_s`` seconds. A call that fails is logged, and the next one tries again."""
     while True:
         pause_s = service.settings.poll_s
         try:

@@ -1,5 +1,8 @@
-"""Who a request is from: an API key in its Authorization header, or, on loopback and with no key made, the people at
-this machine. Requests that a web page elsewhere made a browser send are refused (the Host and Origin headers tell)."""
+"""Identifies the caller of a request.
+
+That is an API key in the Authorization header. On a loopback address, as long as no key exists, everybody on this
+machine is a caller with all scopes; requests that a foreign web page makes a browser send are refused then, by their
+Host and Origin headers."""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -18,6 +21,7 @@ bearer = HTTPBearer(auto_error=False, description="API key, eh_...; not needed o
 
 
 def service_of(request: Request) -> Service:
+    """Returns the service that the app of a request belongs to."""
     return request.app.state.service
 
 
@@ -25,8 +29,10 @@ ServiceOf = Annotated[Service, Depends(service_of)]
 
 
 def require(scope: str) -> Callable[..., Caller]:
-    """A dependency: the caller, if it may do ``scope``; else a 401 or 403 problem. Runs before an upload is read;
-    JSON bodies, which FastAPI reads before dependencies, wait for ``check_caller`` (server.http.json_bodies)."""
+    """Returns a dependency of FastAPI that yields the caller and raises a 401 or 403 problem unless it has ``scope``.
+
+    It runs before an upload is read. FastAPI reads JSON bodies before dependencies, so those are guarded by
+    ``check_caller`` (server.http.json_bodies)."""
 
     def authenticate(
         request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
@@ -40,7 +46,7 @@ def require(scope: str) -> Callable[..., Caller]:
 
 
 async def check_caller(request: Request) -> None:
-    """Raises the 401 or 403 problem of a request from nobody known; what the caller may do is not asked."""
+    """Raises a 401 or 403 problem if the caller cannot be identified. Scopes are not checked."""
     await run_in_threadpool(_caller, request, await bearer(request))
 
 
@@ -60,7 +66,8 @@ def _caller(request: Request, credentials: HTTPAuthorizationCredentials | None) 
 
 
 def _check_origin(request: Request) -> None:
-    """Refuses what a foreign web page sends through a browser on this machine (CSRF, DNS rebinding)."""
+    """Raises a 403 problem for a request that a foreign web page sends through a local browser (CSRF, DNS
+    rebinding)."""
     origin = request.headers.get("origin")
     names = [request.url.hostname or ""]
     if origin is not None:

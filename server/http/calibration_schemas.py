@@ -1,4 +1,4 @@
-"""Documents on the wire: calibrations."""
+"""Defines the JSON documents about calibrations."""
 
 from typing import Literal
 
@@ -10,7 +10,7 @@ from server.storage.records import JsonObject
 
 
 class NewCalibration(Received):
-    """Shots that the rig took of the board, or, from a scene, of anything."""
+    """Requests a calibration from shots that the rig took of the board or, from a scene, of anything."""
 
     model_config = ConfigDict(
         json_schema_extra={

@@ -1,8 +1,8 @@
-"""JSON bodies: who sends one is asked first, and no more of it is taken than such a body may have.
+"""Guards JSON bodies: the caller is identified before the body is read, and the body's size is limited.
 
-FastAPI reads the body of a route that declares one whole, before it asks the route's dependencies. Routes that read
-their body themselves, uploads above all, are let through: their dependencies come first, and they have other limits.
-"""
+FastAPI reads the whole body of a route that declares one before it runs the route's dependencies, so a dependency comes
+too late. Routes that read their body themselves, above all uploads, are passed through: their dependencies run first,
+and they have limits of their own."""
 
 from collections.abc import Sequence
 
@@ -15,14 +15,15 @@ from rig.messages.message import compose
 from server.http.auth import check_caller
 from server.wire.problems import Problem, problem_from
 
-JSON_BYTES = 4 << 20  # the largest that is honest, feature points of all cameras, has 0.3 MB
+JSON_BYTES = 4 << 20  # the largest legitimate body, feature points of all cameras, has 0.3 MB
 
 
 class JsonBodies:
-    """Reads the JSON body of a request whose caller is known, up to ``most`` bytes, and hands it on; refuses others."""
+    """Reads the JSON body of a request from a known caller, at most ``most`` bytes, and passes it on. Refuses other
+    requests with a problem document."""
 
     def __init__(self, app: ASGIApp, routes: Sequence[APIRoute], most: int = JSON_BYTES) -> None:
-        """``routes``: all that the app has, in their order."""
+        """Stores the app and ``routes``, all of the app's routes in their order."""
         self._app, self._routes, self._most = app, routes, most
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -35,7 +36,7 @@ class JsonBodies:
             await check_caller(request)
             messages = await self._read(request)
         except Exception as error:
-            scope["route"] = route  # as the router would have said, for the log and the metrics
+            scope["route"] = route  # the router did not run; log and metrics need the route
             await problem_from(error).response()(scope, receive, send)
             return
 
@@ -48,8 +49,10 @@ class JsonBodies:
         return next((route for route in self._routes if route.matches(scope)[0] is Match.FULL), None)
 
     async def _read(self, request: Request) -> list[Message]:
-        """The messages of the body, to its end or to where the client went away. Raises a 413 problem, and 415 for a
-        form, which is an archive at the wrong address."""
+        """Returns the ASGI messages of the body, up to its end or the client's disconnection.
+
+        Raises a 413 problem for a body that is too large, and 415 for a form: that is an archive sent to the wrong
+        address."""
         if request.headers.get("content-type", "").casefold().startswith("multipart/"):
             detail = compose("json-wanted-here")
             raise Problem(415, "unsupported-media-type", detail)

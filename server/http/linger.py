@@ -1,24 +1,25 @@
-"""A refused upload's answer must reach who is still sending it.
+"""Delivers the answer of a refused upload to a client that is still sending.
 
-uvicorn closes a connection that is not kept alive as soon as the answer is out. Bytes that arrive after that reset it,
-and whoever was writing them, nginx above all, loses the answer: its client saw 502 in place of 401 or 422. So what is
-still coming is read and dropped before the answer ends, as nginx's own lingering_close does. A short upload is
-dropped before the answer begins: nginx ends its client's connection too where an answer overtakes the body, after it
-has promised to keep it, and the client's next request fails.
-"""
+uvicorn closes a connection that is not kept alive as soon as the answer is sent. Bytes that arrive afterwards reset the
+connection, and a sender such as nginx loses the answer: its client saw 502 in place of 401 or 422. So the remaining
+bytes are read and dropped before the answer ends, as nginx's own lingering_close does. The rest of a short upload is
+dropped before the answer begins: where an answer overtakes the body, nginx closes the connection to its client although
+it promised to keep it, and the client's next request fails."""
 
 import asyncio
 from contextlib import suppress
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-PATIENCE_S = 2.0  # the rest of a short upload; who sends gigabytes shall hear sooner that they are not wanted
-LINGER_S = 10.0  # a proxy hangs up within milliseconds of a whole answer; a client that sends on gets no longer
+PATIENCE_S = 2.0  # enough for the rest of a short upload; the sender of gigabytes is answered after that
+LINGER_S = 10.0  # a proxy closes within milliseconds of a complete answer; a client that sends on gets no longer
 
 
 class DrainRequestBody:
-    """Answers a request whose body was not read, on a connection that closes, once no more of it comes, or after
-    ``patience_s``; then ends the answer once no more comes, or after ``linger_s``."""
+    """Drains the unread body of a request whose connection will be closed.
+
+    The answer begins once the body ends or after ``patience_s`` seconds, and it ends once the body ends or after
+    another ``linger_s`` seconds."""
 
     def __init__(self, app: ASGIApp, *, patience_s: float = PATIENCE_S, linger_s: float = LINGER_S) -> None:
         self._app, self._patience_s, self._linger_s = app, patience_s, linger_s

@@ -1,4 +1,4 @@
-"""Documents on the wire: lists that come in pages, and what is done to many things at once."""
+"""Defines the JSON documents of lists that come in pages, and of actions on many things at once."""
 
 from typing import Annotated, Literal
 
@@ -30,7 +30,7 @@ Sought = Annotated[str, Query(max_length=200, pattern=PLAIN, description="words 
 
 
 class Listed(Answer):
-    """One page of a list."""
+    """Holds one page of a list."""
 
     next: str | None = Field(None, description="cursor of the page after this one; null on the last")
     total: int = Field(ge=0, description="how many all pages hold")
@@ -45,7 +45,7 @@ class SessionList(Listed):
 
 
 class PersonOut(Answer):
-    """A subject of the library; ``SubjectOut`` is where somebody is in a picture."""
+    """Describes a subject of the library. (``SubjectOut`` is where the subject is in a picture.)"""
 
     id: str = Field(description="of the newest session")
     label: str
@@ -80,7 +80,7 @@ class RefusedOne(Answer):
 
 
 class BulkOut(Answer):
-    """What was done of an action on many: each of them stands in one of the two lists."""
+    """Holds the result of an action on many things: each of them is in one of the two lists."""
 
     done: list[str]
     refused: list[RefusedOne]

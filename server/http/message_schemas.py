@@ -1,4 +1,4 @@
-"""Messages on the wire: as text where text always stood, and as data beside it."""
+"""Defines how messages appear in JSON documents: as English text, and beside it as code and parameters."""
 
 from typing import Annotated, Any
 
@@ -12,7 +12,8 @@ Texts = list[TextOf]
 
 
 class MessageOut(BaseModel):
-    """What the service tells, as data: who shows it in another language goes by ``code`` and ``parameters``."""
+    """Holds a message of the service as data, so that it can be shown in another language by ``code`` and
+    ``parameters``."""
 
     code: str = Field(description="stable; decides what parameters there are")
     message: str = Field(description="in English")
@@ -25,6 +26,6 @@ class MessageOut(BaseModel):
 
 
 class WarningOut(MessageOut):
-    """As in report.json."""
+    """Holds a warning as in report.json."""
 
     code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")

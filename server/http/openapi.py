@@ -1,5 +1,7 @@
-"""The service's own description: names that generators of clients use, the pipeline's settings by type, files as bytes,
-problems in place of the framework's errors."""
+"""Completes the OpenAPI document of the service.
+
+Operations get the names that client generators use, the pipeline's settings get schemas of their own, files are marked
+as bytes, and problem documents replace the framework's error schemas."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,18 +15,18 @@ from pipeline.warnings import WARNING_CODES
 from server.storage.records import JsonObject
 from server.wire import problems
 
-SETTINGS = {"type": "object", "title": "Settings"}  # stands where a document of settings does, until all are named
+SETTINGS = {"type": "object", "title": "Settings"}  # placeholder of settings, until ``_name_settings`` replaces it
 REFERENCE = "#/components/schemas/{model}"
 TEXTUAL = ("application/json", problems.MEDIA_TYPE, "text/")
 
 
 def operation_name(route: APIRoute) -> str:
-    """The operation's id: its function's name, which a client's method will have."""
+    """Returns the id of an operation: its function's name, which generated clients use for their method."""
     return route.name
 
 
 def describe(app: FastAPI) -> None:
-    """Makes ``app.openapi`` the finished description."""
+    """Replaces ``app.openapi`` by a function that returns the completed document."""
     original = app.openapi
 
     def openapi() -> JsonObject:
@@ -45,7 +47,7 @@ def _responses(document: JsonObject) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _name_problems(document: JsonObject) -> None:
-    """Puts the problem document in place of the framework's own error."""
+    """Replaces the framework's error schemas by that of the problem document."""
     schemas = document.setdefault("components", {}).setdefault("schemas", {})
     schemas["Problem"] = problems.PROBLEM_SCHEMA
     for unused in ("HTTPValidationError", "ValidationError"):
@@ -56,7 +58,7 @@ def _name_problems(document: JsonObject) -> None:
 
 
 def _name_settings(document: JsonObject) -> None:
-    """The pipeline's settings as schemas of their own; every key may be left out, and no other may be there."""
+    """Adds the pipeline's settings as named schemas: every key is optional, unknown keys are refused."""
     described = TypeAdapter(Settings).json_schema(ref_template=REFERENCE)
     named = described.pop("$defs") | {"Settings": described}
     for schema in named.values():

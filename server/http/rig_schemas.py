@@ -1,4 +1,4 @@
-"""Documents on the wire of what the rig's pictures are worth."""
+"""Defines the JSON documents about the rig's pictures: their checks, what a capture holds, and clean plates."""
 
 from typing import Annotated
 
@@ -15,7 +15,7 @@ class SubjectOut(Answer):
 
 
 class ViewChecksOut(Answer):
-    """What was measured of one camera's picture."""
+    """Holds what was measured on one camera's picture."""
 
     mean: float | None = Field(None, description="mean value, 0 to 255")
     clipped_share: float | None = Field(None, description="of pixels at 255 in every channel")
@@ -30,7 +30,7 @@ class CaptureChecks(Answer):
 
 
 class HoldingsOut(Answer):
-    """What there is of a capture: a removal takes the pictures, an erasure all of it."""
+    """Lists what is stored of a capture. A removal deletes the pictures, an erasure everything."""
 
     pictures: int
     bytes: int = Field(description="of images, clean plates and caches")
@@ -41,7 +41,7 @@ class HoldingsOut(Answer):
 
 
 class PlatesOut(Answer):
-    """Clean plates that are kept."""
+    """Describes a set of stored clean plates."""
 
     id: str
     taken: Moment

@@ -1,4 +1,4 @@
-"""Documents on the wire."""
+"""Defines the JSON documents of requests and answers."""
 
 import base64
 import binascii
@@ -26,13 +26,13 @@ EXAMPLE_ID = "0198c0de" + 20 * "0"
 
 
 class Received(BaseModel):
-    """A request body: unknown keys are refused."""
+    """Is the base of request bodies. Unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 class Answer(BaseModel):
-    """A response body, made of a service's record of the same fields."""
+    """Is the base of response bodies, built from a record of the service with the same fields."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -68,7 +68,7 @@ class NewImport(Received):
 
 
 class SessionEdit(Received):
-    """What is not given stays as it is."""
+    """Changes a session. Keys that are left out keep their values."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna B."}]})
 
@@ -77,7 +77,8 @@ class SessionEdit(Received):
 
 
 class CaptureEdit(Received):
-    """What is not given stays as it is; ``"session": null`` takes the capture out of its session."""
+    """Changes a capture. Keys that are left out keep their values; ``"session": null`` removes the capture from its
+    session."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"expression": "smile"}]})
 
@@ -144,7 +145,7 @@ class NewSessionJobs(Received):
 
 
 class Restart(Received):
-    """What is not given is as in the old job."""
+    """Repeats a job. Keys that are left out are taken from the old job."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"method": "simplex"}}]})
 
@@ -174,7 +175,7 @@ class Size(Answer):
 
 
 class FaultOut(Answer):
-    """What is wrong with a capture that was accepted."""
+    """Describes a fault of a capture that was accepted."""
 
     code: str = Field(description="as in docs/rig.md, among them moved, overexposed, blurred, setting, plates, cut-off")
     camera: str | None = Field(description="null: the rig as a whole")
@@ -323,8 +324,8 @@ class InfoOut(Answer):
 
 
 class CheckOut(Answer):
-    """One finding about the service: whether it is well, and what to do where it is not; ``starting``: it is not well
-    yet, and nothing is to be done."""
+    """Holds one check of the service: whether it passed, and what to do if not. ``starting``: it will pass soon without
+    any action."""
 
     ok: bool
     detail: TextOf
@@ -354,7 +355,8 @@ class RigOut(Answer):
 
 
 class CameraSettingsEdit(Received):
-    """What is not given stays as it is; null leaves it as the camera has it."""
+    """Changes a camera's settings. Keys that are left out keep their values; null stops setting the value, so that the
+    camera keeps the one that it has."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"exposure_ms": 8.0, "gain_db": 0.0}]})
 

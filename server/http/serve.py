@@ -1,4 +1,4 @@
-"""``eigenhead serve``: the service and, unless told otherwise, a worker process beside it."""
+"""Implements ``eigenhead serve``: runs the service and, by default, a worker process beside it."""
 
 import signal
 import socket
@@ -28,8 +28,10 @@ log = structlog.get_logger()
 
 
 class WorkerProcess:
-    """A worker that lives as long as this process: it is started again when it dies, and ends when our end of its
-    standard input does, also if we are killed."""
+    """Keeps a worker process running as long as this process lives.
+
+    A worker that dies is started again. It ends when its standard input closes, so it also ends if this process is
+    killed."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._environment = python_environment() | settings.environment()
@@ -39,10 +41,12 @@ class WorkerProcess:
         self._thread.start()
 
     def expect_end(self) -> None:
-        """From now on a worker that ends is no fault: a signal to all of a group or a container ends it, too."""
+        """Declares that the worker may end from now on without being restarted: a signal to a process group or a
+        container ends it too."""
         self._stop.set()
 
     def close(self) -> None:
+        """Ends the worker: closes its standard input, and kills it if it has not ended after 10 s."""
         self.expect_end()
         process = self._process
         if process.stdin is not None:
@@ -55,8 +59,8 @@ class WorkerProcess:
         self._thread.join()
 
     def _start(self) -> "subprocess.Popen[bytes]":
-        """With SIGINT blocked, which the worker and its children inherit: Ctrl-C reaches all of a terminal, and is for
-        the service, which then ends its worker."""
+        """Starts a worker with SIGINT blocked, which its children inherit. Ctrl-C reaches all processes of a terminal;
+        it is meant for the service, which then ends its worker."""
         command = python_command("cli", "worker", "--until-eof")
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
@@ -81,11 +85,10 @@ class WorkerProcess:
 
 
 def run_service(settings: ServiceSettings, *, worker: bool = True, ready: Callable[[str], None] | None = None) -> None:
-    """Serves until a signal. ``ready`` is told the address once requests are answered.
+    """Serves until a signal ends the process. ``ready`` is called with the address once requests are answered.
 
-    What is wrong with the rig's file, the address or the database is found before the rest is loaded. Raises
-    InputError, AddressTaken, DatabaseUnavailable, KeylessAddress.
-    """
+    Faults of the rig's file, the address and the database are found before anything heavy is loaded. Raises InputError,
+    AddressTaken, DatabaseUnavailable, KeylessAddress."""
     if settings.rig is not None:
         read_rig_config(settings.rig)
     sock = listen(settings.host, settings.port)
@@ -126,7 +129,7 @@ def _serve(settings: ServiceSettings, sock: socket.socket, worker: bool, ready: 
     finally:
         if beside is not None:
             beside.close()
-    if server.interrupted:  # asyncio loses the signal that uvicorn raises again where its last task ends first
+    if server.interrupted:  # asyncio may lose the signal that uvicorn raises again at its end
         raise KeyboardInterrupt
 
 

@@ -1,4 +1,4 @@
-"""Documents on the wire: what is kept, how large it is, and what goes next."""
+"""Defines the JSON documents about storage: what is kept, how large it is, and what retention removes next."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Documents on the wire: templates, in whose vertex order heads are written."""
+"""Defines the JSON documents about templates, meshes in whose vertex order heads are written."""
 
 from pydantic import ConfigDict, Field
 
@@ -6,7 +6,7 @@ from server.http.schemas import Answer
 
 
 class RegistrationOut(Answer):
-    """How a template lies on its model."""
+    """Describes how well a template fits its model."""
 
     skin_share: float = Field(ge=0, le=1, description="of its vertices, on the model's skin; the others follow it")
     face_covered_share: float = Field(ge=0, le=1, description="of the model's face, that it shows")
@@ -17,7 +17,7 @@ class RegistrationOut(Answer):
 
 
 class TemplateOut(Answer):
-    """A mesh in whose vertex order a job writes its head: ``settings.outputs.template``."""
+    """Describes a mesh in whose vertex order a job writes its head: ``settings.outputs.template``."""
 
     model_config = ConfigDict(
         from_attributes=True,

@@ -1,4 +1,4 @@
-"""The bytes of a resumable upload: https://tus.io/protocols/resumable-upload, with its checksum extension."""
+"""Receives the bytes of a resumable upload: https://tus.io/protocols/resumable-upload, with its checksum extension."""
 
 import base64
 import hashlib
@@ -25,8 +25,10 @@ async def append(
     threads: Threads,
     silent_s: float = IDLE_TIMEOUT_S,
 ) -> int:
-    """Appends a PATCH's body and returns the new offset. A wrong checksum takes the bytes back (460); a client that is
-    silent for ``silent_s`` is given up (408), and what it sent stays."""
+    """Appends the body of a PATCH to an upload and returns the new offset (bytes).
+
+    Raises problems: 460 for a wrong checksum, and the bytes are removed again; 408 for a client that is silent for
+    ``silent_s`` seconds, and the bytes received so far are kept; 413 for more bytes than were announced."""
     path, before = uploads.data(record), uploads.offset(record)
     digest = _digest(checksum)
     target = await threads.disk(path.open, "ab")
@@ -41,7 +43,7 @@ async def append(
                 await threads.disk(_write, target, bytes(pending), digest)
                 pending = bytearray()
         complete = True
-    finally:  # a connection that breaks leaves what arrived, so that the client may go on from there
+    finally:  # also where the connection breaks: the client continues from the bytes that arrived
         with anyio.CancelScope(shield=True):
             await threads.disk(_finish, target, bytes(pending), digest)
             if checksum is not None and not (complete and _matches(digest, checksum)):

@@ -1,1 +1,1 @@
-"""Bytes in and out over HTTP, for the API and for the pages: forms, files, problem documents."""
+"""Receives and sends bytes over HTTP, for the API and the operator's pages: forms, files, problem documents."""

@@ -1,5 +1,6 @@
-"""Fetching an archive from a server elsewhere, for a caller who names its address: judged (server.origins), bounded in
-bytes and seconds, straight to the data folder."""
+"""Fetches an archive from another server for a caller who names its address.
+
+The address is checked (server.origins), bytes and seconds are limited, and the data go straight to the data folder."""
 
 from pathlib import Path
 
@@ -19,15 +20,15 @@ CONNECT_S = 10.0
 
 
 async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
-    """Writes what lies at ``url`` into ``folder``; returns its path.
+    """Downloads the archive at ``url`` into ``folder`` and returns its path.
 
-    Raises InvalidInput for an address that may not be called ("url-refused") and for a server that does not give the
-    archive ("import-failed"), TooLarge, DiskFull.
-    """
+    Raises InvalidInput for an address that is not allowed ("url-refused") and for a server that does not deliver the
+    archive ("import-failed"), TooLarge, DiskFull."""
     patience = httpx.Timeout(IDLE_TIMEOUT_S, connect=CONNECT_S)
     try:
         with anyio.fail_after(service.settings.import_s):
-            async with httpx.AsyncClient(trust_env=False, timeout=patience) as client:  # a proxy would judge nothing
+            # No proxy of the environment: it would connect in place of us, and not to the checked address.
+            async with httpx.AsyncClient(trust_env=False, timeout=patience) as client:
                 return await _follow(service, client, url, folder / "upload")
     except TimeoutError as error:
         raise _failed(compose("import-too-slow", seconds=service.settings.import_s)) from error
@@ -38,7 +39,7 @@ async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
 async def _follow(service: Service, client: httpx.AsyncClient, url: str, path: Path) -> Path:
     for _ in range(REDIRECTS_MOST + 1):
         aim = await service.threads.disk(target, url, service.settings.import_origins)
-        headers = aim.headers | {"Accept-Encoding": "identity"}  # nothing is unpacked on the way
+        headers = aim.headers | {"Accept-Encoding": "identity"}  # so that Content-Length counts the archive's own bytes
         async with client.stream("GET", aim.url, headers=headers, extensions=aim.extensions) as answer:
             if answer.has_redirect_location:
                 url = str(httpx.URL(url).join(answer.headers["location"]))
@@ -51,7 +52,8 @@ async def _follow(service: Service, client: httpx.AsyncClient, url: str, path: P
 
 
 async def _receive(service: Service, answer: httpx.Response, path: Path) -> None:
-    """The body as it comes, in blocks. Raises TooLarge, and DiskFull before a block that the disk has no room for."""
+    """Writes the body to ``path`` block by block. Raises TooLarge, and DiskFull before a block for which there is no
+    space."""
     settings, store, disk = service.settings, service.store, service.threads.disk
     announced = answer.headers.get("content-length", "")
     length = int(announced) if announced.isascii() and announced.isdigit() else 0

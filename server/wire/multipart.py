@@ -1,8 +1,7 @@
-"""Receiving multipart bodies straight to the data folder.
+"""Receives multipart bodies straight into the data folder.
 
-The body is parsed here, not by the framework, so that a key and free space are looked at before the first byte, no
-file is held in memory or in a temporary folder elsewhere, and every write happens in a thread.
-"""
+The body is parsed here and not by the framework, for three reasons: key and free space are checked before the first
+byte, no file is held in memory or in a temporary folder elsewhere, and every write happens in a thread."""
 
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -28,13 +27,14 @@ from server.wire.problems import Problem
 
 BLOCK_BYTES = 1 << 20
 FIELD_BYTES = 1 << 16  # of a form field that is no file
-FIELDS_MOST = 100  # parts of a form: with FIELD_BYTES, what one request may hold in memory
+FIELDS_MOST = 100  # parts of a form; times FIELD_BYTES it bounds the memory of one request
 ABOUT = ("session", "label", "expression", "tags")  # the fields of a capture's form
 ARCHIVE = ".zip, .tar or .tar.gz"
 
 
 def described_form(file: str, fields: Iterable[str], **described: str) -> JsonObject:
-    """Returns OpenAPI's word for a multipart body of one file, text ``fields``, and further ones with a description."""
+    """Returns the OpenAPI description of a multipart body: one file, text ``fields``, and further fields with
+    descriptions."""
     texts: dict[str, dict[str, str]] = {name: {"type": "string"} for name in fields}
     texts |= {name: {"type": "string", "description": text} for name, text in described.items()}
     properties = {"file": {"type": "string", "format": "binary", "description": file}} | texts
@@ -43,8 +43,8 @@ def described_form(file: str, fields: Iterable[str], **described: str) -> JsonOb
 
 
 def check_length(request: Request, store: Store, settings: ServiceSettings) -> None:
-    """Judges the announced length: 413 if it is too much, 507 if the disk has no room for it twice (packed,
-    unpacked)."""
+    """Checks the announced length. Raises a 413 problem if it is too much, and 507 if the disk has no space for twice
+    as much: the archive and its unpacked files."""
     text = request.headers.get("content-length")
     length = int(text) if text and text.isascii() and text.isdigit() else 0
     if length > settings.body_bytes:
@@ -55,11 +55,11 @@ def check_length(request: Request, store: Store, settings: ServiceSettings) -> N
 async def receive_multipart(
     request: Request, folder: Path, store: Store, settings: ServiceSettings, threads: Threads
 ) -> tuple[Path, dict[str, str]]:
-    """Writes the part ``file`` into ``folder``; returns its path and the other fields.
+    """Writes the part ``file`` of the body into ``folder`` and returns its path and the other fields.
 
-    Raises DiskFull before a block that the disk has no room for, TooLarge, and problems: 415 for another content type,
-    400 for a body that breaks off, 408 for one that no longer comes, 422 without a ``file``, 413.
-    """
+    Raises DiskFull before a block for which the disk has no space, TooLarge, and problems: 415 for another content
+    type, 400 for a body that breaks off, 408 for a client that stops sending, 422 if there is no ``file``, 413 for too
+    much."""
     kind, options = parse_options_header(request.headers.get("content-type"))
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
@@ -73,7 +73,7 @@ async def receive_multipart(
     received = 0
     target: Any = await threads.disk(path.open, "xb")
 
-    def write(block: bytes) -> None:  # a body that comes in chunks announced no length that could be judged before
+    def write(block: bytes) -> None:  # checks each block: a chunked body announces no length to check before
         store.reserve(len(block), settings.free_bytes)
         target.write(block)
 
@@ -99,7 +99,8 @@ async def receive_multipart(
 
 
 class _Form:
-    """What the parser's callbacks collect: the bytes of ``file`` that are not on the disk yet, and the fields."""
+    """Collects what the parser's callbacks deliver: the fields, and those bytes of ``file`` that are not yet on the
+    disk."""
 
     def __init__(self) -> None:
         self.pending = bytearray()
@@ -162,8 +163,8 @@ class _Form:
 
 
 def check_fields(names: Iterable[str], known: Collection[str]) -> None:
-    """Raises InputError naming each field that the form does not have: who mistyped ``settings`` would get the
-    defaults."""
+    """Raises InputError naming each field that the form does not have, so that a misspelt ``settings`` is not ignored
+    in silence."""
     faults = []
     for name in names:
         if name not in known:
@@ -181,8 +182,10 @@ def check_fields(names: Iterable[str], known: Collection[str]) -> None:
 async def receive_capture(
     service: Service, request: Request, known: Collection[str] = ABOUT
 ) -> tuple[CaptureRecord, dict[str, str]]:
-    """Receives a multipart archive and makes a capture of it; returns its record and the form's fields, of which there
-    are ``known`` ones only."""
+    """Receives an archive in a multipart body and makes a capture of it. Returns the capture's record and the form's
+    fields.
+
+    Fields that are not in ``known`` are refused."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
@@ -192,8 +195,8 @@ async def receive_capture(
 
 
 async def receive_calibration_pictures(service: Service, request: Request) -> Calibration:
-    """Receives a multipart archive of IMAGES/ and board.toml, or, where ``from`` is ``scene``, of photographs, and
-    queues a calibration."""
+    """Receives an archive in a multipart body and queues a calibration. It holds IMAGES/ and board.toml, or photographs
+    where the field ``from`` is ``scene``."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)

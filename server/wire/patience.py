@@ -1,5 +1,5 @@
-"""Bodies as they come, with an end to the waiting: a client that vanished without a word sends nothing more, and would
-hold its connection, and what is locked for it, for ever."""
+"""Limits how long a body may be silent. A client that vanished sends nothing more, and would otherwise hold its
+connection and the locks taken for it for ever."""
 
 from collections.abc import AsyncIterator
 
@@ -9,13 +9,13 @@ from rig.messages.message import compose
 from server.wire.problems import Problem
 
 IDLE_TIMEOUT_S = (
-    30.0  # between two pieces: above the pauses of a network that changes, below what who sends again waits for
+    30.0  # between two pieces: longer than a change of networks takes, shorter than clients wait before a retry
 )
 
 
 async def with_idle_timeout(stream: AsyncIterator[bytes], silent_s: float) -> AsyncIterator[bytes]:
-    """Yields the pieces of ``stream``. Raises a 408 problem if the next one does not come within ``silent_s``; how long
-    the whole takes does not matter."""
+    """Yields the pieces of ``stream``. Raises a 408 problem if one does not arrive within ``silent_s`` seconds; the
+    total time is not limited."""
     while (piece := await _next(stream, silent_s)) is not None:
         yield piece
 

@@ -1,4 +1,5 @@
-"""Errors on the wire: RFC 9457 ``application/problem+json`` with a stable ``type`` and every fault in ``errors``."""
+"""Turns errors into RFC 9457 documents ``application/problem+json``: a stable ``type``, and every fault in
+``errors``."""
 
 import errno
 from collections.abc import Iterable, Mapping, Sequence
@@ -97,7 +98,7 @@ def status_of(refusal: type[Refused]) -> int:
 
 
 class Problem(EigenheadError):
-    """Reports what HTTP itself refuses, or a refusal of the service with its status."""
+    """Reports a refusal with its HTTP status: one of HTTP itself, or one of the service."""
 
     def __init__(
         self,
@@ -112,6 +113,7 @@ class Problem(EigenheadError):
         self.errors, self.headers = tuple(message_of(error) for error in errors), dict(headers or {})
 
     def document(self) -> ProblemDocument:
+        """Returns the problem document."""
         return {
             "type": URN + self.kind,
             "title": PROBLEM_TYPES.get(self.kind, self.kind),
@@ -123,11 +125,12 @@ class Problem(EigenheadError):
         }
 
     def response(self) -> JSONResponse:
+        """Returns the HTTP response that carries the document."""
         return JSONResponse(self.document(), self.status, headers=self.headers, media_type=MEDIA_TYPE)
 
 
 def problem_from(error: Exception) -> Problem:
-    """Returns the problem that an error is; what nobody foresaw is a 500 that says so without its inside."""
+    """Returns the problem for an error. An unexpected error becomes a 500 that says so and hides its details."""
     if isinstance(error, Problem):
         return error
     if isinstance(error, InputError):
@@ -154,13 +157,14 @@ def problem_from(error: Exception) -> Problem:
 
 
 def _fault_of(error: Mapping[str, Any]) -> Message | str:
-    """A fault that pydantic found; of a body that is no JSON, a form perhaps, it says nothing to act on."""
+    """Words a fault that pydantic found. For a body that is no JSON pydantic says nothing helpful, so it is worded
+    here."""
     whole_body = error["loc"] == ("body",) and error["type"] == "model_attributes_type"
     return compose("no-json-object") if whole_body else error["msg"]
 
 
 def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:
-    """Makes every error of ``app`` a problem document; ``routes`` are all that it has."""
+    """Makes the app answer every error with a problem document. ``routes`` are all of the app's routes."""
 
     async def answer(request: Request, error: Exception) -> JSONResponse:
         problem = problem_from(error)
@@ -177,7 +181,8 @@ def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:
 
 
 def _methods_of(routes: Sequence[APIRoute], path: str) -> list[str]:
-    """Every method of the path; the router itself names those of the first route that fits."""
+    """Lists all methods of a path, for the Allow header; the router itself names only those of the first matching
+    route."""
     fitting = [route for route in routes if route.path_regex.match(path)]
     return sorted({method for route in fitting if route.path == fitting[0].path for method in route.methods or ()})
 

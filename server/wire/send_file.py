@@ -1,4 +1,4 @@
-"""Sending a file of known content: ETag, If-None-Match, one byte range."""
+"""Sends files of known content, with ETag, If-None-Match and single byte ranges."""
 
 import hashlib
 import io
@@ -31,7 +31,8 @@ RANGE = re.compile(r"^bytes=(\d{1,18})?-(\d{1,18})?$")
 
 
 def send_file(request: Request, file: StoredFile) -> Response:
-    """200, 206, 304 or a 416 problem. What is no single byte range is ignored, as RFC 9110 allows."""
+    """Answers with the file: status 200, 206 for a byte range, or 304 if the client has it. Raises a 416 problem for a
+    range beyond the file, and 404 if the file is missing. Other forms of Range are ignored, as RFC 9110 allows."""
     path, etag = file.path, f'"{file.sha256}"'
     if not path.is_file():
         raise Problem(404, "not-found", compose("file-gone"))
@@ -48,15 +49,17 @@ def send_file(request: Request, file: StoredFile) -> Response:
 def send_archive(
     request: Request, folder: Path, files: Mapping[str, FileEntry], name: str | None = "result.zip"
 ) -> Response:
-    """Packs the named files below ``folder`` as a .zip, stored and without times: the same files are the same bytes.
-    ``name``: what a browser saves it as; None leaves that to the page's link."""
+    """Sends the named files below ``folder`` as an uncompressed .zip without times, so that equal files give equal
+    bytes.
+
+    ``name`` is the file name that a browser suggests; with None the link on the page decides."""
     digest = hashlib.sha256("\n".join(f"{name} {file['sha256']}" for name, file in files.items()).encode()).hexdigest()
     headers = {"ETag": f'"{digest}"', "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
     headers["Content-Disposition"] = "attachment" if name is None else f'attachment; filename="{name}"'
     if request.headers.get("if-none-match") == headers["ETag"]:
         return Response(status_code=304, headers=headers)
     blocks = () if request.method == "HEAD" else _zipped(folder, list(files))
-    return StreamingResponse(blocks, headers=headers, media_type="application/zip")  # of a length that nobody knows yet
+    return StreamingResponse(blocks, headers=headers, media_type="application/zip")  # its length is not known yet
 
 
 def _zipped(folder: Path, names: list[str]) -> Iterator[bytes]:
@@ -71,7 +74,8 @@ def _zipped(folder: Path, names: list[str]) -> Iterator[bytes]:
 
 
 class _Sent(io.RawIOBase):
-    """What was written and not taken yet; a stream that cannot seek."""
+    """Collects the bytes that the zip writer wrote and that were not sent yet. It cannot seek, so zipfile writes a
+    stream."""
 
     def __init__(self) -> None:
         self._pending = bytearray()
@@ -89,6 +93,7 @@ class _Sent(io.RawIOBase):
 
 
 def media_type(name: str) -> str:
+    """Returns the media type of a file by its suffix; ``application/octet-stream`` if it is unknown."""
     suffix = Path(name).suffix
     return TYPES.get(suffix) or mimetypes.guess_type(name)[0] or "application/octet-stream"
 

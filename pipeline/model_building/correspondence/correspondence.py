@@ -1,12 +1,11 @@
-"""Correspondence between raw scans (section 3.2): landmark warp, cylindrical resampling, second pass, refinement.
+"""Brings raw scans into correspondence (section 3.2): landmark warp, cylindrical resampling, second pass, refinement.
 
-Every scan is first moved rigidly (by its landmarks) into the head frame. The reference is the scan nearest the mean;
-its surface is given the default model's connectivity, since a scan's own hundred thousand vertices would make modes
-of a hundred megabytes (departure from the paper, which keeps the scan's vertices). The paper's steps then run as
-written. Landmarks alone leave the surface free to slide between them, so by default a refinement follows: the head that
-is most probable under what is known of heads (``prior``), given the scan's landmarks and surface, and from there a
-smooth displacement along the normals onto the scan.
-"""
+Every scan is first moved rigidly (by its landmarks) into the head frame. The reference is the scan nearest to the mean.
+Its surface gets the default model's connectivity, because modes on a scan's own hundred thousand vertices would take a
+hundred megabytes (the paper keeps the scan's vertices). Then the paper's steps follow unchanged. Landmarks alone leave
+the surface free to slide between them, so by default a refinement follows: the most probable head under a prior of
+heads (``prior``), given the scan's landmarks and surface, and from there a smooth displacement along the normals onto
+the scan."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,13 +31,13 @@ from rig.geometry import RigidTransform, cross_matrix, rigid_fit
 from rig.mesh import vertex_normals
 from rig.progress import Progress
 
-_TAUBIN = (0.5, -0.53)  # a step that smooths and one that gives the size back
-_SMOOTHINGS = 4  # of both: noise of single points falls to half; with 8, fine shape goes too
+_TAUBIN = (0.5, -0.53)  # weights of a step that smooths and of one that restores the size
+_SMOOTHINGS = 4  # pairs of steps: they halve the noise of points; 8 would remove fine shape too
 
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Holds one stage of looking for a head's points on a scan. Lengths in mm."""
+    """Holds the settings of one stage of searching a head's points on a scan. Lengths in mm."""
 
     steps: int
     reach_mm: float  # a match farther than this is another part of the head
@@ -48,16 +47,16 @@ class Search:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matching:
-    """Says how correspondence is found. Lengths in mm."""
+    """Holds the settings of correspondence. Lengths in mm."""
 
     refine: bool = True
     reach_mm: float = 15.0  # a sample farther than this from the warped vertex is another part of the head: void
-    landmark_smoothing_mm: float = 1.0  # landmarks are marked to about half a millimetre: do not bend for that
+    landmark_smoothing_mm: float = 1.0  # landmarks are marked to about 0.5 mm; the warp must not follow such errors
     # Normals lead while the shape is millimetres off; close by they would pin a vertex to where its own, still wrong,
     # normal points (0.43 mm instead of 0.19 on heads inside the span), so there nearness decides.
     broad: Search = Search(5, 15.0, 12.0, 1.0)
     fine: Search = Search(4, 4.0, 1.0, 0.05)
-    mark_mm: float = 0.5  # to which a landmark is marked, an axis
+    mark_mm: float = 0.5  # standard deviation of a marked landmark, per axis
     reference_stiffness: tuple[float, ...] = (30.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 0.5, 0.5)  # per iteration
     stiffness: tuple[float, ...] = (3.0, 1.0, 0.5)
     mark_weight: float = 0.3  # of a landmark in giving the reference its connectivity, beside 1 of a matched vertex
@@ -66,7 +65,8 @@ class Matching:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondence:
-    """Holds heads with the same vertices: row k is scan k, moved into the common frame by ``frame_from_scan``."""
+    """Holds heads with the same vertices (mm): row k is scan k, moved into the common frame by ``frame_from_scan``.
+    ``void`` marks vertices without a surface on the scan."""
 
     heads: Float[np.ndarray, "N V 3"]
     void: Bool[np.ndarray, "N V"]
@@ -76,7 +76,7 @@ class Correspondence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """Holds a scan in the common frame, prepared for refinement."""
+    """Holds a scan in the common frame (mm), prepared for refinement; ``marks`` are its landmarks."""
 
     vertices: Float[np.ndarray, "S 3"]
     normals: Float[np.ndarray, "S 3"]
@@ -86,7 +86,8 @@ class Target:
 def correspond(
     scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
 ) -> Correspondence:
-    """Returns corresponded heads on the template's cage connectivity. Scans must have passed ``scan_checks.check``."""
+    """Returns the scans as heads with the connectivity of the template's cage. The scans must have passed
+    ``scan_checks.check``."""
     matching = matching or Matching()
     frames = common_frame(scans, template)
     placed_scans = list(zip(scans, frames, strict=True))
@@ -106,7 +107,8 @@ def correspond(
 
 
 def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[RigidTransform]:
-    """Returns rigid motions into the head frame: landmarks aligned with each other, their mean with the template's."""
+    """Returns the rigid motions of all scans into the head frame: landmarks are aligned with each other, and their mean
+    with the template's."""
     marks = np.array([stacked(scan.landmarks) for scan in scans])
     ours = template.vertices(np.zeros(0))[[template.landmarks[name] for name in NAMES]]
     weights = np.ones(len(NAMES))
@@ -116,8 +118,7 @@ def common_frame(scans: Sequence[Scan], template: HeadModel) -> list[RigidTransf
 
 
 def prepared(scan: Scan, frame_from_scan: RigidTransform) -> Target:
-    """Returns the scan in the common frame, its noise smoothed away without shrinking it (Taubin 1995), and smooth
-    normals."""
+    """Returns the scan in the common frame, smoothed without shrinking (Taubin 1995), with smooth normals."""
     vertices = frame_from_scan.apply(scan.vertices)
     averaging = _averaging(scan.faces, len(vertices))
     for factor in _TAUBIN * _SMOOTHINGS:
@@ -139,12 +140,12 @@ def _averaging(faces: Int[np.ndarray, "F 3"], count: int) -> sparse.csr_array:
 
 
 def nearest_mean(shapes: Float[np.ndarray, "N L 3"]) -> int:
-    """Returns the shape closest to the mean of all (step 1 of section 3.2)."""
+    """Returns the index of the shape closest to the mean of all (step 1 of section 3.2)."""
     return int(((shapes - shapes.mean(0)) ** 2).sum((1, 2)).argmin())
 
 
 def on_reference(target: Target, template: HeadModel, matching: Matching) -> Float[np.ndarray, "V 3"]:
-    """Returns the reference scan's surface on the template's cage vertices."""
+    """Returns the template's cage vertices placed on the surface of the reference scan."""
     surface = template.vertices(np.zeros(0))[: len(template.mean)]
     index = _landmark_rows(template)
     warped = landmark_warp(surface[index], target.marks, surface)
@@ -167,8 +168,8 @@ def warp_and_resample(
     cylinder: CylinderIndex,
     matching: Matching,
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
-    """Runs steps 3 and 4: the warped reference, its resampling on the target, and where that is void (there:
-    warped)."""
+    """Runs steps 3 and 4 of section 3.2. Returns the warped reference, its resampling on the target, and where that is
+    void; void vertices keep the warped position."""
     warped = landmark_warp(shape[index], marks, shape, smoothing=matching.landmark_smoothing_mm)
     angles, heights, radii = coordinates(warped)
     cast = cylinder.cast(angles, heights, radii)
@@ -222,7 +223,7 @@ def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
 
 
 def _tree(target: Target, search: Search) -> KDTree:
-    """Scan points by position and direction together."""
+    """Returns a search tree of the scan's points by position and normal together."""
     return KDTree(np.concatenate([target.vertices, target.normals * search.normal_mm], 1), balanced_tree=False)
 
 
@@ -233,11 +234,11 @@ def statistical(
     target: Target,
     matching: Matching,
 ) -> Float[np.ndarray, "V 3"]:
-    """Returns the most probable head under the prior for the scan's landmarks and surface: broad modes first, then all.
+    """Returns the most probable head under the prior, given the scan's landmarks and surface: first with broad modes,
+    then with all.
 
-    Smoothness cannot tell where on a plain cheek a vertex belongs; what is known of other heads helps. Residuals are
-    point-to-plane, counted per cm2 of surface, landmarks in all three axes; six columns carry the pose.
-    """
+    Smoothness cannot determine where on a plain cheek a vertex belongs; statistics of other heads can. Residuals are
+    point-to-plane and count per cm2 of surface, landmarks along all three axes; six columns are the pose."""
     shape = landmark_warp(prior.mean[index], target.marks, prior.mean, smoothing=20.0)
     areas = vertex_areas(prior.mean, faces)
     for search, count in ((matching.broad, prior.broad), (matching.fine, len(prior.modes))):
@@ -260,7 +261,8 @@ def _posterior_mean(
     *,
     mark_mm: float,
 ) -> Float[np.ndarray, "V 3"]:
-    """The posterior mean for vertices on the planes of their matches. Single precision: the prior keeps it tame."""
+    """Returns the posterior mean for vertices on the planes of their matches. Single precision suffices, since the
+    prior regularises the system."""
     planes, count = target.normals[near], modes.shape[2]
     along = sum(planes[:, axis, None].astype(np.float32) * modes[:, axis] for axis in range(3))
     lever = np.concatenate([planes, np.cross(mean, planes)], 1)
@@ -289,10 +291,10 @@ def refined(
 ) -> Float[np.ndarray, "V 3"]:
     """Refines a warped reference onto a target by non-rigid closest points.
 
-    Each step solves (W + k L^T L) u = W d for the displacements u from ``start`` (all three axes share the matrix; L is
-    the graph Laplacian, so affine-like motions stay cheap), with d the pull towards the match along its normal: in the
-    tangent plane a vertex stays. Matches are nearest in position and normal together. ``marks`` are places of vertices.
-    """
+    Each step solves (W + k L^T L) u = W d for the displacements u from ``start``. L is the graph Laplacian, so that
+    nearly affine motions cost little; all three axes share the matrix. d moves a vertex along the normal towards its
+    match and leaves it in place in the tangent plane. Matches are nearest by position and normal together. ``marks``
+    are target positions of vertices (mm)."""
     bending, tree = _bending(faces, start), _tree(target, search)
     fixed = np.array(list(marks), int)
     shape = start
@@ -311,7 +313,7 @@ def refined(
 def _matched(
     shape: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], target: Target, tree: KDTree, search: Search
 ) -> tuple[Int[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Nearest scan points, and weight 1 where the match is near and faces the same way."""
+    """Returns the nearest scan points, and weights: 1 where the match is near and its normal similar, otherwise 0."""
     normals = vertex_normals(shape, faces)
     near = np.asarray(tree.query(np.concatenate([shape, normals * search.normal_mm], 1), workers=1)[1])
     distance = np.linalg.norm(target.vertices[near] - shape, axis=1)
@@ -324,7 +326,7 @@ def _dots(a: Float[np.ndarray, "N 3"], b: Float[np.ndarray, "N 3"]) -> Float[np.
 
 
 def _bending(faces: Int[np.ndarray, "F 3"], vertices: Float[np.ndarray, "V 3"]) -> sparse.csr_array:
-    """L^T L of the Laplacian with weights that fall with edge length (a graph of uneven density)."""
+    """Returns L^T L of a graph Laplacian whose weights fall with edge length, because vertices are unevenly dense."""
     edges, _, _ = edges_of(faces)
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     weight = 1 / np.maximum(length, 0.5)

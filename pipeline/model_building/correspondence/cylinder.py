@@ -1,8 +1,7 @@
-"""The cylindrical projection of section 3.2: rays from the vertical axis through the head, outwards.
+"""Casts rays from the vertical axis through the head outwards: the cylindrical projection of section 3.2.
 
-A ray is (angle, height): angle 0 looks along +z (out of the face), pi/2 along +x (the subject's left), height is y.
-The compiled loops test a ray against the triangles of its cell in an (angle, height) grid, and nothing else.
-"""
+A ray is (angle, height): angle 0 looks along +z (out of the face), pi/2 along +x (the subject's left); height is y. The
+compiled loops test a ray only against the triangles of its cell in an (angle, height) grid."""
 
 from dataclasses import dataclass
 
@@ -14,21 +13,21 @@ from pipeline.model_building.correspondence.cylinder_kernels import CELL_MM, bin
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cast:
-    """Says where rays meet a surface; NaN and -1 where they do not."""
+    """Holds where rays meet a surface: radius (mm) and triangle, NaN and -1 where they do not."""
 
     radii: Float[np.ndarray, " N"]
     triangles: Int[np.ndarray, " N"]
 
 
 def coordinates(points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, " _"], ...]:
-    """Returns the angle (-pi to pi), height and radius of points about the axis x = z = 0."""
+    """Returns angle (-pi to pi), height and radius (mm) of points about the axis x = z = 0."""
     return np.arctan2(points[:, 0], points[:, 2]), points[:, 1], np.hypot(points[:, 0], points[:, 2])
 
 
 def points_at(
     angles: Float[np.ndarray, " N"], heights: Float[np.ndarray, " N"], radii: Float[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N 3"]:
-    """Returns the inverse of ``coordinates``."""
+    """Returns points from angle, height and radius: the inverse of ``coordinates``."""
     return np.stack([radii * np.sin(angles), heights, radii * np.cos(angles)], 1)
 
 
@@ -48,7 +47,8 @@ class CylinderIndex:
         heights: Float[np.ndarray, " N"],
         near: Float[np.ndarray, " N"] | None = None,
     ) -> Cast:
-        """Returns the hit nearest in radius to ``near``, or the outermost one, of each ray."""
+        """Returns for each ray the hit whose radius is nearest to ``near`` (mm), or without ``near`` the outermost
+        hit."""
         wanted = np.full(len(angles), np.inf) if near is None else np.asarray(near, float)
         found, triangles = cast_rays(
             self._vertices, self._faces, self._low, self._rows, self._start, self._members, angles, heights, wanted

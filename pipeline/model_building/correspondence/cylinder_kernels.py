@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.model_building.correspondence.cylinder``."""
+"""Contains the compiled loops of ``pipeline.model_building.correspondence.cylinder``."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ CELLS_ROUND = 288  # 2 mm at 92 mm from the axis
 
 @njit(cache=True)
 def cells_spanned(vertices, face, low, rows):  # pragma: no cover - compiled
-    """First and last column (unwrapped) and row of the cells that a triangle may touch."""
+    """Returns first and last column (unwrapped) and row of the cells that a triangle may touch."""
     angle0 = np.arctan2(vertices[face[0], 0], vertices[face[0], 2])
     first = last = angle0
     bottom = top = vertices[face[0], 1]
@@ -29,8 +29,8 @@ def cells_spanned(vertices, face, low, rows):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
-    """Triangles by the cell of the cylinder (angle, height) that they reach into: where each cell's start, and
-    their rows."""
+    """Lists the triangles in each cell of the (angle, height) grid. Returns where each cell's list starts, and the
+    lists."""
     counts = np.zeros(rows * CELLS_ROUND + 1, np.int64)
     for f in range(len(faces)):
         a, b, c, d = cells_spanned(vertices, faces[f], low, rows)
@@ -52,7 +52,8 @@ def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def cast_rays(vertices, faces, low, rows, start, members, angles, heights, wanted):  # pragma: no cover - compiled
-    """The radius (mm) and the triangle that each ray from the axis meets first; NaN and -1 where none."""
+    """Returns radius (mm) and triangle of each ray's hit: that nearest to the ``wanted`` radius, or the outermost; NaN
+    and -1 where there is none."""
     radii, triangles = np.full(len(angles), np.nan), np.full(len(angles), -1, np.int64)
     width = 2 * np.pi / CELLS_ROUND
     for k in range(len(angles)):

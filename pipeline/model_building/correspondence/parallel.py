@@ -1,4 +1,5 @@
-"""The same work on many scans, in several processes (threads gain nothing: SuperLU and numpy hold the interpreter)."""
+"""Runs the same work on many scans in several processes. Threads gain nothing, as SuperLU and numpy hold the
+interpreter."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -15,20 +16,20 @@ Result = TypeVar("Result")
 
 FEW = 12  # with fewer items the processes' start (two seconds) costs more than they save
 _BLAS_THREADS = "OPENBLAS_NUM_THREADS"
-_CHUNK = 4  # what a task carries besides its item (a prior of 40 MB) travels once a chunk
+_CHUNK = 4  # items per message: the task's constant data (a prior of 40 MB) is sent once for each chunk
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workers:
-    """Runs work in processes: ``over`` runs a module-level function (or a partial of one) over items, in order; results
-    come as a list."""
+    """Runs a module-level function, or a partial of one, over items in several processes."""
 
     pool: ProcessPoolExecutor | None
 
     def over(
         self, work: Callable[[Item], Result], items: Sequence[Item], stage: str, report: Progress | None
     ) -> list[Result]:
-        """Runs ``work`` over the items, in order; an exception of it is raised here, the earliest item's first."""
+        """Runs ``work`` over the items and returns the results in their order. Raises the exception of the earliest
+        failing item."""
         results = map(work, items) if self.pool is None else self.pool.map(work, items, chunksize=_CHUNK)
         out = []
         for result in results:
@@ -40,18 +41,19 @@ class Workers:
 
 @contextmanager
 def workers(count: int, items: int) -> Iterator[Workers]:
-    """Yields ``count`` processes for ``items`` pieces of work, or none where one process does as well."""
+    """Yields ``count`` processes for ``items`` pieces of work; for few items the work runs in this process."""
     if count < 2 or items < FEW:
         yield Workers(None)
         return
-    # fresh interpreters: a fork would copy the locks of whatever threads (BLAS, numba) are at work here
+    # fresh interpreters: a fork would copy locks that threads (BLAS, numba) of this process hold
     with _single_threaded_children(), ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
         yield Workers(pool)
 
 
 @contextmanager
 def _single_threaded_children() -> Iterator[None]:
-    """Processes started in here do their linear algebra in one thread: there is one of them for each core."""
+    """Makes processes that are started in the block use one thread for linear algebra, as there is one process for each
+    core."""
     before = os.environ.get(_BLAS_THREADS)
     os.environ[_BLAS_THREADS] = "1"
     try:

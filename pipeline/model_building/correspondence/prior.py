@@ -1,12 +1,11 @@
-"""A prior for registration that reaches beyond a model's own span.
+"""Builds a prior of heads for registration, which allows more heads than a model's own span.
 
-A PCA of 138 heads has 137 directions, and a new head needs others: used alone on heads outside its span it drags
-vertices to wrong places. Two things are known of heads beside the sample. They are as likely as their mirror images,
-so the covariance is averaged with its mirrored self. And what is far apart on a head knows little of each other:
-multiplying the covariance by a Gaussian of the distance between vertices keeps what neighbours tell and frees the rest
-(localised Gaussian process morphable models, Luethi et al. 2018, *Gaussian Process Morphable Models*, section 3.3).
-The prior is a mixture of the plain and the localised covariance.
-"""
+A PCA of 138 heads has 137 directions, and a new head needs others: alone, on heads outside its span, it pulls vertices
+to wrong positions. Two facts are known besides the sample. A head and its mirror image are equally likely, so the
+covariance is averaged with its mirror image. And distant parts of a head are nearly independent, so the covariance is
+multiplied by a Gaussian of the distance between vertices, which keeps the correlation of neighbours and frees the rest
+(localised Gaussian process morphable models, Luethi et al. 2018, *Gaussian Process Morphable Models*, section 3.3). The
+prior is a mixture of the plain and the localised covariance."""
 
 from dataclasses import dataclass
 
@@ -18,19 +17,19 @@ from scipy.spatial.distance import cdist
 
 from pipeline.head_model.subdivision import edges_of
 
-GLOBAL, LOCAL = 0.8, 0.6  # share of the standard deviation each part carries; squares add to 1
-LENGTH_MM = 60.0
+GLOBAL, LOCAL = 0.8, 0.6  # factors of both parts' standard deviations; their squares add up to 1
+LENGTH_MM = 60.0  # of the Gaussian of the distance between vertices
 KEPT = 700  # localised modes; with 300 the held-out error of tests/benchmarks/correspondence.py is a tenth larger
 _SPARE = 100  # directions of the sketch beyond those kept
 _BLOCK = 600
 _MIRROR = np.array([-1.0, 1.0, 1.0])
-_SYMMETRIC = 0.99  # share of edges that must be edges on the other side too: quads may be split the other way there
+_SYMMETRIC = 0.99  # share of edges that must exist mirrored too; not all do, since quads may be split differently
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Holds heads mean + z modes, z ~ N(0, I), in mm; modes need not be orthogonal. The first ``broad`` ones are
-    global."""
+    """Holds a distribution of heads (mm): mean + z modes with z ~ N(0, I). Modes need not be orthogonal; the first
+    ``broad`` ones are global, the others localised."""
 
     mean: Float[np.ndarray, "V 3"]
     modes: Float32[np.ndarray, "K V 3"]
@@ -40,8 +39,8 @@ class Prior:
 def registration_prior(
     mean: Float[np.ndarray, "V 3"], modes: Float[np.ndarray, "M V 3"], faces: Int[np.ndarray, "F 3"], *, seed: int = 0
 ) -> Prior:
-    """Returns the mixture for a model's mean and modes (mm per standard deviation), mirrored where the mesh allows
-    it."""
+    """Returns the mixture for a model's mean and modes (mm per standard deviation), mirrored if the mesh is
+    symmetric."""
     opposite = mirror_images(mean, faces)
     if opposite is not None:
         mean = (mean + mean[opposite] * _MIRROR) / 2
@@ -52,12 +51,10 @@ def registration_prior(
 
 
 def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " V"] | None:
-    """Returns the vertex on the other side of the median plane x = 0 for each vertex; None where the mesh has no two
-    sides.
+    """Returns for each vertex its counterpart across the median plane x = 0; None if the mesh is not symmetric.
 
-    The cheapest one-to-one assignment: a mean head is not quite symmetric, and the nearest vertex of the mirrored one
-    would serve some twice.
-    """
+    It is the cheapest one-to-one assignment. A mean head is not quite symmetric, so the nearest mirrored vertex would
+    be used twice for some."""
     opposite = linear_sum_assignment(cdist(mean, mean * _MIRROR, "sqeuclidean"))[1]
     edges = edges_of(faces)[0].astype(np.int64)
     across = np.sort(opposite[edges], 1)
@@ -68,11 +65,10 @@ def mirror_images(mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"])
 def localised(
     mean: Float[np.ndarray, "V 3"], modes: Float32[np.ndarray, "M V 3"], *, seed: int = 0
 ) -> Float32[np.ndarray, "K V 3"]:
-    """Returns the ``KEPT`` strongest modes of the covariance times a Gaussian of the distance on the mean head.
+    """Returns the ``KEPT`` strongest modes of the covariance multiplied by a Gaussian of the distance on the mean head.
 
-    Their product K is too large to hold (400 MB), so its rows are made block by block and meet a random sketch once:
-    K ~ Y (P^T Y)^-1 Y^T with Y = K P (Halko, Martinsson, Tropp 2011, section 5.5).
-    """
+    That product K is too large to store (400 MB), so its rows are computed in blocks and multiplied once by a random
+    sketch: K ~ Y (P^T Y)^-1 Y^T with Y = K P (Halko, Martinsson, Tropp 2011, section 5.5)."""
     size = mean.size
     flat = modes.reshape(len(modes), size)
     probe = np.random.default_rng(seed).standard_normal((size, min(KEPT + _SPARE, size))).astype(np.float32)
@@ -84,7 +80,7 @@ def localised(
         product = (flat[:, entries].T @ flat).reshape(len(window), 3, len(mean), 3) * window[:, None, :, None]
         sketch[entries] = product.reshape(3 * len(window), size) @ probe
     core = probe.T.astype(float) @ sketch
-    ridge = 1e-6 * np.trace(core) / len(core)  # single precision leaves the smallest eigenvalues below zero
+    ridge = 1e-6 * np.trace(core) / len(core)  # rounding makes the smallest eigenvalues negative
     factor = cholesky((core + core.T) / 2 + ridge * np.eye(len(core)))
     root = solve_triangular(factor.T, sketch.T.astype(float), lower=True)
     values, vectors = np.linalg.eigh(root @ root.T)

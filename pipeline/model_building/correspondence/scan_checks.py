@@ -1,8 +1,7 @@
-"""Checks of raw scans before they are averaged: units, sides, windings, landmarks off the surface, holes.
+"""Checks raw scans before they are averaged: units, sides, orientation of faces, landmarks off the surface, holes.
 
-What has one plain remedy is repaired and said (units, a mirrored file, swapped names, inverted faces); everything else
-is a fault, and every fault of a scan is named. Landmark geometry is judged against the default model's mean.
-"""
+A problem with one obvious remedy is repaired and reported (units, a mirrored file, exchanged names, inverted faces).
+Everything else is a fault, and all faults of a scan are named. Landmarks are compared with the default model's mean."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from rig.geometry import rigid_fit
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 SIZE_RANGE = (0.7, 1.4)  # of the mean head: wider than any adult, narrower than the steps between units
-MISPLACED_MM = 35.0  # from the mean head's place: twice what the heads of the database show
+MISPLACED_MM = 35.0  # from the landmark of the mean head: twice the largest distance in the database
 OFF_SURFACE_MM = 15.0  # an ear's landmark may lie at the edge of a hole
 FACE_HOLE_MM = 25.0
 HEAD_HOLE_MM = 90.0
@@ -31,7 +30,7 @@ _OUTWARD_SHARE = 0.7  # of the area: folds of ear and nostril look inwards even 
 
 
 class BadScan(InputError):
-    """Reports a scan that must not be averaged in; ``faults`` says all that is wrong with it."""
+    """Reports a scan that must not be used. ``faults`` lists everything that is wrong with it."""
 
     def __init__(self, name: str, faults: Iterable[str]) -> None:
         super().__init__(f"scan {name}", faults)
@@ -39,14 +38,14 @@ class BadScan(InputError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """Holds a scan fit for correspondence, and what was put right in it."""
+    """Holds a scan fit for correspondence, and the repairs made to it."""
 
     scan: Scan
     repairs: tuple[str, ...]
 
 
 def check(scan: Scan, template: HeadModel) -> Checked:
-    """Returns the scan in millimetres with sides and windings put right. Raises BadScan with every fault found."""
+    """Returns the scan in millimetres, with sides and faces repaired. Raises BadScan naming every fault."""
     _check_complete(scan)
     scan, repairs = _in_millimetres(scan, template)
     scan, side_repairs = _sides_and_windings(scan, template)
@@ -72,7 +71,8 @@ def _check_complete(scan: Scan) -> None:
 
 
 def _in_millimetres(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
-    """Size by landmarks decides the unit: heads differ by a third, units by a factor of ten."""
+    """Converts a scan to millimetres. The size by landmarks decides its unit: heads differ by a third, units by a
+    factor of 10."""
     ratio = _radius_of_gyration(stacked(scan.landmarks)) / _radius_of_gyration(_mean_marks(template))
     for unit, factor in UNITS.items():
         if SIZE_RANGE[0] < ratio * factor < SIZE_RANGE[1]:
@@ -85,7 +85,8 @@ def _in_millimetres(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
 
 
 def _sides_and_windings(scan: Scan, template: HeadModel) -> tuple[Scan, list[str]]:
-    """Left and right against the mean head, faces against the axis; both wrong together is a mirrored file."""
+    """Repairs exchanged sides (compared with the mean head) and inverted faces (compared with the axis). Both together
+    mean a mirrored file."""
     marks, mean = stacked(scan.landmarks), _mean_marks(template)
     swapped = marks[[NAMES.index(mirrored(name)) for name in NAMES]]
     flipped = _misfit(swapped, mean) < 0.6 * _misfit(marks, mean)
@@ -119,7 +120,8 @@ def _landmark_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def _surface_faults(scan: Scan) -> list[str]:
-    """Neighbours that run along their edge in the same direction face opposite ways."""
+    """Returns a fault if neighbouring faces are oriented against each other: both use their common edge in one
+    direction."""
     directed = np.concatenate([scan.faces[:, [0, 1]], scan.faces[:, [1, 2]], scan.faces[:, [2, 0]]]).astype(np.int64)
     keys = directed[:, 0] * len(scan.vertices) + directed[:, 1]
     doubled = len(keys) - len(np.unique(keys))
@@ -129,7 +131,8 @@ def _surface_faults(scan: Scan) -> list[str]:
 
 
 def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
-    """The widest holes as seen from the axis, below the crown; its diameter is that of a disc of the same area."""
+    """Returns faults of holes that are too wide, seen from the axis, below the crown. The diameter is that of a disc of
+    the same area."""
     void, face = voids(scan, template)
     faults = []
     for where, mask, limit in (("face", void & face, FACE_HOLE_MM), ("head", void, HEAD_HOLE_MM)):
@@ -140,7 +143,8 @@ def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Bool[np.ndarray, "H A"]]:
-    """Returns cells of 4 mm (height, angle) from chin to above the brow where no surface is, and those of the face."""
+    """Returns the cells of 4 mm (height, angle), from chin to above the brow, that have no surface, and which cells are
+    face."""
     marks, placed = stacked(scan.landmarks), _placed(scan, template)
     at = dict(zip(NAMES, rigid_fit(marks, _mean_marks(template)).apply(marks), strict=True))
     heights = np.arange(at["gnathion"][1] + 4, at["glabella"][1] + 35, _CELL_MM)
@@ -152,7 +156,7 @@ def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Boo
 
 
 def outward_share(scan: Scan, template: HeadModel) -> float:
-    """Returns the share of the scan's area whose faces look away from the head's axis."""
+    """Returns the share of the scan's area whose faces point away from the head's axis."""
     corners = _placed(scan, template)[scan.faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     outward = (doubled * (corners.mean(1) * [1, 0, 1])).sum(1) > 0
@@ -161,8 +165,10 @@ def outward_share(scan: Scan, template: HeadModel) -> float:
 
 
 def _widest(mask: Bool[np.ndarray, "H A"]) -> float:
-    """Diameter (mm) of the disc as large as the largest connected patch; the columns close round the back."""
-    twice = np.zeros((len(mask), 2 * mask.shape[1]), np.int32)  # laid out twice, no patch is cut by the seam
+    """Returns the diameter (mm) of a disc as large as the largest connected patch. Columns are cyclic around the
+    head."""
+    # Two copies side by side, so that the seam cuts no patch.
+    twice = np.zeros((len(mask), 2 * mask.shape[1]), np.int32)
     ndimage.label(np.concatenate([mask, mask], 1), output=twice)
     cells = np.bincount(twice.ravel(), minlength=2)[1:]
     largest = min(float(cells.max()), float(mask.sum()))

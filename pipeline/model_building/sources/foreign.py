@@ -1,4 +1,4 @@
-"""What a reader of other people's models returns, and what it raises."""
+"""Defines what readers of other projects' models return, and the error that they raise."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from rig.errors import EigenheadError
 
 
 class CannotImport(EigenheadError):
-    """Reports a file or folder that holds no head model that can be read."""
+    """Reports a file or folder that contains no readable head model."""
 
     def __init__(self, path: Path | str, why: str) -> None:
         super().__init__(
@@ -23,7 +23,8 @@ class CannotImport(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Foreign:
-    """Holds a model as its file tells it, in mm and head axes (x to the subject's left, y up, z out of the face)."""
+    """Holds a model as its file describes it, in mm and the axes of the head frame (x to the subject's left, y up, z
+    out of the face)."""
 
     name: str
     licence: str
@@ -38,8 +39,8 @@ class Foreign:
 
 
 def read_obj(path: Path, *, polygons: bool = True) -> tuple[Float[np.ndarray, "V 3"], list[list[int]]]:
-    """Returns vertices and polygons in file order (trimesh would merge and reorder what the indices of the README
-    count)."""
+    """Returns vertices and polygons in the order of the file. trimesh would merge and reorder the vertices to which
+    published indices refer."""
     vertices, faces = [], []
     with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:

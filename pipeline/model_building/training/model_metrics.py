@@ -1,8 +1,7 @@
-"""What a model is worth: compactness, generalisation and specificity.
+"""Measures the quality of a model: compactness, generalisation and specificity.
 
-R. Davies, *Learning Shape: Optimal Models for Analysing Natural Variability* (2002), chapter 5. Each alone can be
-gamed: a model of one head is compact and specific, a model of everything generalises.
-"""
+R. Davies, *Learning Shape: Optimal Models for Analysing Natural Variability* (2002), chapter 5. No single one suffices:
+a model of one head is compact and specific, a model that allows any shape generalises."""
 
 from collections.abc import Iterable
 
@@ -15,7 +14,7 @@ from rig.progress import Progress
 
 
 def compactness(sigma: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """Returns the share of the total variance in the first m modes."""
+    """Returns for each m the share of the total variance that the first m modes have."""
     return np.cumsum(sigma.astype(float) ** 2) / np.sum(sigma.astype(float) ** 2)
 
 
@@ -26,12 +25,11 @@ def generalisation(
     *,
     report: Progress | None = None,
 ) -> dict[int, float]:
-    """Computes, leaving one out, the mean vertex distance (mm, over ``region``) of each head to its best likeness in
-    the others' PCA.
+    """Computes the mean vertex distance (mm, over ``region``) of each head to the nearest head in the PCA of all
+    others, by number of modes.
 
-    Rotating into the components' own axes is exact for the training heads, so each PCA is one of N - 1 points in
-    N - 1 dimensions and not in 3 V.
-    """
+    The heads are rotated into the components' own axes, which is exact for training heads. So each PCA is one of N - 1
+    points in N - 1 dimensions instead of 3 V."""
     counts = list(counts)
     points = components.scores * components.sigma  # mm, orthonormal axes
     axes = (components.modes / components.sigma[:, None, None])[:, region].reshape(len(components.sigma), -1)
@@ -59,8 +57,8 @@ def specificity(
     draws: int = 200,
     seed: int = 0,
 ) -> float:
-    """Returns the mean over random draws of the vertex distance (mm, over ``region``) to the nearest of the given
-    heads."""
+    """Computes the mean distance (mm over vertices of ``region``) of random draws of a model to the nearest of
+    ``heads``."""
     rng = np.random.default_rng(seed)
     known = heads[:, region].astype(np.float32)
     total = 0.0
@@ -73,12 +71,10 @@ def specificity(
 def of_draws(
     model: HeadModel, *, heads: int = 138, used: int = 60, draws: int = 200, seed: int = 0
 ) -> dict[str, float]:
-    """Returns generalisation and specificity (mm) where a model's own Gaussian is the population: ``heads`` draws of
-    it.
+    """Computes generalisation and specificity (mm) for ``heads`` random draws of a model in place of real subjects.
 
-    For models whose subjects are not published, and beside them for others: a Gaussian has no outliers and fills all
-    its modes, so these are not the figures of real subjects.
-    """
+    It serves models whose subjects are not published, and others for comparison. A Gaussian has no outliers and uses
+    all its modes, so the figures differ from those of real subjects."""
     rng = np.random.default_rng(seed)
     flat = model.modes.reshape(len(model.modes), -1)
     drawn = model.mean + (rng.standard_normal((heads, len(flat))) @ flat).reshape(heads, *model.mean.shape)

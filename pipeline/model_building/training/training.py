@@ -1,4 +1,4 @@
-"""From corresponded heads to a model file's content: alignment, principal components, levels, face region."""
+"""Turns corresponded heads into the content of a model file: alignment, principal components, levels, face region."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +20,8 @@ USED_MODES = 60  # section 4.4
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Training:
-    """Holds corresponded heads (mm, any common pose, y up, z to the front) with what a model carries besides shape."""
+    """Holds corresponded heads (mm, in any common pose, y up, z to the front), and what a model contains besides
+    shape."""
 
     name: str
     licence: str
@@ -34,7 +35,9 @@ class Training:
 
 
 def train(training: Training, *, report: Progress | None = None) -> ModelParts:
-    """Returns rigid Procrustes (no scale), PCA, levels, generalisation and specificity. Raises NotAManifold."""
+    """Computes a model's parts: rigid Procrustes alignment (no scale), PCA, levels, generalisation and specificity.
+
+    Raises NotAManifold."""
     say = report or (lambda stage, fraction: None)
     check_manifold(training.faces)
     say("aligning", 0.0)
@@ -61,7 +64,7 @@ def finish(
     *,
     report: Progress | None = None,
 ) -> ModelParts:
-    """Returns the parts of a model from its components: decimated levels are chosen on the mean head."""
+    """Builds the parts of a model from its components. Decimated levels are chosen on the mean head."""
     say = report or (lambda stage, fraction: None)
     say("decimating", 0.0)
     decimated = levels_of(components.mean, training.faces, region, training.landmarks, training.subdivisions)
@@ -92,10 +95,10 @@ def levels_of(
     landmarks: Mapping[str, int],
     subdivisions: int,
 ) -> dict[str, tuple[Int[np.ndarray, " K"], Int[np.ndarray, "G 3"]]]:
-    """Levels of 95 % and 99 %: rows of the full level and faces among them; every landmark stays.
+    """Computes the levels of 95 % and 99 % reduction: their vertices as rows of the full level, and their faces. Every
+    landmark is kept.
 
-    The counts are 5 % and 1 % of the full level, or of the paper's 96,000 triangles where a model has fewer.
-    """
+    They have 5 % and 1 % of the triangles of the full level, or of the paper's 96,000 if a model has fewer."""
     full, full_faces = refine(faces, len(mean), subdivisions)
     targets = tuple(round(max(len(full_faces), PAPER_FACES) * share) for share in (0.05, 0.01))
     steps = 0
@@ -106,34 +109,34 @@ def levels_of(
     importance = np.where(rough @ region.astype(float) > 0.5, FACE_WEIGHT, 1.0)
     fixed = np.zeros(count, bool)
     fixed[list(landmarks.values())] = True
-    # vertices of a rougher step come first in the full level, so these are their final places
+    # subdivision appends vertices, so the coarse level's indices are valid in the full level too
     places = (full[np.arange(count)]) @ mean
     p95, p99 = decimate(places, rough_faces, targets, importance=importance, fixed=fixed)
     return {"p95": p95, "p99": p99}
 
 
 def in_head_frame(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, "N V 3"]:
-    """Returns every head moved (not turned) so that its mean tragion is the origin: inside the head, between the
+    """Returns every head shifted (not rotated) so that its mean tragion is the origin, inside the head between the
     ears."""
     ears = heads[:, [landmarks["tragion_right"], landmarks["tragion_left"]]].mean(1)
     return heads - ears[:, None]
 
 
 def centred(heads: Float[np.ndarray, "N V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, "N V 3"]:
-    """Returns all heads moved together so that the mean head's ears lie level with the origin between them."""
+    """Returns all heads shifted alike, so that the origin is in the middle between the mean head's tragia."""
     return heads - heads.mean(0)[[landmarks["tragion_right"], landmarks["tragion_left"]]].mean(0)
 
 
 def above_neck(head: Float[np.ndarray, "V 3"], landmarks: Mapping[str, int]) -> Float[np.ndarray, " V"]:
-    """Returns the weight 1 above a plane from chin to nape, 0 below: how a neck is held must not turn the head."""
+    """Returns weights: 1 above a plane from chin to nape, 0 below it, so that the posture of the neck does not rotate
+    the head."""
     chin = head[landmarks["gnathion"]]
     slope = 0.35  # the line from under the chin to the nape rises towards the back
     return (head[:, 1] > chin[1] - 3 + slope * (chin[2] - head[:, 2])).astype(float)
 
 
 def face_region(mean: Float[np.ndarray, "V 3"], landmarks: Mapping[str, int]) -> Bool[np.ndarray, " V"]:
-    """Marks the face from ear to ear, lower forehead to under the chin: in front of the ears, above the jaw line, below
-    the hair."""
+    """Marks the face: in front of the ears, above the jaw line, below the hair."""
     at = {name: mean[index] for name, index in landmarks.items()}
     eye = (at["exocanthion_right"] + at["exocanthion_left"]) / 2
     jaw = (at["gonion_right"] + at["gonion_left"]) / 2

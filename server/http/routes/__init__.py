@@ -1,1 +1,1 @@
-"""HTTP under /v1, one noun a file."""
+"""Declares the routes under /v1: one module for each kind of resource."""

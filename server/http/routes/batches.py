@@ -26,7 +26,7 @@ SHEET: Responses = {200: {"content": {"text/html": TEXT}}, **documented(404)}
 
 
 class NewBatch(Received):
-    """The captures are named in one of three ways: ``captures``, ``session`` or ``prefix``."""
+    """Requests a batch. Its captures are named in one of three ways: ``captures``, ``session`` or ``prefix``."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -86,7 +86,7 @@ class BatchList(Listed):
 def submit_batch(
     service: ServiceOf, caller: Submitter, wanted: NewBatch, response: Response, idempotency_key: Idempotency = None
 ) -> BatchOut:
-    """A job for each of many captures, behind the jobs of others. The same Idempotency-Key with the same request
+    """Queues a job for each of many captures, behind the jobs of others. The same Idempotency-Key with the same request
     returns the first batch."""
     request = BatchRequest(
         Selection(wanted.captures, wanted.session, wanted.prefix),
@@ -110,7 +110,7 @@ def list_batches(
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> BatchList:
-    """A page at a time, newest first; ``q`` looks into the label."""
+    """Lists batches in pages, newest first; ``q`` searches the label."""
     found = service.batches.page(q, state, limit, cursor)
     return BatchList(
         batches=[BatchOut.model_validate(batch) for batch in found.items], next=found.next, total=found.total
@@ -119,37 +119,38 @@ def list_batches(
 
 @router.get("/batches/{batch_id}", responses=documented(404))
 def get_batch(service: ServiceOf, caller: Reader, batch_id: str) -> BatchOut:
-    """A batch: its state, its captures by state, remaining seconds. ``GET /v1/jobs?batch=`` lists its jobs."""
+    """Returns a batch: its state, its captures by state, remaining seconds. ``GET /v1/jobs?batch=`` lists its jobs."""
     return BatchOut.model_validate(service.batches.get(batch_id))
 
 
 @router.post("/batches/{batch_id}/pause", responses=documented(404, 409))
 def pause_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """No further job begins; those that run go on. Queued ones are taken back within a second."""
+    """Stops the batch from beginning further jobs; running ones go on. Queued jobs are withdrawn within a second."""
     return BatchOut.model_validate(service.batches.pause(batch_id))
 
 
 @router.post("/batches/{batch_id}/resume", responses=documented(404, 409))
 def resume_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """Goes on where it was paused."""
+    """Continues a paused batch."""
     return BatchOut.model_validate(service.batches.resume(batch_id))
 
 
 @router.post("/batches/{batch_id}/cancel", responses=documented(404))
 def cancel_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """Cancels what has not ended, for good; results stay. A batch that ended stays as it is."""
+    """Cancels the jobs that have not ended; they cannot be resumed. Results stay. A batch that has ended does not
+    change."""
     return BatchOut.model_validate(service.batches.cancel(batch_id))
 
 
 @router.post("/batches/{batch_id}/retry", responses=documented(404, 409))
 def retry_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """A new job for each capture whose job failed; the failed ones stay in the list of jobs."""
+    """Queues a new job for each capture whose job failed; the failed jobs stay in the list of jobs."""
     return BatchOut.model_validate(service.batches.retry(batch_id))
 
 
 @router.delete("/batches/{batch_id}", status_code=204, responses=documented(404, 409))
 def delete_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> None:
-    """Forgets a batch that ended. Its jobs and heads stay."""
+    """Removes the record of a batch that has ended. Its jobs and heads stay."""
     service.batches.remove(batch_id)
 
 
@@ -157,12 +158,12 @@ def delete_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> None:
 def get_batch_table(
     service: ServiceOf, caller: Reader, batch_id: str, form: Annotated[TableFormat, Query(alias="format")] = "csv"
 ) -> Response:
-    """A row a capture, in the batch's order, with the columns of ``eigenhead batch``: docs/batch.md has each with its
-    unit."""
+    """Returns a table with a row for each capture, in the batch's order, and the columns of ``eigenhead batch``;
+    docs/batch.md describes each column with its unit."""
     return send_table(service, batch_id, form)
 
 
 @router.get("/batches/{batch_id}/sheet", responses=SHEET, response_class=StreamingResponse)
 def get_batch_sheet(service: ServiceOf, caller: Reader, batch_id: str) -> Response:
-    """The contact sheet: three views of each head, its warnings in colour; one file that needs nothing beside it."""
+    """Returns the contact sheet, one self-contained HTML file: three views of each head, and its warnings in colour."""
     return send_sheet(service, batch_id)

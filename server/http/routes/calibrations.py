@@ -1,4 +1,4 @@
-"""Calibrations: from an archive of board pictures or from shots that the rig took; looked at, fetched, removed."""
+"""Declares the routes of calibrations, made from an archive of board pictures or from shots that the rig took."""
 
 import json
 from typing import Annotated
@@ -32,8 +32,8 @@ BODY["requestBody"]["content"]["application/json"] = {"schema": NewCalibration.m
 
 @router.post("", status_code=202, responses=documented(400, 404, 408, 413, 415, 507), openapi_extra=BODY)
 async def make_calibration(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CalibrationOut:
-    """Queues a calibration of an uploaded archive (multipart), or of captures that the rig took (JSON): of the board,
-    or, ``"from": "scene"``, of anything."""
+    """Queues a calibration of an uploaded archive (multipart), or of captures that the rig took (JSON). They show the
+    board or, with ``"from": "scene"``, any scene."""
     if request.headers.get("content-type", "").partition(";")[0].strip() == "application/json":
         await service.threads.disk(check_length, request, service.store, service.settings)
         wanted = _parsed(await _small_body(request))
@@ -50,13 +50,13 @@ async def make_calibration(service: ServiceOf, caller: Taker, request: Request, 
 
 @router.get("", responses=documented())
 def list_calibrations(service: ServiceOf, caller: Reader) -> CalibrationList:
-    """Newest first."""
+    """Lists all calibrations, newest first."""
     return CalibrationList(calibrations=[CalibrationOut.model_validate(found) for found in service.calibrations.find()])
 
 
 @router.get("/{calibration_id}", responses=documented(404))
 def get_calibration(service: ServiceOf, caller: Reader, calibration_id: str) -> CalibrationOut:
-    """A calibration: its state and, once it succeeded, figures and checks."""
+    """Returns a calibration: its state and, once it has succeeded, figures and checks."""
     return CalibrationOut.model_validate(service.calibrations.get(calibration_id))
 
 
@@ -71,7 +71,7 @@ FILE: Responses = {
 @router.head("/{calibration_id}/cameras.json", include_in_schema=False)
 @router.get("/{calibration_id}/cameras.json", responses=FILE, response_class=FileResponse)
 def get_cameras(service: ServiceOf, caller: Reader, request: Request, calibration_id: str) -> Response:
-    """The calibrated cameras, as a capture folder has them."""
+    """Returns the calibrated cameras as cameras.json of a capture folder."""
     return send_file(request, service.calibrations.file(calibration_id, "cameras.json"))
 
 
@@ -81,13 +81,13 @@ def get_cameras(service: ServiceOf, caller: Reader, request: Request, calibratio
     response_class=FileResponse,
 )
 def get_report(service: ServiceOf, caller: Reader, request: Request, calibration_id: str) -> Response:
-    """One self-contained page: residuals, coverage, uncertainty."""
+    """Returns the report as a self-contained HTML page: residuals, coverage, uncertainty."""
     return send_file(request, service.calibrations.file(calibration_id, "report.html"))
 
 
 @router.delete("/{calibration_id}", status_code=204, responses=documented(404, 409))
 def remove_calibration(service: ServiceOf, caller: Taker, calibration_id: str) -> None:
-    """A calibration in use stays in use: what is removed are its pictures and its report."""
+    """Removes a calibration's pictures and report. If it is in use, its cameras stay in use."""
     service.calibrations.remove(calibration_id)
 
 

@@ -1,4 +1,4 @@
-"""Captures: taken with the rig or uploaded, looked at, given feature points, removed."""
+"""Declares the routes of captures: taking or uploading them, viewing them, setting feature points, removing them."""
 
 import json
 from collections.abc import Callable
@@ -39,9 +39,9 @@ TAGS = "with commas between"
 
 @router.post("/captures", status_code=201, responses=documented(400, 404, 413, 415, 507))
 def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response: Response) -> CaptureOut:
-    """Triggers the rig now; answers once every camera delivered (201) or the fault is known (503).
+    """Triggers the rig at once. Answers 201 when every camera has delivered, or 503 when the fault is known.
 
-    ``board``: pictures of the calibration board, from the cameras that deliver, for ``POST /v1/calibrations``."""
+    ``board``: takes pictures of the calibration board for ``POST /v1/calibrations``, from the cameras that deliver."""
     about = CaptureMetadata(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     return _created(service.captures.take(about, seed=wanted.seed, board=wanted.board), response)
 
@@ -53,15 +53,15 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
     openapi_extra=described_form(ARCHIVE, FIELDS, tags=TAGS),
 )
 async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
-    """Takes a capture folder as an archive; 422 names every fault in it, and then nothing of it is kept."""
+    """Receives a capture folder as an archive. If it has faults, 422 names all of them and nothing is stored."""
     record, _ = await receive_capture(service, request)
     return _created(record, response)
 
 
 @router.post("/captures/imports", status_code=201, responses=documented(400, 404, 413, 415, 507))
 async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, response: Response) -> CaptureOut:
-    """Takes a capture folder as an archive that lies elsewhere, at a server that the operator allowed
-    (``EIGENHEAD_IMPORT_ORIGINS``; 403 where there is none); 422 names every fault in it."""
+    """Downloads a capture folder as an archive from a server that the operator allowed (``EIGENHEAD_IMPORT_ORIGINS``;
+    403 if there is none). 422 names every fault in the archive."""
     if not service.settings.import_origins:
         detail = compose("imports-not-allowed")
         raise Forbidden("imports-off", detail)
@@ -88,8 +88,8 @@ def list_captures(
         str | None, Query(max_length=64, pattern=PLAIN, description="only captures older than this id")
     ] = None,
 ) -> CaptureList:
-    """A page at a time, newest first unless asked otherwise; ``q`` looks into label, expression, tags, session,
-    verdict, source and id."""
+    """Lists captures in pages, newest first by default; ``q`` searches label, expression, tags, session, verdict,
+    source and id."""
     query = CaptureQuery(q, session, verdict, before=before, tag=tag, order=sort)
     found = service.captures.page(query, limit, cursor)
     captures = [CaptureOut.model_validate(record) for record in found.items]
@@ -98,8 +98,8 @@ def list_captures(
 
 @router.post("/captures/bulk", responses=documented(400, 413, 415, 507))
 def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> BulkOut:
-    """One action on many captures; what cannot be done to one is said and holds no other up. ``reconstruct`` needs the
-    scope ``submit``."""
+    """Applies one action to many captures. Captures to which it cannot be applied are reported and do not stop the
+    others. ``reconstruct`` needs the scope ``submit``."""
     if wanted.action == "reconstruct" and not caller.may("submit"):
         raise Forbidden("scope-missing", compose("your-key-lacks-scope", scope="'submit'"))
     work = ReconstructionRequest(wanted.model, wanted.settings)
@@ -117,7 +117,7 @@ def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> B
 
 @router.get("/captures/{capture_id}", responses=documented(404))
 def get_capture(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureOut:
-    """A capture: its cameras, its files with their sha256, and the rig's certificate of the shot."""
+    """Returns a capture: its cameras, its files with their sha256, and the rig's certificate of the shot."""
     return CaptureOut.model_validate(service.store.capture(capture_id))
 
 
@@ -129,7 +129,7 @@ def get_checks(service: ServiceOf, caller: Reader, capture_id: str) -> CaptureCh
 
 @router.patch("/captures/{capture_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_capture(service: ServiceOf, caller: Taker, capture_id: str, wanted: CaptureEdit) -> CaptureOut:
-    """Another label, expression or session, or other tags."""
+    """Changes label, expression, session or tags of a capture."""
     changes = wanted.model_dump(exclude_unset=True)
     changed = service.captures.edit(capture_id, changes, tags=changes.pop("tags", None))
     return CaptureOut.model_validate(changed)
@@ -149,32 +149,32 @@ IMAGE_RESPONSES: Responses = {
 @router.head("/captures/{capture_id}/images/{camera}", include_in_schema=False)
 @router.get("/captures/{capture_id}/images/{camera}", responses=IMAGE_RESPONSES, response_class=FileResponse)
 def get_image(service: ServiceOf, caller: Reader, request: Request, capture_id: str, camera: str) -> Response:
-    """A camera's photograph as it came."""
+    """Returns a camera's photograph as it was received."""
     return send_file(request, service.captures.image(capture_id, "images", camera))
 
 
 @router.head("/captures/{capture_id}/backgrounds/{camera}", include_in_schema=False)
 @router.get("/captures/{capture_id}/backgrounds/{camera}", responses=IMAGE_RESPONSES, response_class=FileResponse)
 def get_background(service: ServiceOf, caller: Reader, request: Request, capture_id: str, camera: str) -> Response:
-    """The first clean plate of a camera."""
+    """Returns the first clean plate of a camera."""
     return send_file(request, service.captures.image(capture_id, "background", camera))
 
 
 @router.put("/captures/{capture_id}/features", responses=documented(400, 404, 409, 413, 415, 507))
 def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: NewFeatures) -> CaptureOut:
-    """Stores feature points; 422 names every point that the capture cannot have. Jobs made from now on use them."""
+    """Stores feature points; 422 names every point that does not fit the capture. Later jobs use them."""
     return CaptureOut.model_validate(service.captures.put_features(capture_id, features.points))
 
 
 @router.get("/captures/{capture_id}/features", responses=documented(404))
 def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeatures:
-    """The feature points that are stored."""
+    """Returns the stored feature points."""
     return NewFeatures(points=service.captures.features(capture_id))
 
 
 @router.get("/captures/{capture_id}/holdings", responses=documented(404))
 def get_holdings(service: ServiceOf, caller: Reader, capture_id: str) -> HoldingsOut:
-    """What a removal of the capture takes, and what stays."""
+    """Returns what a removal of the capture would delete, and what would stay."""
     return HoldingsOut.model_validate(service.captures.holdings(capture_id))
 
 
@@ -185,8 +185,8 @@ def delete_capture(
     capture_id: str,
     erase: Annotated[bool, Query(description="its jobs and heads, too, for good")] = False,
 ) -> None:
-    """Removes a capture with its images; its jobs and their results, which show the face, stay. 409 while a job needs
-    it. With ``erase`` nothing stays: jobs are cancelled and go with their results."""
+    """Removes a capture with its images. Its jobs and their results, which show the face, stay. 409 while a job needs
+    the capture. With ``erase`` its jobs are cancelled and removed with their results, too."""
     if erase:
         service.captures.erase(capture_id)
     else:
@@ -207,7 +207,8 @@ async def reconstruct_upload(
     response: Response,
     idempotency_key: Idempotency = None,
 ) -> JobOut:
-    """Upload and job in one call. The same Idempotency-Key with the same files and settings returns the first job."""
+    """Receives a capture and queues its job in one call. The same Idempotency-Key with the same files and settings
+    returns the first job."""
     record, fields = await receive_capture(service, request, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]
@@ -217,7 +218,7 @@ async def reconstruct_upload(
     except BaseException:
         service.store.remove_capture(record.id)
         raise
-    if job.capture_id != record.id:  # the key's first call made the job; this upload is not needed
+    if job.capture_id != record.id:  # an earlier call with this key made the job, so this upload is removed
         service.store.remove_capture(record.id)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return JobOut.model_validate(job)

@@ -1,4 +1,5 @@
-"""Jobs: submitted, watched, cancelled, restarted; and the files that they made."""
+"""Declares the routes of jobs: submitting, watching, cancelling and restarting them, and fetching the files they
+made."""
 
 from collections.abc import AsyncIterator, Callable
 from typing import Annotated
@@ -66,8 +67,8 @@ def list_jobs(
     cursor: Cursor = None,
     offset: Annotated[int, Query(ge=0, le=1_000_000, deprecated=True)] = 0,
 ) -> JobList:
-    """A page at a time, newest first unless asked otherwise; ``q`` looks into name, model, method, level, id and the
-    capture's words. ``offset`` serves older clients: a cursor neither repeats nor drops a job."""
+    """Lists jobs in pages, newest first by default; ``q`` searches name, model, method, level, id and the capture's
+    words. ``offset`` serves older clients; a cursor neither repeats nor omits a job."""
     query = JobQuery(q, None if state is None else STATUSES[state], capture, session, batch, sort)
     if offset:
         old = service.jobs.find(state=state, capture=capture, session=session, limit=limit, offset=offset)
@@ -79,7 +80,7 @@ def list_jobs(
 
 @router.post("/jobs/bulk", responses=documented(400, 413, 415, 507))
 def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkOut:
-    """One action on many jobs; what cannot be done to one is said and holds no other up."""
+    """Applies one action to many jobs. Jobs to which it cannot be applied are reported and do not stop the others."""
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.cancel,
         "restart": lambda job: service.jobs.restart(job, ReconstructionRequest(), key=caller.key),
@@ -90,7 +91,7 @@ def change_jobs(service: ServiceOf, caller: Submitter, wanted: JobBulk) -> BulkO
 
 @router.get("/jobs/{job_id}", responses=documented(404))
 def get_job(service: ServiceOf, caller: Reader, job_id: str) -> JobOut:
-    """A job: its state, stage, progress, remaining seconds, and once it succeeded its files."""
+    """Returns a job: its state, stage, progress, remaining seconds, and once it has succeeded its files."""
     return JobOut.model_validate(service.jobs.get(job_id))
 
 
@@ -107,13 +108,13 @@ async def job_events(
     job: Annotated[str, Depends(known_job)],
     last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", max_length=40)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """``progress`` events (state, stage, progress, eta_s) and at the end one ``end`` event with the whole job.
+    """Streams ``progress`` events (state, stage, progress, eta_s), and at the end one ``end`` event with the whole job.
 
-    ``Last-Event-ID`` resumes after that event.
-    """
+    ``Last-Event-ID`` resumes after that event."""
     seq = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else 0
     while True:
-        state = await service.threads.disk(service.jobs.state, job)  # asked first: the last events are already there
+        # The state is read before the events, so that no event of an ended job is missed.
+        state = await service.threads.disk(service.jobs.state, job)
         for event in await service.threads.disk(service.jobs.events.since, job, min(seq, 2**31 - 1)):
             seq = event.seq
             yield ServerSentEvent(event="progress", id=str(seq), data=event.document)
@@ -126,7 +127,7 @@ async def job_events(
 
 @router.post("/jobs/{job_id}/cancel", responses=documented(404))
 def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
-    """Takes effect within a second in any stage; a finished job stays as it is."""
+    """Cancels a job within a second, in any stage. A finished job does not change."""
     return JobOut.model_validate(service.cancel(job_id))
 
 
@@ -134,7 +135,8 @@ def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
 def restart_job(
     service: ServiceOf, caller: Submitter, job_id: str, response: Response, wanted: Restart | None = None
 ) -> JobOut:
-    """A new job for the same capture, perhaps with another model or settings; ``restart_of`` names the old one."""
+    """Queues a new job for the same capture, with another model or settings if given; ``restart_of`` names the old
+    job."""
     work = ReconstructionRequest(wanted.model, wanted.settings) if wanted else ReconstructionRequest()
     return _accepted(service.jobs.restart(job_id, work, key=caller.key), response)
 
@@ -151,7 +153,7 @@ def delete_job(service: ServiceOf, caller: Submitter, job_id: str) -> None:
     response_class=PlainTextResponse,
 )
 def get_job_log(service: ServiceOf, caller: Reader, job_id: str) -> str:
-    """What its workers said of this job: stages, warnings, how it ended. 404 before it begins."""
+    """Returns what the workers logged about this job: stages, warnings, how it ended. 404 before it begins."""
     return service.jobs.log(job_id)
 
 
@@ -171,7 +173,7 @@ RESULT: Responses = {
 
 @router.get("/jobs/{job_id}/result", responses=documented(404, 409))
 def list_result(service: ServiceOf, caller: Reader, job_id: str) -> ResultList:
-    """Every file of a job's result; each is fetched at its ``url``, all of them as ``all.zip``."""
+    """Lists the files of a job's result. Each is fetched at its ``url``, all of them as ``all.zip``."""
     files = [
         {"name": name, "url": f"/v1/jobs/{job_id}/result/{quote(name)}", "media_type": media_type(name), **file}
         for name, file in service.jobs.files(job_id).items()
@@ -182,15 +184,15 @@ def list_result(service: ServiceOf, caller: Reader, job_id: str) -> ResultList:
 @router.head("/jobs/{job_id}/result/all.zip", include_in_schema=False)
 @router.get("/jobs/{job_id}/result/all.zip", responses=ARCHIVE, response_class=StreamingResponse)
 def get_archive(service: ServiceOf, caller: Reader, request: Request, job_id: str) -> Response:
-    """Every file of the result in one archive, made while it is sent."""
+    """Returns all files of the result as one archive, which is packed while it is sent."""
     return send_archive(request, service.store.folder("jobs", job_id) / "result", service.jobs.files(job_id))
 
 
 @router.head("/jobs/{job_id}/result/{name:path}", include_in_schema=False)
 @router.get("/jobs/{job_id}/result/{name:path}", responses=RESULT, response_class=FileResponse)
 def get_result(service: ServiceOf, caller: Reader, request: Request, job_id: str, name: str) -> Response:
-    """head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and so on; ``GET .../result`` lists
-    what there is."""
+    """Returns a file of the result: head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and so
+    on. ``GET .../result`` lists them."""
     return send_file(request, service.jobs.result_file(job_id, name))
 
 

@@ -1,4 +1,4 @@
-"""Health, readiness, metrics, models, templates, keys, webhooks; the page that shows the API."""
+"""Declares the routes of health, readiness, metrics, models, templates, keys and webhooks, and the page of the API."""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -39,19 +39,21 @@ DOCS = Path(__file__).parents[1] / "static" / "docs.html"
 
 @router.get("/docs", include_in_schema=False)
 def docs() -> FileResponse:
-    """The API for people, made in the browser from openapi.json; nothing comes from elsewhere."""
+    """Returns a page that shows the API. The browser builds it from openapi.json and loads nothing from other
+    servers."""
     return FileResponse(DOCS, media_type="text/html")
 
 
 @router.get("/healthz", tags=["operations"])
 async def healthz() -> Health:
-    """The process answers."""
+    """Answers as long as the process runs."""
     return Health(status="ok", version=version("eigenhead"))
 
 
 @router.get("/readyz", tags=["operations"], responses={503: {"model": Ready, "description": "Not ready"}})
 def readyz(service: ServiceOf, response: Response) -> Ready:
-    """The service can take work: EGL, disk, database, a worker, the rig. 503 with the same document where it cannot."""
+    """Tells whether the service can take work: EGL, disk, database, a worker, the rig. If not, the status is 503, with
+    the same document."""
     checks = readiness(service)
     ready = all(check.ok for check in checks.values())
     response.status_code = 200 if ready else 503
@@ -65,19 +67,19 @@ def readyz(service: ServiceOf, response: Response) -> Ready:
     responses={200: {"content": {MEDIA_TYPE: {"schema": {"type": "string"}}}}, **documented()},
 )
 def metrics(service: ServiceOf, caller: Reader) -> Response:
-    """Prometheus text format."""
+    """Returns the metrics in Prometheus' text format."""
     return Response(exposition(service), media_type=MEDIA_TYPE)
 
 
 @router.get("/v1/info", tags=["operations"], responses=documented())
 def info(service: ServiceOf, caller: Reader) -> InfoOut:
-    """Version, limits, how many jobs wait, and the settings that a job has by default."""
+    """Returns version, limits, the number of waiting jobs, and the default settings of a job."""
     return InfoOut.model_validate(about(service))
 
 
 @router.get("/v1/models", tags=["models"], responses=documented())
 def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
-    """The head models that a job may name."""
+    """Lists the head models that a job may name."""
     from pipeline.head_model.model_names import list_models, model_path
 
     default = model_path("default").resolve()
@@ -90,27 +92,28 @@ def list_models_at_hand(service: ServiceOf, caller: Reader) -> ModelList:
 
 @router.get("/v1/templates", tags=["models"], responses=documented())
 def list_templates(service: ServiceOf, caller: Reader) -> TemplateList:
-    """The meshes in whose vertex order a job may write its head (``settings.outputs.template``)."""
+    """Lists the meshes in whose vertex order a job may write its head (``settings.outputs.template``)."""
     templates = [TemplateOut.model_validate(template) for template in templates_at_hand()]
     return TemplateList(templates=templates)
 
 
 @router.post("/v1/keys", status_code=201, tags=["access"], responses=documented(400, 413, 415, 507))
 def add_key(service: ServiceOf, caller: Admin, wanted: NewKey) -> NewKeyOut:
-    """Makes an API key, which is shown this once."""
+    """Makes an API key. The answer is the only time that it is shown."""
     key = service.keys.add(wanted.name, tuple(wanted.scopes))
     return NewKeyOut(id=key.split("_")[1], key=key)
 
 
 @router.get("/v1/keys", tags=["access"], responses=documented())
 def list_keys(service: ServiceOf, caller: Admin) -> KeyList:
-    """The API keys, without their secrets."""
+    """Lists the API keys, without their secrets."""
     return KeyList(keys=[KeyOut(id=key.id, name=key.name, scopes=list(key.scopes)) for key in service.keys.all()])
 
 
 @router.delete("/v1/keys/{key_id}", status_code=204, tags=["access"], responses=documented(404, 409))
 def remove_key(service: ServiceOf, caller: Admin, key_id: str) -> None:
-    """A key cannot remove itself, so that the last one does not go by accident and leave the service keyless."""
+    """Removes an API key. A key cannot remove itself, so that removing the last one by accident does not leave the
+    service without keys."""
     if key_id == caller.key:
         raise Problem(409, "own-key", compose("own-key"))
     service.keys.remove(key_id)
@@ -118,17 +121,17 @@ def remove_key(service: ServiceOf, caller: Admin, key_id: str) -> None:
 
 @router.post("/v1/webhooks", status_code=201, tags=["webhooks"], responses=documented(400, 413, 415, 507))
 def add_webhook(service: ServiceOf, caller: Admin, wanted: NewWebhook) -> NewWebhookOut:
-    """Signed messages about ended jobs go to this address (standardwebhooks.com)."""
+    """Registers an address for signed messages about ended jobs (standardwebhooks.com)."""
     return NewWebhookOut.model_validate(service.webhooks.add(wanted.url))
 
 
 @router.get("/v1/webhooks", tags=["webhooks"], responses=documented())
 def list_webhooks(service: ServiceOf, caller: Admin) -> WebhookList:
-    """The addresses that are told when a job ends."""
+    """Lists the addresses that are notified when a job ends."""
     return WebhookList(webhooks=[WebhookOut.model_validate(hook) for hook in service.webhooks.all()])
 
 
 @router.delete("/v1/webhooks/{webhook_id}", status_code=204, tags=["webhooks"], responses=documented(404))
 def remove_webhook(service: ServiceOf, caller: Admin, webhook_id: str) -> None:
-    """Tells that address no more."""
+    """Removes an address; it is notified no more."""
     service.webhooks.remove(webhook_id)

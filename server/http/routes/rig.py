@@ -1,4 +1,5 @@
-"""The rig: its state, a live view, settings of cameras and lamps, clean plates, the calibration in use."""
+"""Declares the routes of the rig: its state, live view, settings of cameras and lamps, clean plates, calibration in
+use."""
 
 from collections.abc import AsyncIterator
 from contextlib import suppress
@@ -32,7 +33,7 @@ UNKEPT = {"Cache-Control": "no-store"}
 
 @router.get("", responses=documented())
 def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
-    """Cameras, drivers, faults, and whether it is calibrated."""
+    """Returns cameras, drivers and faults of the rig, and its calibration."""
     return RigOut.model_validate(service.rig.describe())
 
 
@@ -42,7 +43,7 @@ def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
     responses={200: {"content": {"image/jpeg": {}}}, **documented(404)},
 )
 def rig_preview(service: ServiceOf, caller: Reader, name: str) -> Response:
-    """What the camera sees now."""
+    """Returns the camera's present picture."""
     return Response(service.rig.preview(name), media_type="image/jpeg", headers=UNKEPT)
 
 
@@ -57,8 +58,8 @@ async def rig_preview_stream(
     name: str,
     seconds: Annotated[float, Query(gt=0, le=3600, description="after which it ends")] = 600.0,
 ) -> Response:
-    """What the camera sees, four times a second, as motion JPEG: for a page's ``<img>`` or a video player."""
-    first = await service.threads.disk(service.rig.preview, name)  # a 404 or 503 comes before the first picture
+    """Streams the camera's picture four times a second as motion JPEG, for a page's ``<img>`` or a video player."""
+    first = await service.threads.disk(service.rig.preview, name)  # raises its 404 or 503 before the stream begins
     return StreamingResponse(_pictures(service, name, first, seconds), media_type=PARTS, headers=UNKEPT)
 
 
@@ -67,7 +68,7 @@ async def _pictures(service: Service, name: str, picture: bytes, seconds: float)
     while True:
         began = anyio.current_time()
         yield b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(picture), picture)
-        with suppress(Unavailable):  # a camera that is away for a moment: the last picture stands
+        with suppress(Unavailable):  # of a camera that is gone for a moment the last picture stays
             picture = await service.threads.disk(service.rig.preview, name)
         await anyio.sleep(max(0.0, began + PICTURE_EVERY_S - anyio.current_time()))
         if anyio.current_time() >= until:
@@ -76,52 +77,56 @@ async def _pictures(service: Service, name: str, picture: bytes, seconds: float)
 
 @router.get("/cameras/{name}/settings", responses=documented(404))
 def camera_settings(service: ServiceOf, caller: Reader, name: str) -> CameraSettingsOut:
-    """Exposure, gain and white balance that were asked of a camera, and what it did not take."""
+    """Returns exposure, gain and white balance as requested of a camera, and which of them it did not accept."""
     return CameraSettingsOut.model_validate(service.rig.camera_settings(name))
 
 
 @router.patch("/cameras/{name}/settings", responses=documented(400, 404, 409, 413, 415, 507))
 def set_camera(service: ServiceOf, caller: Taker, name: str, wanted: CameraSettingsEdit) -> CameraSettingsOut:
-    """Other settings of a camera, kept over restarts; take new clean plates after it. 409 in the simulated studio."""
+    """Changes settings of a camera, also for later starts. New clean plates are needed afterwards. 409 in the simulated
+    studio."""
     changed = service.rig.set_camera(name, wanted.model_dump(exclude_unset=True))
     return CameraSettingsOut.model_validate(changed)
 
 
 @router.get("/lights", responses=documented())
 def rig_lights(service: ServiceOf, caller: Reader) -> Lights:
-    """The lamps that are on during a shot."""
+    """Returns the lamps that are on during a shot."""
     return Lights(outputs=list(service.rig.lights()))
 
 
 @router.put("/lights", responses=documented(400, 409, 413, 415, 507))
 def set_lights(service: ServiceOf, caller: Taker, wanted: Lights) -> Lights:
-    """Other lamps from now on, kept over restarts; take new clean plates after it. 409 in the simulated studio."""
+    """Selects the lamps that are on during a shot, also for later starts. New clean plates are needed afterwards. 409
+    in the simulated studio."""
     return Lights(outputs=list(service.rig.set_lights(tuple(sorted(set(wanted.outputs))))))
 
 
 @router.post("/background", responses=documented(409, 507))
 def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
-    """Takes new clean plates of the empty studio. The old ones stay if that fails (503), or if the new ones show
-    somebody whom the old ones do not (409): those are kept, and PUT puts them to use all the same."""
+    """Takes new clean plates of the empty studio.
+
+    The old ones stay in use if that fails (503), or if the new ones show somebody whom the old ones do not (409). In
+    the latter case the new ones are kept, and PUT can put them to use nevertheless."""
     service.store.reserve(0, service.settings.free_bytes)
     return BackgroundOut.model_validate(service.rig.take_background())
 
 
 @router.get("/background", responses=documented())
 def list_plates(service: ServiceOf, caller: Reader) -> PlatesList:
-    """The clean plates that are kept, newest first: those in use, earlier ones, and those that were refused."""
+    """Lists the stored clean plates, newest first: those in use, earlier ones, and those that were refused."""
     return PlatesList(versions=[PlatesOut.model_validate(kept) for kept in service.rig.plates()])
 
 
 @router.put("/background", responses=documented(400, 404, 413, 415, 507))
 def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesList:
-    """Puts clean plates that are kept to use: earlier ones, which takes the newest back, or refused ones all the
-    same."""
+    """Puts stored clean plates to use: earlier ones, or refused ones nevertheless."""
     service.rig.use_plates(wanted.version)
     return list_plates(service, caller)
 
 
 @router.put("/calibration", responses=documented(400, 404, 409, 413, 415, 507))
 def use_calibration(service: ServiceOf, caller: Taker, wanted: UseCalibration) -> RigOut:
-    """Every capture from now on gets this calibration. 409 for a poor one, naming what it lacks, unless asked for."""
+    """Selects the calibration of every later capture. 409 for one whose verdict is poor, with the reasons, unless
+    ``poor`` is set."""
     return RigOut.model_validate(service.use_calibration(wanted.calibration_id, poor=wanted.poor))

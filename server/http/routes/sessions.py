@@ -1,4 +1,4 @@
-"""Sessions: one subject's captures, and their erasure."""
+"""Declares the routes of sessions, the captures of one subject, and of their erasure."""
 
 from typing import Annotated
 
@@ -28,7 +28,7 @@ def make_session(service: ServiceOf, caller: Taker, wanted: NewSession, response
 def list_sessions(
     service: ServiceOf, caller: Reader, q: Sought = "", limit: Limit = 100, cursor: Cursor = None
 ) -> SessionList:
-    """Newest first, a page at a time; ``q`` looks into label and consent."""
+    """Lists sessions in pages, newest first; ``q`` searches label and consent."""
     found = service.sessions.page(q, limit, cursor)
     sessions = [SessionOut.model_validate(session) for session in found.items]
     return SessionList(sessions=sessions, next=found.next, total=found.total)
@@ -45,7 +45,7 @@ def list_subjects(
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> SubjectList:
-    """People: sessions of one name are one person's. Each with its newest head."""
+    """Lists people, each with the newest head. Sessions with the same name are one person's."""
     found = service.sessions.subjects(q, sort, limit, cursor, tag=tag)
     subjects = [PersonOut.model_validate(subject) for subject in found.items]
     return SubjectList(subjects=subjects, next=found.next, total=found.total)
@@ -53,19 +53,19 @@ def list_subjects(
 
 @router.get("/sessions/{session_id}", responses=documented(404))
 def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionOut:
-    """A session with the ids of its captures."""
+    """Returns a session with the ids of its captures."""
     return SessionOut.model_validate(service.sessions.get(session_id))
 
 
 @router.patch("/sessions/{session_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: SessionEdit) -> SessionOut:
-    """Another label or consent note."""
+    """Changes the label or the consent note."""
     changed = service.sessions.edit(session_id, label=wanted.label, consent=wanted.consent)
     return SessionOut.model_validate(changed)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))
 def erase_session(service: ServiceOf, caller: Taker, session_id: str) -> None:
-    """Erases a subject: cancels the jobs, then removes images, results, caches and what the job database holds of
-    them."""
+    """Erases a subject: cancels the jobs, then removes images, results, caches and the subject's data in the job
+    database."""
     service.sessions.erase(session_id)

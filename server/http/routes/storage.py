@@ -1,4 +1,4 @@
-"""What lies in the data folder, and what retention takes of it."""
+"""Declares the routes that show what the data folder holds and what retention removes from it."""
 
 from typing import Annotated
 
@@ -16,14 +16,14 @@ Reader = Annotated[Caller, Depends(require("read"))]
 
 @router.get("/storage", responses=documented())
 def get_storage(service: ServiceOf, caller: Reader) -> StorageOut:
-    """Bytes by kind, as of the last look through the data folder; a look that is older than five minutes starts the
-    next, for which nobody waits."""
+    """Returns the bytes of each kind of data, as they were last measured. If that is older than five minutes, a new
+    measurement starts, but the answer does not wait for it."""
     return StorageOut.model_validate(service.storage.use())
 
 
 @router.get("/retention", responses=documented())
 def get_retention(service: ServiceOf, caller: Reader) -> RetentionOut:
-    """How long captures and finished jobs are kept, which the service's variables say (``EIGENHEAD_KEEP_...``), and
-    what goes next."""
+    """Returns how long captures and finished jobs are kept (set by the variables ``EIGENHEAD_KEEP_...``), and what is
+    removed next."""
     settings = {name: getattr(service.settings, name) for name in RetentionOut.model_fields if name != "upcoming"}
     return RetentionOut(**settings, upcoming=[UpcomingOut.model_validate(one) for one in upcoming(service)])

@@ -1,4 +1,5 @@
-"""Resumable uploads, tus 1.0 (https://tus.io/protocols/resumable-upload): creation, termination, checksum, expiration.
+"""Declares the routes of resumable uploads, tus 1.0 (https://tus.io/protocols/resumable-upload), with its extensions
+creation, termination, checksum and expiration.
 
 The PATCH that brings the last byte answers with the capture's ``Location``, or with a 422 that names every fault.
 """
@@ -33,7 +34,7 @@ COMMON = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 
 @router.options("", status_code=204, responses=documented())
 def tus_options(service: ServiceOf) -> Response:
-    """What this server of resumable uploads can do."""
+    """Returns which parts of the tus protocol this server supports."""
     headers = {
         "Tus-Version": VERSION,
         "Tus-Extension": "creation,termination,checksum,expiration",
@@ -52,7 +53,7 @@ def tus_create(
     upload_metadata: Annotated[str | None, Header(alias="Upload-Metadata", max_length=8000)] = None,
 ) -> Response:
     """Announces an archive of ``Upload-Length`` bytes. ``Upload-Metadata`` may hold session, label, expression and
-    tags, with commas between."""
+    tags, separated by commas."""
     _check_version(tus_resumable)
     if not upload_length or not (upload_length.isascii() and upload_length.isdigit()) or len(upload_length) > 18:
         raise Problem(400, "upload-length", compose("upload-length-missing"))
@@ -66,7 +67,7 @@ def tus_create(
 
 @router.head("/{upload_id}", responses=documented(404, 412))
 def tus_head(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
-    """How many bytes are here; with the capture's ``Location`` once it was made."""
+    """Returns how many bytes have arrived, and the capture's ``Location`` once it has been made."""
     _check_version(tus_resumable)
     record = _owned_upload(service, caller, upload_id)
     headers = {"Upload-Offset": str(service.uploads.offset(record)), "Upload-Length": str(record.length)}
@@ -93,13 +94,13 @@ async def tus_patch(
     upload_offset: Annotated[str | None, Header(alias="Upload-Offset")] = None,
     upload_checksum: Annotated[str | None, Header(alias="Upload-Checksum", max_length=200)] = None,
 ) -> Response:
-    """Appends bytes at ``Upload-Offset``."""
+    """Appends bytes at ``Upload-Offset``. With the last byte the capture is made."""
     _check_version(tus_resumable)
     if request.headers.get("content-type") != "application/offset+octet-stream":
         raise Problem(415, "unsupported-media-type", compose("offset-stream-wanted"))
     record = await service.threads.disk(_owned_upload, service, caller, upload_id)
     with service.uploads.lock(record.id):
-        # read again: the request that held the lock before may have made the capture
+        # read again under the lock: another request may have made the capture meanwhile
         record = await service.threads.disk(_owned_upload, service, caller, upload_id)
         return await _append(service, record, upload_offset, request.stream(), upload_checksum)
 
@@ -120,7 +121,7 @@ async def _append(
 
 @router.delete("/{upload_id}", status_code=204, responses=documented(404, 409, 412))
 def tus_delete(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable: Resumable = None) -> Response:
-    """Gives an upload up; a capture that was made from it stays. 409 while bytes of it come in."""
+    """Discards an upload; a capture that was made from it stays. 409 while bytes of it are arriving."""
     _check_version(tus_resumable)
     record = _owned_upload(service, caller, upload_id)
     with service.uploads.lock(record.id):
@@ -129,12 +130,12 @@ def tus_delete(service: ServiceOf, caller: Taker, upload_id: str, tus_resumable:
 
 
 def _finish(service: Service, record: UploadRecord) -> UploadRecord:
-    """Makes the capture; an archive that cannot be used is let go with its upload."""
+    """Makes the capture. An archive that cannot be used is removed with its upload."""
     try:
         with service.store.incoming() as folder:
             data = service.uploads.data(record)
             capture = service.captures.accept(data, folder, CaptureMetadata.of(record.fields))
-    except (Unavailable, DiskFull):  # these may go well another time
+    except (Unavailable, DiskFull):  # the client may try again: keep the upload
         raise
     except (InputError, Refused):
         service.uploads.remove(record.id)
@@ -160,7 +161,7 @@ def _check_version(version: str | None) -> None:
 
 
 def _metadata(text: str | None) -> dict[str, str]:
-    """``key base64, key base64``; raises a 400 problem for anything else."""
+    """Decodes tus metadata, ``key base64, key base64``. Raises a 400 problem for anything else."""
     fields: dict[str, str] = {}
     for part in (text or "").split(","):
         key, _, value = part.strip().partition(" ")
