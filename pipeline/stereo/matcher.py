@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
@@ -33,6 +33,7 @@ class Planes(NamedTuple):
     fresh: Bool[np.ndarray, "h w"]  # neighbours have not tried it yet
 
 
+@runtime_checkable  # the tests check types of calls
 class Matcher(Protocol):
     """Compares windows of one view, on planes, with its neighbours."""
 
