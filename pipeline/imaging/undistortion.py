@@ -33,7 +33,7 @@ def undistorted_picture(
     places = _sampled_pixels(lens, pinhole)
     channels = []
     for channel in np.moveaxis(picture, 2, 0):
-        smooth = spline_filter(channel.astype(np.float32), SPLINE_ORDER, output=np.float32, mode="mirror")
+        smooth = spline_filter(channel.astype(float), SPLINE_ORDER, mode="mirror")
         channels.append(map_coordinates(smooth, places, order=SPLINE_ORDER, mode="constant", prefilter=False))
     return np.clip(np.rint(np.stack(channels, axis=2)), 0, 255).astype(np.uint8)
 

@@ -2,6 +2,7 @@
 world lie in the pictures where the files say, to 0.01 px."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from rig.capture import Capture
 from rig.formats.cameras_file import read_rig_file
 from rig.formats.capture_folder import read_capture, write_capture
+from rig.formats.images import write_image
 from rig.formats.ply import write_ply
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
@@ -22,6 +24,7 @@ from server.cli.main import app
 from tests.support.dataset_readers import avatar_pixel, dot_centre, frames_of, nerfstudio_pixel, read_png, with_dots
 from tests.support.scenes import ellipsoid
 from tests.support.small_studio import small_studio_captures
+from tests.support.textured_wedge import HEIGHT, WIDTH, wedge_rig, write_photographs
 
 pytestmark = pytest.mark.gl
 OFFSETS_MM = np.array([(0, 0, 0), (0, 62, 0), (0, -60, 0)], float)
@@ -187,3 +190,43 @@ def test_a_data_set_is_replaced_only_on_request(shot: tuple[Path, np.ndarray], t
     assert len(list((out / "images").iterdir())) == 6
     inside = CliRunner().invoke(app, ["export", str(shot[0]), "--as", "nerfstudio", "--out", str(shot[0] / "images")])
     assert "the capture's own pictures" in str(inside.exception)
+
+
+@pytest.mark.slow
+def test_photographs_alone_are_calibrated_once_and_keep_the_frame_of_their_result(tmp_path: Path) -> None:
+    rig = wedge_rig()
+    photographs = write_photographs(tmp_path / "photos", rig)
+    columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    for camera in rig:  # a ball before the wedge is the subject
+        column, row = camera.project(np.array([[0.0, 0.0, -20.0]]))[0]
+        disc = np.hypot(columns - column, rows - row) < 80
+        write_image(photographs / "masks" / f"{camera.name}.png", disc.astype(np.uint8) * np.uint8(255))
+    apart = np.linalg.norm(rig["cam00"].centre_world - rig["cam04"].centre_world)
+    scale = {"cameras": ["cam00", "cam04"], "distance_mm": 1.5 * apart}  # makes the ball as large as a head
+    (photographs / "scale.json").write_text(json.dumps(scale))
+    exported(photographs, tmp_path / "first", "nerfstudio", "--settings", str(settings_with_front(tmp_path)))
+    found = tmp_path / "first" / "found"
+    kept = {path.name: path.read_bytes() for path in found.glob("c*.json")}
+    assert set(kept) == {"cameras.json", "calibration.json"}
+    assert len(frames_of(tmp_path / "first")) == len(rig)
+
+    result = tmp_path / "result"  # as a reconstruction leaves it: what was found, the head, and what it was made of
+    shutil.copytree(found, result)
+    write_head(result, ellipsoid(2))
+    made_of = json.loads(kept["calibration.json"])
+    inputs = {name: digest for name, digest in made_of["made_of"].items() if name.endswith(".png")}
+    inputs |= {"cameras.json": made_of["cameras_sha256"]}
+    (result / "report.json").write_text(json.dumps({"inputs": inputs}))
+    exported(photographs, tmp_path / "second", "nerfstudio", "--result", str(result))
+    for name, content in kept.items():
+        assert (tmp_path / "second" / "found" / name).read_bytes() == content
+        assert (result / name).read_bytes() == content
+    first, second = (frames_of(tmp_path / folder) for folder in ("first", "second"))
+    assert first == second
+
+
+def settings_with_front(folder: Path) -> Path:
+    """A front camera that no guess would choose, so that the world is another without it."""
+    path = folder / "settings.json"
+    path.write_text(json.dumps({"front": "cam04"}))
+    return path
