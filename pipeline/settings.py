@@ -231,6 +231,7 @@ class OutputSettings:
     neutral: bool = False  # neutral.glb, the head without its expression
     normal_map: bool = False  # head.glb has 10,000 triangles, and a normal map of what they leave out
     morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names
+    slicer: bool = False  # landmarks.mrk.json, a point list for 3D Slicer
     template: str | None = None  # head-NAME.obj: the head in the vertex order of a registered template, too
     obj: bool = False  # of earlier versions: "obj" among the formats
     atlas: bool = False  # of earlier versions: head.glb has a texture now
@@ -261,9 +262,8 @@ class Settings:
     front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
     unexplained_outlines: Literal["refuse", "warn"] = "refuse"  # of a head that explains hardly any of them
-    device: Literal["auto", "cpu", "gl"] = (
-        "auto"  # what compares photographs; auto: a GPU where there is one and the processor is small; gl: any OpenGL
-    )
+    device: Literal["auto", "cpu", "gl"] = "auto"  # what compares photographs; auto: a GPU where there is one and the
+    # processor is small; gl: any OpenGL
     fail_on: tuple[str, ...] = ()  # codes of warnings (pipeline.warnings.WARNING_CODES) that are failures here
     segmentation: SegmentationSettings = field(default_factory=SegmentationSettings)
     faces: FaceSettings = field(default_factory=FaceSettings)

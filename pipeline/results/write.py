@@ -6,6 +6,7 @@
     turntable.png       the head from the right to the left profile
     head.obj head.mtl head.png, head.usdz, head.stl, head.3mf     on request (settings.outputs.formats)
     neutral.glb         on request: the head without its expression; posed.glb, with morphs to make others
+    landmarks.mrk.json  on request: the landmarks as a point list of 3D Slicer
     head-NAME.obj       on request: the head in the vertex order of the template NAME, with its texture
 
 Files of the same input, model, settings and version are the same bytes, report.json's seconds excepted.
@@ -22,6 +23,7 @@ from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
+from pipeline.results.slicer_landmarks import landmarks_document
 from pipeline.results.write_expression import write_expression
 from pipeline.results.write_template import write_template
 from pipeline.stages.bust import Bust
@@ -54,6 +56,9 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
         ]
         for job in jobs:
             job.result()
+    if result.settings.outputs.slicer:
+        points = json.dumps(landmarks_document(result), indent=1, allow_nan=False)
+        write_atomically(folder / "landmarks.mrk.json", points.encode())
     text = json.dumps(report_document(result, template), indent=1, allow_nan=False)
     write_atomically(folder / "report.json", text.encode())
 

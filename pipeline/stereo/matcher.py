@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
@@ -33,6 +33,7 @@ class Planes(NamedTuple):
     fresh: Bool[np.ndarray, "h w"]  # neighbours have not tried it yet
 
 
+@runtime_checkable  # the tests check types of calls
 class Matcher(Protocol):
     """Compares windows of one view, on planes, with its neighbours."""
 
@@ -186,8 +187,8 @@ class ShaderMatcher:
 
 
 def packed_ways(stack: Stack, view: int, others: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 16"]:
-    """Returns the ways from a view to others as ``Way`` of shaders/matching.glsl has them; the last three numbers of a
-    row are integers. At least one row: no buffer may be empty."""
+    """Returns the ways from a view to others as the struct Way of shaders/matching.glsl has them; the last three
+    numbers of a row are integers. At least one row: no buffer may be empty."""
     ways = stack.homographies(view, others)
     packed = np.zeros((max(len(ways), 1), 16), np.float32)
     packed[: len(ways), :12], packed[: len(ways), 12] = ways[:, :12], ways[:, 15]

@@ -205,6 +205,9 @@ TRANSFORMS: Table = {
     **_keys(
         "nothing", "", "enable_depth_loading", "integer_depth_scale", "sharpen", "envmap", "timestamp", "camera_id"
     ),
+    **_keys("nothing", "of a data set that `eigenhead export` wrote", "unit", "fg_mask_path", "camera_index"),
+    **_keys("nothing", "of a data set that `eigenhead export` wrote", "timestep_index", "camera_indices"),
+    **_keys("nothing", "of a data set that `eigenhead export` wrote", "timestep_indices"),
     **_keys("nothing", "", "auxiliary_data", "format_version", "dataset_id", "ids", "time", "fps", "num_exposures"),
 }
 

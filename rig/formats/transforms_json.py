@@ -61,13 +61,16 @@ def read_transforms(path: Path) -> CamerasRead:
 
 def write_transforms(rig: Rig, path: Path) -> None:
     """Writes a ``transforms.json`` in metres, pictures called ``images/<camera>.png``."""
-    frames = []
-    for camera in rig:
-        matrix = np.eye(4)
-        pose = camera.camera_from_world.inverse()
-        matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation / 1000.0
-        frames.append({"file_path": f"images/{camera.name}.png", **_lens(camera), "transform_matrix": matrix.tolist()})
+    frames = [frame_document(camera, f"images/{camera.name}.png") for camera in rig]
     write_atomically(path, json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1).encode())
+
+
+def frame_document(camera: Camera, file_path: str) -> dict[str, object]:
+    """Returns the frame of one camera, in metres. Raises InputError for a lens that the format does not hold."""
+    matrix = np.eye(4)
+    pose = camera.camera_from_world.inverse()
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation / 1000.0
+    return {"file_path": file_path, **_lens(camera), "transform_matrix": matrix.tolist()}
 
 
 def _lens(camera: Camera) -> dict[str, object]:

@@ -120,6 +120,9 @@ def reconstruct(
     morphs: Annotated[
         bool, typer.Option("--morphs", help="Write posed.glb too, with morph targets under Apple's names.")
     ] = False,
+    slicer: Annotated[
+        bool, typer.Option("--slicer", help="Write landmarks.mrk.json too, a point list for 3D Slicer.")
+    ] = False,
     template: Annotated[
         str | None,
         typer.Option(
@@ -145,7 +148,7 @@ def reconstruct(
     from server.tasks.settings_file import settings_document
 
     switches = {"obj": obj, "atlas": atlas, "delight": delight, "normal_map": normal_map}
-    switches |= {"neutral": neutral, "morphs": morphs}
+    switches |= {"neutral": neutral, "morphs": morphs, "slicer": slicer}
     outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
     outputs |= {name: word for name, word in words.items() if word}

@@ -42,9 +42,9 @@ def reconstruct_locally(
     share_one_heap()
     chosen = settings_from_document(settings)
     check_template(chosen.outputs.template, model or "default")
-    _check_apart(out, capture)
+    check_apart(out, capture)
     if trace is not None:
-        _check_apart(trace.parent, capture, "--trace")
+        check_apart(trace.parent, capture, "--trace")
         prepare_file(trace, option="--trace")
     with _traced(trace), _result_folder(out) as fresh, folder_of(capture) as folder:
         _reconstruct_folder(folder, fresh, kept=out, model=model, chosen=chosen, report=report)
@@ -71,7 +71,7 @@ def _reconstruct_folder(
     durations.learn(chosen, progress.finish())
 
 
-def _check_apart(out: Path, capture: Path, option: str = "--out") -> None:
+def check_apart(out: Path, capture: Path, option: str = "--out") -> None:
     """Raises SpoilsCapture if pictures of the result in ``out`` would be read as pictures of the capture."""
     from server.tasks.photographs import photographs_alone
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 RESULT_FILE = re.compile(
-    r"^((head|bust|neutral|posed|turntable|contact_sheet)[\w-]*\.\w+|report\.json|batch\.json|overlays|texture)$"
+    r"^((head|bust|neutral|posed|turntable|contact_sheet)[\w-]*\.\w+|report\.json|landmarks\.mrk\.json|batch\.json|overlays|texture)$"
 )
 
 

@@ -18,12 +18,12 @@ CAMERAS = ("cam00", "cam03", "cam04", "cam07", "cam08", "cam01")
 PIXELS = 320 * 240
 
 
-def small_studio_captures(folder: Path, count: int, renderer: Renderer) -> Path:
-    """Captures s0, s1 ... of bald heads before an even backdrop; returns the folder."""
+def small_studio_captures(folder: Path, count: int, renderer: Renderer, *, first: int = 0) -> Path:
+    """Captures s0, s1 ... (from ``first`` on) of bald heads before an even backdrop; returns the folder."""
     model = load_model()
     rig = work_rig(default_layout().subset(list(CAMERAS)), PIXELS)
     preset = replace(CLEAN, noise=0.01, plates=2, texture=False)
-    for seed in range(count):
+    for seed in range(first, first + count):
         rng = np.random.default_rng(seed)
         taken = simulate(drawn_subject(model, rng), rig, preset, rng, renderer=renderer)
         write_capture(folder / f"s{seed}", replace(taken.capture, features={}), taken.rig)

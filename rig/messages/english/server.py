@@ -215,5 +215,7 @@ TEMPLATES = {
     "means-cache-bytes": "the most that silhouettes and thumbnails take up",
     "means-upload-hours": "how long an unfinished resumable upload is kept",
     "refinement-camera-moved": "{camera} has moved in {captures} and took no part there: calibrate with the board again, for refinement is for fractions of a pixel",
+    "no-result-folder": "has no report.json that says what it was made of: name the folder that eigenhead reconstruct wrote",
+    "result-of-other-file": "was made of another {file} than this capture has",
     "captures-of-one-rig": "the captures must be of one rig, calibrated once",
 }

@@ -607,6 +607,8 @@ export default {
   "means-cache-bytes": "das Meiste, das Silhouetten und Vorschaubilder einnehmen",
   "means-upload-hours": "wie lange ein unfertiges Hochladen aufbewahrt wird",
   "refinement-camera-moved": "{camera} hat sich in {captures} bewegt und nahm dort nicht teil: mit der Tafel neu kalibrieren, denn die Verfeinerung ist für Bruchteile eines Pixels",
+  "no-result-folder": "hat keine report.json, die sagt, woraus das Ergebnis entstand: den Ordner angeben, den eigenhead reconstruct geschrieben hat",
+  "result-of-other-file": "entstand aus einer anderen {file} als der dieser Aufnahme",
   "captures-of-one-rig": "die Aufnahmen müssen von einem Rig sein, einmal kalibriert",
   "size-refused": "{size}: {remedy}",
   "outline-size": "{size}: Ist es nicht {unless}, dann {remedy}",
