@@ -163,7 +163,7 @@ def test_the_reports_schema_is_that_of_its_type() -> None:
 
 def block(name: str, page: str = "service.md") -> str:
     text = (DOCS / page).read_text(encoding="utf-8")
-    (code,) = re.findall(rf"```sh {name}\n(.*?)```", text, re.DOTALL)
+    (code,) = re.findall(rf"<!-- code: {name} -->\n```sh\n(.*?)```", text, re.DOTALL)
     return code
 
 

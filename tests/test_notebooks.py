@@ -35,7 +35,8 @@ def test_a_notebook_is_kept_without_outputs(path: Path) -> None:
 def test_the_first_head_is_made_plotted_and_true(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the commands of docs/python.md, in a shell that knows no `eigenhead`."""
     pytest.importorskip("nbclient", reason="deploy/setup.sh --docs installs it")
-    (code,) = re.findall(r"```sh notebook\n(.*?)```", (ROOT / "docs" / "python.md").read_text("utf-8"), re.DOTALL)
+    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"<!-- code: notebook -->\n```sh\n(.*?)```", text, re.DOTALL)
     for name, target in ((".venv", Path(sys.prefix)), ("docs", ROOT / "docs")):
         (tmp_path / name).symlink_to(target)
     monkeypatch.setenv("MPLCONFIGDIR", str(tmp_path / "matplotlib"))

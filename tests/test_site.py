@@ -57,3 +57,12 @@ def test_every_link_within_the_site_leads_to_a_file_and_a_place(site: Path) -> N
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
     for page in site.rglob("*.html"):
         assert [place for place in targets(LOADED, page) if re.match(r"(?:https?:)?//", place)] == [], page.name
+
+
+def test_every_heading_is_one(site: Path) -> None:
+    """A fence that the site's Markdown does not know swallows all up to the next one."""
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        shown = (site / page.relative_to(ROOT / "docs").with_suffix(".html")).read_text(encoding="utf-8")
+        wanted, found = len(re.findall(r"^##+ ", text, re.MULTILINE)), len(re.findall(r"<h[2-6]\b[^>]*\bid=", shown))
+        assert found == wanted, page.name

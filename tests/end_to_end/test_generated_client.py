@@ -43,7 +43,8 @@ pytestmark = pytest.mark.slow
 
 
 def block(language: str) -> str:
-    (code,) = re.findall(rf"```{language} client\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)
+    text = GUIDE.read_text(encoding="utf-8")
+    (code,) = re.findall(rf"<!-- code: client -->\n```{language}\n(.*?)```", text, re.DOTALL)
     return code
 
 

@@ -29,7 +29,7 @@ RAW = {
     "pipeline/research/people/people_subjects.py": 1,
     "pipeline/research/faults/real.py": 1,
     "pipeline/research/surface/relief.py": 2,
-    "pipeline/research/runner.py": 7,
+    "pipeline/research/runner.py": 8,
     "pipeline/research/speed/scaling.py": 2,
     "pipeline/research/paper/span.py": 1,
     "pipeline/research/surface/surfaces.py": 1,
