@@ -109,7 +109,7 @@ def roughness(
 ) -> Float[np.ndarray, " n"]:
     """Returns how far (px, RMS) an outline strays from a ``smooth`` curve along it, less what bends the curve off it:
     signed distances along it have no steps of pixels."""
-    column, row = smooth.astype(np.float32).T[:, None]
+    column, row = np.split(smooth.T.astype(np.float32), 2)
     off = cv2.remap(distance, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(float)
     return np.sqrt(np.maximum(_pooled(off**2, px_per_mm) - _pooled(off, px_per_mm) ** 2, 0.0))
 
