@@ -100,7 +100,7 @@ def bare_cells(
     middle = CELL_PX * (np.stack([column, row], axis=-1).reshape(-1, 2) + 0.5)
     away, nearest = KDTree(outline).query(middle, distance_upper_bound=REACH_MM * px_per_mm)
     near = np.isfinite(away)
-    cells.ravel()[near] = bare[nearest[near]]
+    cells.ravel()[near] = bare[np.asarray(nearest)[near]]
     return cells
 
 
