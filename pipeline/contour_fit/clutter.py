@@ -1,10 +1,11 @@
 """Hair, shoulders and clothes only ever add area to a silhouette: which stretches of a rim do not count for that."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from pipeline.contour_fit.problem import ContourProblem, StageEvidence
 from pipeline.contour_fit.rim import Rim
@@ -46,9 +47,32 @@ def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
     """Returns the rim with zero weight for the samples in cells marked as clutter."""
     if evidence.noise.clutter is None:
         return rim
-    cell = (rim.pixel / CELL_PX).astype(int)
-    length = rim.length.copy()
-    for k, cells in enumerate(evidence.noise.clutter):
+    return replace(rim, length=np.where(within(evidence.noise.clutter, rim), 0.0, rim.length))
+
+
+def with_bare_crown(
+    problem: ContourProblem, evidence: StageEvidence, rim: Rim, length: Float[np.ndarray, " s"], level: str
+) -> Rim:
+    """Returns the rim with its full ``length`` where the crown, all that lies above the brows, is by the outline of a
+    bare skull."""
+    if evidence.noise.bare is None:
+        return rim
+    bare = is_crown(problem, rim, level) & within(evidence.noise.bare, rim)
+    return replace(rim, length=np.where(bare, length, rim.length))
+
+
+def is_crown(problem: ContourProblem, rim: Rim, level: str) -> Bool[np.ndarray, " s"]:
+    """Tells which samples of a level's rim lie above the brows."""
+    mean = problem.model.vertices(np.zeros(0), level)
+    brows = problem.model.vertices(np.zeros(0))[problem.model.landmarks["glabella"], 1]
+    return (mean[:, 1] > brows)[rim.corner].all(axis=1)
+
+
+def within(cells: Sequence[Bool[np.ndarray, "_ _"]], rim: Rim) -> Bool[np.ndarray, " s"]:
+    """Tells which samples lie in marked cells of their view."""
+    row, column = (rim.pixel / CELL_PX).astype(int).T[::-1]
+    found = np.zeros(len(rim.view), bool)
+    for k, marked in enumerate(cells):
         here = np.flatnonzero(rim.view == k)
-        length[here[cells[cell[here, 1], cell[here, 0]]]] = 0.0
-    return replace(rim, length=length)
+        found[here] = marked[row[here], column[here]]
+    return found

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 
 from pipeline.contour_fit.clutter import CLUTTER_PX, CLUTTER_SIGMAS, find_clutter
-from pipeline.contour_fit.problem import FIRST_NOISE_PX, ContourProblem, RimNoise, Stage, StageEvidence, State
+from pipeline.contour_fit.problem import FIRST_NOISE_PX, ContourProblem, Stage, StageEvidence, State
 from pipeline.contour_fit.rim import Rim
 from pipeline.contour_fit.rim_term import observed_rim
 
@@ -33,7 +33,8 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
     if not settled and not stage.whole_head:  # a bare head has none
         clutter, settled = find_clutter(problem, rim, max(CLUTTER_PX, CLUTTER_SIGMAS * deviation)), True
     unit = estimated_unit(problem, rim, 2.0 * floor) or evidence.noise.unit
-    return StageEvidence(RimNoise(unit, floor, clutter, settled), evidence.photographs)
+    noise = replace(evidence.noise, unit=unit, floor_px=floor, clutter=clutter, is_settled=settled)
+    return StageEvidence(noise, evidence.photographs)
 
 
 def with_clutter_of_start(

@@ -127,12 +127,13 @@ class RimNoise:
     """Holds how much an outline is trusted. ``unit``: l sigma^2 (px^3), the divisor of squared residual (px^2) per px
     of outline; ``floor_px``: the least robust scale, three standard deviations of the model's misfit; ``clutter``: for
     each view the cells with hair or clothes, None before the search; ``is_settled``: whether ``clutter`` comes from a
-    fit rather than from the start."""
+    fit rather than from the start; ``bare``: for each view the cells by the outline of a bare skull, None unasked."""
 
     unit: float
     floor_px: float
     clutter: tuple[Bool[np.ndarray, "_ _"], ...] | None
     is_settled: bool = False
+    bare: tuple[Bool[np.ndarray, "_ _"], ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

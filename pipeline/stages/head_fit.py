@@ -5,6 +5,7 @@ Two stages, since what the pixels show is decided in between: ``fit_outlines``, 
 
 from dataclasses import dataclass
 
+from pipeline.contour_fit.bare_outline import with_bare_outline
 from pipeline.contour_fit.contour import ContourSolution, finish, solve_contour
 from pipeline.contour_fit.expression_evidence import with_expression_evidence
 from pipeline.contour_fit.fit import Fit
@@ -97,7 +98,7 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
         return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))
     detail = Detail("span" if settings.detail == "span" else "kernel", compose("level-asked"))
     if settings.detail in PHOTO_LEVELS:
-        hair = labels.hair_probability()
+        hair, solved = labels.hair_probability(), with_bare_outline(solved, labels.skin_probability())
         images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
         solved, detail = refine_with_photographs(solved, images, settings.photo, hair=hair)
     eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model

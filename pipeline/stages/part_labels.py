@@ -26,6 +26,10 @@ class PartLabels:
         """Returns, for each camera, the probability of hair at every pixel."""
         return {name: part.probability[..., Part.HAIR.channel] for name, part in self.maps.items()}
 
+    def skin_probability(self) -> dict[str, Float32[ndarray, "_ _"]]:
+        """Returns, for each camera, the probability of skin at every pixel."""
+        return {name: part.probability[..., Part.SKIN.channel] for name, part in self.maps.items()}
+
 
 @stage("parts")
 def label_parts(context: ReconstructionContext, views: Views, model: HeadModel, head_world: Mesh) -> Staged[PartLabels]:
