@@ -24,12 +24,13 @@ FIRST_S = {
     "depth": 40.0,
     "fine": 9.0,
     "texture": 1.4,
-    "bust": 24.0,
     "evidence": 0.8,
+    "bust": 6.0,
     "write": 3.0,
 }
 """Seconds of every stage, in their order: `eigenhead reconstruct scan-a --detail fine` on two cores that four
-other processes share. On idle ones all are three to four times shorter, which a job's own pace soon tells."""
+other processes share; of the bust what is waited for after the head. On idle ones all are three to four times
+shorter, which a job's own pace soon tells."""
 SIMPLEX_S = 200.0  # of the simplex's fit, at the same pace: a minute on idle cores
 LEARNING = 0.3  # weight of the newest job; the first one of its kind counts alone
 LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
