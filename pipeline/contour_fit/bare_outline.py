@@ -11,7 +11,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
 from pipeline.contour_fit.clutter import CELL_PX, is_crown, within
@@ -92,6 +91,8 @@ def bare_cells(
     if not outlines:
         return cells
     outline = max(outlines, key=len)[:, 0].astype(float)
+    from scipy.ndimage import gaussian_filter1d  # 0.05 s
+
     smooth = gaussian_filter1d(outline, SMOOTH_MM * px_per_mm, axis=0, mode="wrap")
     rough = roughness(distance, smooth, px_per_mm) / px_per_mm
     shown = _pooled(_inside(distance, skin, smooth, px_per_mm), px_per_mm)
@@ -115,6 +116,8 @@ def roughness(
 
 
 def _pooled(values: Float[np.ndarray, " n"], px_per_mm: float) -> Float[np.ndarray, " n"]:
+    from scipy.ndimage import gaussian_filter1d  # 0.05 s
+
     return gaussian_filter1d(values, STRETCH_MM * px_per_mm, mode="wrap")
 
 

@@ -96,7 +96,7 @@ def calibrate(
     ] = False,
     json_out: Json = False,
 ) -> None:
-    """Calibrate a rig from pictures of a board, or of a scene."""
+    """Calibrate a rig from pictures of a board or scene."""
     if source == "scene":
         for option, value in (("--board", board), ("--previous", previous), ("--anyway", anyway or None)):
             if value is not None:

@@ -30,7 +30,7 @@ def export(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Write a capture as a data set for programs that learn a scene.
+    """Write a capture as a data set for other programs.
 
     Undistorted pictures, masks and cameras in metres."""
     from typing import cast

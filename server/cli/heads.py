@@ -90,6 +90,22 @@ Trace = Annotated[
     ),
 ]
 
+Device = Annotated[
+    str | None,
+    chosen(
+        "What compares photographs: cpu, gl (OpenGL), or auto, the default: a GPU beside few cores.",
+        of_setting("device"),
+    ),
+]
+TemplateName = Annotated[
+    str | None,
+    typer.Option(
+        help="Write head-NAME.obj too, in the vertex order of this template.",
+        metavar="NAME",
+        autocompletion=completing(_templates),
+    ),
+]
+
 
 @app.command(epilog="Example: eigenhead reconstruct shots/anna.tar.gz --out heads/anna --method contour")
 def reconstruct(
@@ -123,21 +139,8 @@ def reconstruct(
     slicer: Annotated[
         bool, typer.Option("--slicer", help="Write landmarks.mrk.json too, a point list for 3D Slicer.")
     ] = False,
-    template: Annotated[
-        str | None,
-        typer.Option(
-            help="Write head-NAME.obj too, in the vertex order of this template.",
-            metavar="NAME",
-            autocompletion=completing(_templates),
-        ),
-    ] = None,
-    device: Annotated[
-        str | None,
-        chosen(
-            "What compares photographs: cpu, gl (OpenGL), or auto, the default: a GPU beside few cores.",
-            of_setting("device"),
-        ),
-    ] = None,
+    template: TemplateName = None,
+    device: Device = None,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     trace: Trace = None,
     data: Data = None,
