@@ -131,6 +131,11 @@ def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
         yield pool
 
 
+def background_thread(name: str) -> ThreadPoolExecutor:
+    """Returns a pool of one thread, for what runs beside the caller's own work whose loops share the threads."""
+    return ThreadPoolExecutor(1, thread_name_prefix=name)
+
+
 class TracedPool(ThreadPoolExecutor):
     """Records each task as a slice of one loop."""
 

@@ -3,12 +3,12 @@
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Concatenate, Generic, ParamSpec, TypeVar
 
-from pipeline.compute.threads import thread_count
+from pipeline.compute.threads import background_thread, thread_count
 from pipeline.compute.trace import span
 from pipeline.stages.context import ReconstructionContext
 from pipeline.warnings import ReportWarning
@@ -99,7 +99,7 @@ class Recorder:
             with span("foreground", stage.name):
                 yield pending
             return
-        with ThreadPoolExecutor(1, thread_name_prefix=stage.name) as pool:
+        with background_thread(stage.name) as pool:
             future: Future[Staged[T]] = pool.submit(_run_behind, stage, quiet, *products, **options)
             try:
                 with span("foreground", stage.name):
