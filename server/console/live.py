@@ -15,7 +15,8 @@ from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from server.console.live_frame import LiveFrame
 from server.console.studio_view import frames
-from server.services.rigs import RigBackend, jpeg, reduced
+from server.services.rigs.backend import RigBackend
+from server.services.rigs.previews import jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child
 from server.wire.problems import problem_from

@@ -22,7 +22,8 @@ from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs
 from server.services.records import Found
-from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
+from server.services.rigs.backend import SHOT_BYTES, RigBackend
+from server.services.rigs.simulated import SimulatedRig
 from server.services.tags import checked_tags, typed_tags
 from server.services.texts import check_texts
 from server.services.work import refuse_board

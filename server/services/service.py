@@ -13,7 +13,8 @@ from server.services.captures import Captures
 from server.services.jobs import Jobs, migrate
 from server.services.keys import Keys
 from server.services.records import Calibration, Job, RigState
-from server.services.rigs import RigBackend, open_rig
+from server.services.rigs.backend import RigBackend
+from server.services.rigs.opening import open_rig
 from server.services.sessions import Sessions
 from server.services.storage_use import StorageCount
 from server.services.threads import Threads

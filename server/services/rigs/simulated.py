@@ -1,0 +1,99 @@
+"""The simulated studio as the service's rig."""
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+from rig.acquisition.plates import PlatesVersion
+from rig.formats.cameras_json import read_rig, write_rig
+from rig.image import ImageRgb
+from rig.messages.message import compose
+from rig.rig import Rig
+from server.errors import Conflict, NotFound, Unavailable
+from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
+from server.services.rigs.backend import check_names, rig_state
+from server.services.rigs.previews import jpeg
+from server.tasks.child import Child, WorkFailed
+from server.tasks.simulate import SimulatedCertificate, look, simulated
+
+
+class SimulatedRig:
+    """Takes shots of the simulated studio, rendered in a child process with a GL context of its own. The truth of a
+    shot is kept beside it."""
+
+    def __init__(self, calibration: Path) -> None:
+        self._calibration = calibration
+        self._child = Child(niceness=3)
+        self._one_at_a_time = threading.Lock()
+
+    def describe(self) -> RigState:
+        rig = self._rig()
+        cameras = [RigCamera(name, "simulated", "ready") for name in rig.names]
+        calibrated = "own" if self._calibration.is_file() else "studio"
+        return rig_state("simulated", "simulated", cameras, [], calibrated)
+
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
+        """Takes a shot of a person even if ``board`` is set: the studio has no board to show."""
+        with self._one_at_a_time:
+            try:
+                shot = self._child.remote(simulated)(folder=str(folder), seed=seed)
+            except WorkFailed as error:
+                raise Unavailable("shot-failed", error.message, [error.message]) from error
+        if self._calibration.is_file():
+            write_rig(read_rig(self._calibration), folder / "files" / "cameras.json")
+        return shot
+
+    def look(self) -> Mapping[str, ImageRgb]:
+        with self._one_at_a_time:
+            return self._child.remote(look)(cameras=list(self._rig().names))
+
+    def preview(self, camera: str) -> bytes:
+        if camera not in self._rig():
+            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
+        with self._one_at_a_time:
+            return jpeg(self._child.remote(look)(cameras=[camera])[camera])
+
+    def camera_settings(self, camera: str) -> CameraSettings:
+        if camera not in self._rig():
+            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
+        return CameraSettings(None, None, None, ())
+
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+        self.camera_settings(camera)
+        raise _fixed_studio()
+
+    def lights(self) -> tuple[int, ...]:
+        return ()
+
+    def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
+        raise _fixed_studio()
+
+    def take_background(self) -> CleanPlates:
+        """Takes no pictures: the simulated studio takes clean plates with every shot. Returns its
+        cameras and a note."""
+        return CleanPlates(self._rig().names, 2, compose("hint-studio-plates"))
+
+    def plates(self) -> list[PlatesVersion]:
+        return []
+
+    def use_plates(self, version: str) -> None:
+        raise NotFound(compose("thing-plates-version"), version, compose("hint-studio-plates"))
+
+    def use(self, calibration: Path) -> None:
+        check_names(read_rig(calibration), self._rig().names)
+        self._calibration.parent.mkdir(exist_ok=True)
+        write_rig(read_rig(calibration), self._calibration)
+
+    def close(self) -> None:
+        self._child.close()
+
+    @staticmethod
+    def _rig() -> Rig:
+        from rig.studio.scene.layout import default_layout
+
+        return default_layout()
+
+
+def _fixed_studio() -> Conflict:
+    detail = compose("simulated-rig-fixed")
+    return Conflict("simulated-rig", detail)
