@@ -7,7 +7,6 @@ input, its state the workflow's status. Progress comes from the event log, files
 import json
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -22,6 +21,15 @@ from server.log import log_file
 from server.origins import target
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
+from server.services.job_states import (
+    APPLICATION,
+    APPLICATION_VERSION,
+    FINISHED,
+    STATES,
+    STATUSES,
+    WORKFLOW,
+    select_by_state,
+)
 from server.services.records import Found, Job, moment_of
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
@@ -33,22 +41,7 @@ from server.storage.library import Library
 from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
 from server.storage.store import Store, StoredFile, is_id, new_id, repeatable_id
 
-APPLICATION = "eigenhead"
-APPLICATION_VERSION = "eigenhead-jobs-1"  # pinned: a job outlives an upgrade; changes only with the steps themselves
-WORKFLOW = "reconstruct"
-DELIVERY = "deliver"
-STATES = {
-    "DELAYED": "queued",
-    "ENQUEUED": "queued",
-    "PENDING": "running",
-    "SUCCESS": "succeeded",
-    "ERROR": "failed",
-    "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "failed",
-    "CANCELLED": "cancelled",
-}
-STATUSES = {state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())}
 WORKER_START_S = 60.0  # a worker loads for 5 s on idle cores, for 40 s where all cores are busy
-FINISHED = ("succeeded", "failed", "cancelled")
 
 log = structlog.get_logger()
 
@@ -193,7 +186,7 @@ class Jobs:
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
         """Returns one page of the jobs that match a query; a word that names a state selects jobs in that state. Raises
         InputError for a cursor of another list."""
-        page = self.index.page(_by_state(query), limit, cursor)
+        page = self.index.page(select_by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[Job]:
@@ -375,17 +368,6 @@ def _options(job_id: str, queue: str, priority: int, attributes: dict[str, str |
         "priority": priority,
         "attributes": attributes,
     }
-
-
-def _by_state(query: JobQuery) -> JobQuery:
-    words = query.sought.split()
-    states = [word.casefold() for word in words if word.casefold() in STATUSES]
-    if not states:
-        return query
-    statuses = [status for state in states for status in STATUSES[state]]
-    both = statuses if query.statuses is None else [status for status in statuses if status in query.statuses]
-    rest = " ".join(word for word in words if word.casefold() not in STATUSES)
-    return replace(query, sought=rest, statuses=both)
 
 
 def _request(row: WorkflowStatus) -> JobRequest | None:
