@@ -1,7 +1,7 @@
-"""Jobs as everybody but the worker sees them: submit, look, cancel, restart, delete.
+"""Jobs as everybody but the worker uses them: submit, query, cancel, restart, delete.
 
-The job engine's workflow row is the one truth about a job: its id is the workflow's id, its request the workflow's
-input, its state the workflow's status. Progress comes from the event log, files from the store.
+The job engine's row of a workflow is the only record of a job: the workflow's id is the job's, its input the request,
+its status the state. Progress comes from the event log, files from the data folder.
 """
 
 import json
@@ -47,12 +47,12 @@ log = structlog.get_logger()
 
 
 def migrate(settings: ServiceSettings) -> None:
-    """Creates the tables of the job engine, which the engine's client does not."""
+    """Creates the job engine's own tables in the service's database, which the engine's client does not do."""
     DBOS.migrate(system_database_url=settings.url)
 
 
 class Jobs:
-    """Manages the jobs of one service. Every method blocks on the database: call it from a thread."""
+    """Manages the jobs of one service. Every method blocks on the database, so call them from a thread."""
 
     def __init__(self, settings: ServiceSettings, store: Store, engine: sa.Engine, library: Library) -> None:
         self._settings, self._store, self._engine, self._library = settings, store, engine, library
@@ -64,6 +64,7 @@ class Jobs:
         self._began = time.monotonic()
 
     def close(self) -> None:
+        """Closes the job engine's connections to the database."""
         self.client.destroy()
 
     def submit(
@@ -76,11 +77,12 @@ class Jobs:
         queue: str | None = None,
         priority: int = 100,
     ) -> Job:
-        """Queues a reconstruction of a capture and returns the job. With a known idempotency key it returns the job of
-        the first request.
+        """Queues a reconstruction of a capture and returns the job. A repeated request with the same idempotency key
+        returns the job of the first one.
 
-        Raises InputError for work that cannot be done, InvalidInput for a webhook that may not be called, NotFound,
-        DiskFull, TooMany, and Conflict where the key was used for another request.
+        Raises NotFound for an unknown capture; InputError for an unknown model, wrong settings or queue; InvalidInput
+        for a webhook that may not be called; Conflict for a capture of the calibration board and for an idempotency key
+        that was used for another request; DiskFull; TooMany if the API key has too many jobs.
         """
         wanted.check()
         capture = self._store.capture(capture_id)
@@ -100,12 +102,13 @@ class Jobs:
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
     def check_queue(self, queue: str | None) -> None:
-        """Raises InputError for a queue that jobs may not name; None stands for the service's own."""
+        """Raises InputError for a queue that jobs may not name. None stands for the service's own queue."""
         if queue is not None and queue not in self._settings.queues:
             raise InputError("queue", [compose("queue-unknown", queue=f"{queue!r:.40}", queues=self._settings.queues)])
 
     def submit_session(self, session: str, wanted: ReconstructionRequest, *, key: str, priority: int) -> list[Job]:
-        """Queues a reconstruction of every capture of a session. Raises what ``submit`` raises."""
+        """Queues a reconstruction of every capture of a session that shows a head, and returns the jobs. Raises what
+        ``submit`` raises; jobs queued before the error stay queued."""
         wanted.check()  # a session without captures asks no job to
         self._store.session(session)
         return [self.submit(capture, wanted, key=key, priority=priority) for capture in self._library.heads_of(session)]
@@ -136,8 +139,8 @@ class Jobs:
     def enqueue_within(
         self, connection: sa.Connection, request: JobRequest, session: str | None, batch: BatchRow
     ) -> str:
-        """Queues a job of a batch in the caller's transaction and returns its id. It does not count among the jobs of
-        the batch's API key."""
+        """Queues a job of a batch in the caller's transaction and returns its id. If the transaction fails, there is no
+        job. It does not count towards the limit of jobs of an API key."""
         job_id = new_id()
         self.index.add_within(connection, job_id, request, session)
         attributes = {"capture": request["capture_id"], "session": session, "batch": batch.id}
@@ -162,6 +165,7 @@ class Jobs:
         return (_request(self._known(job_id)) or {}).get("webhook")
 
     def state(self, job_id: str) -> str:
+        """Returns the state of a job: "queued", "running", "succeeded", "failed" or "cancelled". Raises NotFound."""
         return STATES[self._known(job_id, load=False).status]
 
     def find(
@@ -173,7 +177,8 @@ class Jobs:
         limit: int = 100,
         offset: int = 0,
     ) -> list[Job]:
-        """Returns jobs, newest first, of one state, capture or session where these are given."""
+        """Returns jobs, newest first, ``limit`` at most after skipping ``offset``. They can be restricted to one state,
+        capture or session."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
             return []
@@ -184,8 +189,8 @@ class Jobs:
         return self._jobs(rows)
 
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
-        """Returns one page of the jobs that match a query; a word that names a state selects jobs in that state. Raises
-        InputError for a cursor of another list."""
+        """Returns one page of the jobs that match a query, ``limit`` at most. A word of the search that names a state
+        ("failed") selects jobs in that state. Raises InputError for a cursor of another list."""
         page = self.index.page(select_by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
@@ -209,7 +214,7 @@ class Jobs:
         return {capture: [(job.id, STATES[job.status]) for job in jobs] for capture, jobs in found.items()}
 
     def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
-        """Lists the ids of queued and running jobs, of one capture, session or API key where these are given."""
+        """Lists the ids of queued and running jobs. They can be restricted to one capture, session or API key."""
         wanted = {k: v for k, v in {"capture": capture, "session": session, "key": key}.items() if v is not None}
         rows = self.client.list_workflows(
             name=WORKFLOW, status=STATUSES["queued"] + STATUSES["running"], load_input=False, load_output=False
@@ -218,7 +223,7 @@ class Jobs:
 
     def cancel(self, job_id: str) -> tuple[Job, bool]:
         """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether this call
-        cancelled it. Raises NotFound."""
+        cancelled it. A worker notices within about a second. Raises NotFound."""
         before = self.state(job_id)
         if before not in FINISHED:
             self.client.cancel_workflow(job_id)
@@ -227,8 +232,8 @@ class Jobs:
         return job, before not in FINISHED and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
-        """Returns size and SHA-256 of the files of a job's result, by name. Raises NotFound, and Conflict for a job
-        without result."""
+        """Returns size and SHA-256 of the files of a job's result, by name. Raises NotFound, and Conflict if the job
+        has not succeeded or its files are gone."""
         job = self.get(job_id)
         if job.state != "succeeded":
             raise Conflict("no-result", compose("job-without-result", state=job.state))
@@ -237,7 +242,8 @@ class Jobs:
         return job.files
 
     def log(self, job_id: str) -> str:
-        """Returns the log that the workers wrote for a job. Raises NotFound."""
+        """Returns the log that workers wrote of a job. Raises NotFound for an unknown job and for one that has not
+        begun."""
         self.state(job_id)
         try:
             return log_file(self._store.data / "jobs", job_id).read_text(encoding="utf-8", errors="replace")
@@ -254,15 +260,17 @@ class Jobs:
         return self._store.folder("jobs", job_id) / "result"
 
     def result_file(self, job_id: str, name: str) -> StoredFile:
-        """Returns a file of a job's result, looked up in the job's record. Raises NotFound and Conflict."""
+        """Returns a file of a job's result. The name is looked up in the job's record. Raises NotFound for an unknown
+        job or file, and Conflict if the job has no result."""
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
         return StoredFile(self._result(job_id) / name, file["sha256"])
 
     def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> Job:
-        """Submits a new job for the capture of an earlier job, which it names. Where ``wanted`` has None, the earlier
-        job's value is used. Raises InputError, NotFound and TooMany."""
+        """Queues a new job for the capture of an earlier job, and notes the earlier job's id in it. Model and settings
+        that are None in ``wanted`` are the earlier job's. Raises InputError for wrong ones, NotFound if the job or its
+        capture is gone, and TooMany."""
         wanted.check()
         row = self._known(job_id)
         request = _request(row)
@@ -277,7 +285,8 @@ class Jobs:
         return self._enqueue(request, (row.attributes or {}).get("session"), key, row.queue_name, row.priority or 0)
 
     def delete(self, job_id: str) -> None:
-        """Removes a finished job and its files. The files go first, which needs no room in the database."""
+        """Removes a finished job and its files. The files go first: that needs no room in the database, and the call
+        can be repeated. Raises NotFound, and Conflict for a queued or running job."""
         if self.state(job_id) not in FINISHED:
             raise Conflict("job-active", compose("job-active"))
         self._store.remove(self._store.folder("jobs", job_id))
@@ -307,7 +316,8 @@ class Jobs:
         return self.queue_notice(queue) if state == "queued" else None
 
     def queue_notice(self, queue: str | None) -> Message | None:
-        """Returns what keeps the jobs of a queue from beginning: that no worker serves it. Else None."""
+        """Returns a message if no live worker serves a queue, so that its jobs cannot begin. Returns None if one
+        does."""
         with self._engine.connect() as connection:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
@@ -317,7 +327,8 @@ class Jobs:
         return compose("no-worker", queue=f"{queue!r}", queue_name=str(queue))
 
     def worker_may_start(self) -> bool:
-        """Tells whether the service started so recently that its worker may still be loading."""
+        """Returns whether the service started less than ``WORKER_START_S`` seconds ago, so that its worker may still be
+        loading."""
         return time.monotonic() - self._began < WORKER_START_S
 
     def _status(self, job_id: str, load: bool = True) -> WorkflowStatus | None:

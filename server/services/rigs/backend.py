@@ -17,62 +17,76 @@ SHOT_BYTES = 64 << 20  # that a shot may take on the disk
 
 
 class RigBackend(Protocol):
-    """Declares what the service needs of a rig. Methods block: call them from a thread."""
+    """Declares what the service needs of a rig, simulated or real. Methods block, so call them from a thread."""
 
-    def describe(self) -> RigState: ...
+    def describe(self) -> RigState:
+        """Returns the state of the rig without opening its cameras."""
+        ...
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument | SimulatedCertificate:
-        """Takes a shot into ``folder/files`` and returns its certificate. Raises Unavailable naming what is missing.
+        """Takes a shot, writes the capture to ``folder/files`` and returns the shot's certificate.
 
         ``board``: the shot shows the calibration board, for which neither a calibration nor every camera is needed.
+        ``seed`` chooses the subject of the simulated studio. Raises Unavailable naming what is missing, and InputError
+        for a seed of a real rig.
         """
         ...
 
     def look(self) -> Mapping[str, ImageRgb]:
-        """Returns what each camera sees now; cameras that show nothing are left out. Raises Unavailable."""
+        """Returns a current picture of each camera, by name. Cameras that deliver none are left out. Raises
+        Unavailable."""
         ...
 
     def preview(self, camera: str) -> bytes:
-        """Returns a JPEG file of what a camera sees now. Raises NotFound and Unavailable."""
+        """Returns a current picture of one camera as a JPEG file, at most ``PREVIEW_WIDTH`` pixels wide. Raises
+        NotFound for an unknown camera, and Unavailable."""
         ...
 
     def camera_settings(self, camera: str) -> CameraSettings:
-        """Returns the exposure, gain and white balance that were requested of a camera. Raises NotFound."""
+        """Returns the exposure, gain and white balance requested of a camera. Raises NotFound for an unknown camera."""
         ...
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
-        """Changes settings of a camera from now on; an open rig is opened anew. Raises NotFound, InputError and
-        Conflict."""
+        """Changes settings of a camera and keeps them across restarts; an open rig is closed and opened again. Raises
+        NotFound for an unknown camera, InputError for wrong values, and Conflict for the simulated studio."""
         ...
 
     def lights(self) -> tuple[int, ...]:
-        """Returns the light outputs that are on during a shot."""
+        """Returns the numbers of the light outputs that are on during a shot."""
         ...
 
     def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
-        """Changes which light outputs are on during a shot, from now on. Raises InputError and Conflict."""
+        """Chooses which light outputs are on during a shot, keeps that across restarts, and returns them. Raises
+        InputError for wrong outputs, and Conflict for the simulated studio."""
         ...
 
     def take_background(self) -> CleanPlates:
-        """Takes new clean plates of the empty studio. Raises Unavailable, and Conflict where they show somebody."""
+        """Takes new clean plates of the empty studio and puts them to use. Raises Unavailable if cameras fail, and
+        Conflict if the pictures show a person."""
         ...
 
     def plates(self) -> list[PlatesVersion]:
-        """Returns the clean plates in use and those kept, newest first."""
+        """Returns the versions of clean plates, the one in use and earlier ones, newest first."""
         ...
 
     def use_plates(self, version: str) -> None:
-        """Puts clean plates that were kept to use again. Raises NotFound."""
+        """Puts an earlier version of the clean plates to use again. Raises NotFound for an unknown version, and
+        Unavailable."""
         ...
 
     def use(self, calibration: Path) -> None:
-        """Uses the calibration in a cameras.json file from now on. Raises Conflict if it is of another rig."""
+        """Uses the calibration in a cameras.json file from now on; the file is copied. Raises Conflict if its cameras
+        are not those of the rig."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Closes the cameras, or the child process that simulates them."""
+        ...
 
 
 def check_names(rig: Rig, names: tuple[str, ...]) -> None:
+    """Raises Conflict, naming the cameras that only one of both has, unless a calibration is of the cameras
+    ``names``."""
     if set(rig.names) != set(names):
         differing = sorted(set(rig.names) ^ set(names))
         detail = compose("calibration-of-other-rig")
@@ -82,5 +96,6 @@ def check_names(rig: Rig, names: tuple[str, ...]) -> None:
 def rig_state(
     identity: str, kind: str, cameras: list[RigCamera], faults: list[Message], calibration: str | None
 ) -> RigState:
+    """Returns the state of a rig, which is ready if it has no fault and no camera is missing."""
     ready = not faults and all(camera.state != "missing" for camera in cameras)
     return RigState(identity, kind, ready, tuple(cameras), tuple(faults), calibration)

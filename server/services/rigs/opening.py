@@ -1,4 +1,4 @@
-"""Which rig the service's settings name."""
+"""Opens the rig that the service's settings name."""
 
 from server.services.rigs.backend import RigBackend
 from server.services.rigs.real import RealRig
@@ -7,7 +7,7 @@ from server.settings import ServiceSettings
 
 
 def open_rig(settings: ServiceSettings) -> RigBackend:
-    """Returns the rig of the settings: simulated, or described by a rig.toml. Raises InputError naming every fault of
-    rig.toml."""
+    """Returns the simulated studio, or the real rig if the settings name a rig.toml. No camera is opened yet. Raises
+    InputError naming every fault of rig.toml."""
     calibration = settings.data / "rig" / "cameras.json"
     return SimulatedRig(calibration) if settings.rig is None else RealRig(settings.rig, calibration)

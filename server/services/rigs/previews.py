@@ -1,4 +1,4 @@
-"""Pictures of the rig for people: small, and quick to send."""
+"""Makes small pictures of what the rig's cameras see, for the operator's pages."""
 
 import cv2
 import numpy as np
@@ -10,7 +10,7 @@ PREVIEW_QUALITY = 80  # of JPEG, 0 to 100
 
 
 def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
-    """Encodes RGB pixels as a JPEG file, reduced to a width of at most ``width`` pixels."""
+    """Encodes an RGB image as a JPEG file. An image wider than ``width`` pixels is reduced to that width."""
     small = reduced(image, width)
     done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
     assert done
@@ -18,7 +18,7 @@ def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
 
 
 def reduced(image: ImageRgb, width: int) -> ImageRgb:
-    """Returns the image, reduced to a width of ``width`` pixels where it is wider."""
+    """Returns an image no wider than ``width`` pixels; its proportions stay. A smaller image is returned as it is."""
     if image.shape[1] <= width:
         return image
     size = (width, max(1, round(image.shape[0] * width / image.shape[1])))

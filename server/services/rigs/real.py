@@ -30,8 +30,11 @@ from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
 
 
 class RealRig:
-    """Takes shots with the cameras of a rig.toml. The rig is opened when first needed and stays open; where that fails,
-    it is tried again."""
+    """Takes shots with the cameras of a rig.toml, one at a time.
+
+    The cameras are opened at the first use and stay open. If opening fails, the next use tries again. Settings that the
+    operator changed lie beside the calibration in adjusted.json and hold after a restart.
+    """
 
     def __init__(self, path: Path, calibration: Path) -> None:
         self._from_file: RigConfig = read_rig_config(path)
@@ -42,6 +45,8 @@ class RealRig:
         self._lock = threading.RLock()
 
     def describe(self) -> RigState:
+        """Returns the state of the rig. Cameras that were not used yet are "closed", which is no fault; a missing
+        calibration is one."""
         with self._lock:
             states = {} if self._session is None else self._session.states()
             error = None if self._session is None else self._session.trigger_error()
@@ -58,6 +63,12 @@ class RealRig:
         return rig_state(self._config.name, "real", cameras, faults, None if rig is None else "own")
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument:
+        """Takes a shot and writes the capture, with hard links to the clean plates. Nothing is written if a camera
+        failed.
+
+        Raises InputError for a seed, and Unavailable if the rig has no calibration (unless ``board`` is set), cannot be
+        opened, or a camera fails.
+        """
         if seed is not None:
             raise InputError("request", [compose("seed-of-real-rig")])
         if board:
@@ -89,10 +100,13 @@ class RealRig:
         return shot.document()
 
     def look(self) -> Mapping[str, ImageRgb]:
+        """Takes one picture with each camera, without trigger. Raises Unavailable if the rig cannot be opened."""
         with self._lock:
             return self._opened().look()
 
     def preview(self, camera: str) -> bytes:
+        """Takes one picture with one camera and returns it as a JPEG file. Raises NotFound for an unknown camera, and
+        Unavailable if it delivers none."""
         if camera not in self._config.names:
             raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
         with self._lock:
@@ -102,6 +116,8 @@ class RealRig:
         return jpeg(image)
 
     def camera_settings(self, camera: str) -> CameraSettings:
+        """Returns the settings requested of a camera, by rig.toml or by the operator, and those that the driver did not
+        take. Raises NotFound for an unknown camera."""
         wanted = next((found for found in self._config.cameras if found.name == camera), None)
         if wanted is None:
             raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
@@ -111,6 +127,8 @@ class RealRig:
         return CameraSettings(wanted.exposure_ms, wanted.gain_db, wanted.white_balance_k, unmet)
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+        """Changes settings of a camera and stores them in adjusted.json. An open rig is closed and opened again, since
+        drivers take settings when they open. Raises NotFound and InputError."""
         self.camera_settings(camera)
         with self._lock:
             before = self._adjustment()
@@ -119,9 +137,12 @@ class RealRig:
             return self.camera_settings(camera)
 
     def lights(self) -> tuple[int, ...]:
+        """Returns the numbers of the trigger box's light outputs that are on during a shot."""
         return self._config.lights.outputs
 
     def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
+        """Chooses the light outputs that are on during a shot and stores the choice in adjusted.json. Raises InputError
+        for wrong outputs."""
         with self._lock:
             self._adjust(replace(self._adjustment(), lights=outputs))
             return self.lights()
@@ -144,6 +165,8 @@ class RealRig:
                 self._opened()
 
     def take_background(self) -> CleanPlates:
+        """Takes clean plates with all cameras and puts them to use. Raises Unavailable if cameras fail. Raises Conflict
+        if the plates show a person; they are kept as a version that ``use_plates`` can put to use all the same."""
         with self._lock:
             try:
                 plates = self._opened().take_plates()
@@ -157,15 +180,20 @@ class RealRig:
         return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, None)
 
     def plates(self) -> list[PlatesVersion]:
+        """Returns the versions of clean plates on the disk, newest first."""
         return plates_versions(self._config.plates_folder)
 
     def use_plates(self, version: str) -> None:
+        """Puts a version of the clean plates to use. Raises NotFound for an unknown version, and Unavailable if the rig
+        cannot be opened."""
         with self._lock:
             if all(kept.id != version for kept in self.plates()):
                 raise NotFound(compose("thing-plates-version"), version, compose("hint-plates"))
             self._opened().use_plates(version)
 
     def use(self, calibration: Path) -> None:
+        """Copies a calibration to the data folder and uses it for every later shot. Raises Conflict if its cameras are
+        not those of rig.toml."""
         rig = read_rig(calibration)
         check_names(rig, self._config.names)
         self._calibration.parent.mkdir(exist_ok=True)
@@ -175,6 +203,7 @@ class RealRig:
                 self._session.rig = rig
 
     def close(self) -> None:
+        """Closes the cameras. The next use opens them again."""
         with self._lock:
             if self._session is not None:
                 self._session.close()
