@@ -1,11 +1,54 @@
-"""Defines the JSON documents about the rig's pictures: their checks, what a capture holds, and clean plates."""
+"""Defines the JSON documents about the rig, its cameras and clean plates, and about what a capture's pictures show."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from server.http.message_schemas import MessageOut, Texts
 from server.http.schemas import Answer, Moment, Received
+
+
+class CameraOut(Answer):
+    name: str
+    driver: str
+    state: Literal["ready", "open", "closed", "missing"]
+
+
+class RigOut(Answer):
+    id: str
+    kind: Literal["simulated", "real"]
+    ready: bool
+    cameras: list[CameraOut]
+    faults: Texts
+    fault_messages: list[MessageOut] = Field(validation_alias="faults")
+    calibration: str | None
+
+
+class CameraSettingsEdit(Received):
+    """Changes a camera's settings. Keys that are left out keep their values; null stops setting the value, so that the
+    camera keeps the one that it has."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"exposure_ms": 8.0, "gain_db": 0.0}]})
+
+    exposure_ms: float | None = Field(None, ge=0.001, le=60_000)
+    gain_db: float | None = Field(None, ge=-60, le=60)
+    white_balance_k: int | None = Field(None, ge=1000, le=20_000)
+
+
+class CameraSettingsOut(Answer):
+    exposure_ms: float | None
+    gain_db: float | None
+    white_balance_k: int | None
+    unmet: Texts = Field(description="what the camera did not take, and why")
+    unmet_messages: list[MessageOut] = Field(validation_alias="unmet")
+
+
+class Lights(Received):
+    model_config = ConfigDict(json_schema_extra={"examples": [{"outputs": [0, 1]}]})
+
+    outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
+        max_length=4, description="light outputs of the trigger box that are on during a shot"
+    )
 
 
 class SubjectOut(Answer):

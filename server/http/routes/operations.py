@@ -9,7 +9,7 @@ from fastapi.responses import FileResponse
 
 from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
-from server.http.schemas import (
+from server.http.operation_schemas import (
     CheckOut,
     Health,
     InfoOut,

@@ -12,12 +12,15 @@ from fastapi.responses import StreamingResponse
 from server.errors import Unavailable
 from server.http.auth import ServiceOf, require
 from server.http.calibration_schemas import UseCalibration
-from server.http.rig_schemas import BackgroundOut, PlatesList, PlatesOut, UsePlates
-from server.http.schemas import (
+from server.http.rig_schemas import (
+    BackgroundOut,
     CameraSettingsEdit,
     CameraSettingsOut,
     Lights,
+    PlatesList,
+    PlatesOut,
     RigOut,
+    UsePlates,
 )
 from server.services.keys import Caller
 from server.services.service import Service
