@@ -1,4 +1,4 @@
-"""Defines the JSON documents of requests and answers."""
+"""Defines what the JSON documents of HTTP have in common, and those of captures, sessions, jobs and results."""
 
 import base64
 import binascii
@@ -26,18 +26,20 @@ EXAMPLE_ID = "0198c0de" + 20 * "0"
 
 
 class Received(BaseModel):
-    """Is the base of request bodies. Unknown keys are refused."""
+    """Refuses unknown keys; the base of all request bodies."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 class Answer(BaseModel):
-    """Is the base of response bodies, built from a record of the service with the same fields."""
+    """Takes its fields from a record of the service; the base of all response bodies."""
 
     model_config = ConfigDict(from_attributes=True)
 
 
 class NewSession(Received):
+    """Begins a session of one subject."""
+
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"label": "Anna", "consent": "signed 2026-03-01, for research"}]}
     )
@@ -47,6 +49,8 @@ class NewSession(Received):
 
 
 class NewCapture(Received):
+    """Requests a shot with the rig."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna", "expression": "neutral"}]})
 
     session: Id | None = None
@@ -58,6 +62,8 @@ class NewCapture(Received):
 
 
 class NewImport(Received):
+    """Requests a capture from an archive on another server."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://store.example/anna.tar.gz"}]})
 
     url: str = Field(max_length=2000, description="of an archive of a capture, at a server that the operator allowed")
@@ -89,6 +95,8 @@ class CaptureEdit(Received):
 
 
 class NewFeatures(Received):
+    """Holds feature points: for each point the pixel in each camera that shows it."""
+
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"points": {"pronasale": {"cam00": [511.2, 402.7], "cam03": [433.0, 398.1]}}}]}
     )
@@ -110,11 +118,15 @@ Secret = Annotated[str, Field(pattern="^whsec_[A-Za-z0-9+/]{32,}={0,2}$"), After
 
 
 class JobWebhook(Received):
+    """Names an address to which the end of one job is announced."""
+
     url: str = Field(pattern="^https?://", max_length=2000, description="at a server that the operator allowed")
     secret: Secret | None = Field(None, description="signs the messages (standardwebhooks.com)")
 
 
 class NewJob(Received):
+    """Requests a reconstruction of a capture."""
+
     model_config = ConfigDict(
         json_schema_extra={
             "examples": [
@@ -137,6 +149,8 @@ class NewJob(Received):
 
 
 class NewSessionJobs(Received):
+    """Requests a reconstruction of every capture of a session that shows a head."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"detail": "fine"}}]})
 
     model: str | None = Field(None, max_length=200)
@@ -145,7 +159,7 @@ class NewSessionJobs(Received):
 
 
 class Restart(Received):
-    """Repeats a job. Keys that are left out are taken from the old job."""
+    """Repeats a job. Keys that are left out have the values of the old job."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"method": "simplex"}}]})
 
@@ -154,6 +168,8 @@ class Restart(Received):
 
 
 class Size(Answer):
+    """Describes a camera by its name and the size of its pictures in pixels."""
+
     name: str
     width: int
     height: int
@@ -170,6 +186,8 @@ class FaultOut(Answer):
 
 
 class CaptureOut(Answer):
+    """Describes a capture: its pictures, what people wrote about it, and the verdict on it."""
+
     id: str
     created: Moment
     source: Literal["upload", "rig"]
@@ -194,6 +212,8 @@ class CaptureOut(Answer):
 
 
 class SessionOut(Answer):
+    """Describes a session with the ids of its captures, newest first."""
+
     id: str
     created: Moment
     label: str
@@ -202,6 +222,8 @@ class SessionOut(Answer):
 
 
 class JobError(Answer):
+    """Describes why a job failed. ``type`` and ``detail`` are as in a problem document."""
+
     type: str
     detail: TextOf
     errors: Texts
@@ -210,22 +232,31 @@ class JobError(Answer):
 
 
 class FileOut(Answer):
+    """Describes a file by its size in bytes and its SHA-256."""
+
     bytes: int
     sha256: str
 
 
 class ResultFile(FileOut):
+    """Describes a file of a result and where to fetch it."""
+
     name: str = Field(description="below the result folder, such as overlays/cam00.png")
     url: str
     media_type: str
 
 
 class ResultList(Answer):
+    """Holds the files of a job's result."""
+
     job_id: str
     files: list[ResultFile]
 
 
 class JobOut(Answer):
+    """Describes a job: its request, state and progress and, once it has succeeded, the files of its result. ``eta_s``
+    is the estimated remaining time in seconds."""
+
     id: str
     name: str
     state: State

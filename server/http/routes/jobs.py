@@ -96,7 +96,7 @@ def get_job(service: ServiceOf, caller: Reader, job_id: str) -> JobOut:
 
 
 def known_job(service: ServiceOf, caller: Reader, job_id: str) -> str:
-    """Returns the job's id, or raises NotFound before a stream begins, since the status is sent before its first
+    """Returns the id of a job. Raises NotFound before a stream begins, since the status is sent before a stream's first
     byte."""
     service.jobs.state(job_id)
     return job_id
@@ -127,7 +127,7 @@ async def job_events(
 
 @router.post("/jobs/{job_id}/cancel", responses=documented(404))
 def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
-    """Cancels a job within a second, in any stage. A finished job does not change."""
+    """Cancels a job, in any stage; its worker stops within a second. A finished job does not change."""
     return JobOut.model_validate(service.cancel(job_id))
 
 

@@ -36,7 +36,7 @@ UNKEPT = {"Cache-Control": "no-store"}
 
 @router.get("", responses=documented())
 def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
-    """Returns cameras, drivers and faults of the rig, and its calibration."""
+    """Returns the cameras, drivers and faults of the rig, and whether it is calibrated."""
     return RigOut.model_validate(service.rig.describe())
 
 
@@ -107,10 +107,11 @@ def set_lights(service: ServiceOf, caller: Taker, wanted: Lights) -> Lights:
 
 @router.post("/background", responses=documented(409, 507))
 def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
-    """Takes new clean plates of the empty studio.
+    """Takes new clean plates of the empty studio and uses them for later captures.
 
-    The old ones stay in use if that fails (503), or if the new ones show somebody whom the old ones do not (409). In
-    the latter case the new ones are kept, and PUT can put them to use nevertheless."""
+    If that fails (503), or if the new plates show a person whom the old ones do not (409), the old ones stay in use.
+    After a 409 the new plates are kept, and ``PUT`` can put them to use nevertheless.
+    """
     service.store.reserve(0, service.settings.free_bytes)
     return BackgroundOut.model_validate(service.rig.take_background())
 
@@ -130,6 +131,6 @@ def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesLi
 
 @router.put("/calibration", responses=documented(400, 404, 409, 413, 415, 507))
 def use_calibration(service: ServiceOf, caller: Taker, wanted: UseCalibration) -> RigOut:
-    """Selects the calibration of every later capture. 409 for one whose verdict is poor, with the reasons, unless
-    ``poor`` is set."""
+    """Selects the calibration of every later capture. Answers 409, with the reasons, for a calibration whose verdict is
+    poor, unless ``poor`` is set."""
     return RigOut.model_validate(service.use_calibration(wanted.calibration_id, poor=wanted.poor))

@@ -45,7 +45,8 @@ def list_subjects(
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> SubjectList:
-    """Lists people, each with the newest head. Sessions with the same name are one person's."""
+    """Lists people in pages, each with the newest head. Sessions with the same name are one person's. ``q`` searches
+    label and consent."""
     found = service.sessions.subjects(q, sort, limit, cursor, tag=tag)
     subjects = [PersonOut.model_validate(subject) for subject in found.items]
     return SubjectList(subjects=subjects, next=found.next, total=found.total)
@@ -66,6 +67,6 @@ def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: Ses
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))
 def erase_session(service: ServiceOf, caller: Taker, session_id: str) -> None:
-    """Erases a subject: cancels the jobs, then removes images, results, caches and the subject's data in the job
+    """Erases a session for good: cancels its jobs, then removes images, results, caches and its data in the job
     database."""
     service.sessions.erase(session_id)
