@@ -39,8 +39,8 @@ def batch_rows(batches: Batches, store: Store, batch: Batch, columns: Sequence[C
 
 
 def batch_sheet(batches: Batches, store: Store, batch: Batch) -> Iterator[str]:
-    """Returns the lines of a batch's contact sheet, an HTML page with one card for each capture. Its links and pictures
-    lead to the console's pages."""
+    """Yields the lines of a batch's contact sheet, a self-contained HTML page with one card for each capture. A card
+    links to the console's page of the result."""
     columns = batch_columns(batch)
     cards = [sheet_card(outcome, table_row(outcome, columns)) for outcome in _outcomes(batches, store, batch)]
     return sheet_lines(batch.label or batch.id, cards)
