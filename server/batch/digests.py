@@ -1,4 +1,4 @@
-"""Computes the sha256 of what a result depends on: a capture's files, settings, and the model."""
+"""Computes the SHA-256 of a capture, so that a later run can tell whether its result is up to date."""
 
 import hashlib
 import os

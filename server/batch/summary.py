@@ -1,4 +1,4 @@
-"""Writes table and contact sheet of all results in a batch's folder, whichever process made them."""
+"""Writes the table and the contact sheet of all results in a batch's folder, whichever process made them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ SHEET = "sheet.html"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Holds what became of a capture: its ``report`` and ``origin`` where it is done, its ``failure`` where it failed,
-    neither where it is not made yet. ``result``: folder of the result; ``link``: address of it on the sheet."""
+    """Holds what became of a capture: ``report`` and ``origin`` if it is done, ``failure`` if it failed, neither if it
+    is not made yet. ``link``: address of its result on the sheet."""
 
     capture: BatchCapture
     result: Path
@@ -33,10 +33,8 @@ class Outcome:
 
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
-    """Writes the table and the sheet of all captures of a batch, other shards' included. Returns the files.
-
-    Raises OSError.
-    """
+    """Writes the table and the sheet of all captures of a batch, including those of other shares, and returns the
+    files. Each file is replaced atomically. Raises OSError."""
     folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(expressions_of(task.model for task in tasks))
     outcomes = [_outcome(folder, task) for task in tasks]
