@@ -1,0 +1,150 @@
+"""What pages show of captures and sessions: the lines of their lists."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from typing import TypedDict, cast
+
+from rig.acquisition.shot import CameraSyncDocument, FaultDocument, SyncDocument
+from rig.messages.message import MessageDocument, compose, documents_of
+from server.console.page import shared
+from server.console.removal import removals
+from server.errors import NotFound
+from server.services.records import Session
+from server.services.service import Service
+from server.storage.records import CaptureRecord
+from server.tasks.simulate import SimulatedCertificate, SimulatedSync
+
+SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
+
+
+class JobOfCapture(TypedDict):
+    """Holds a job of a capture. ``progress`` (0 to 1) is None unless the job runs."""
+
+    id: str
+    state: str
+    progress: float | None
+
+
+class SyncLine(TypedDict):
+    """Holds a sentence on how far the pictures of a shot are of one moment."""
+
+    message: MessageDocument
+    good: bool
+
+
+class CaptureLine(TypedDict):
+    """Holds a capture as the list shows it. ``size``: of the first camera's pictures (px); ``jobs``: all its jobs,
+    newest first."""
+
+    id: str
+    created: str
+    source: str
+    label: str
+    expression: str
+    front: str
+    features: bool
+    cameras: list[str]
+    bytes: int
+    session: str | None
+    jobs: list[JobOfCapture]
+    board: bool
+    size: dict[str, str | int]
+    sizes: dict[str, tuple[int, int]]
+    verdict: str | None
+    faults: list[FaultDocument]
+    warnings: list[MessageDocument]
+    sync: SyncLine | None
+    tags: list[str]
+
+
+class SessionLine(TypedDict):
+    """Holds a session as the list shows it. ``captures``: their number."""
+
+    id: str
+    created: str
+    label: str
+    consent: str
+    captures: int
+
+
+def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCapture]]:
+    """Returns the jobs of each capture, newest first, with the progress of those that run."""
+    found = service.jobs.of_captures(captures)
+    running = [job for jobs in found.values() for job, state in jobs if state == "running"]
+    progress = {job.id: job.progress for job in service.jobs.of(running)}
+    return {
+        capture: [
+            {"id": job, "state": state, "progress": progress.get(job)} for job, state in jobs if job not in removals
+        ]
+        for capture, jobs in found.items()
+    }
+
+
+def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine:
+    return {
+        "id": record.id,
+        "created": record.created,
+        "source": record.source,
+        "label": record.label,
+        "expression": record.expression,
+        "front": record.front,
+        "features": record.features,
+        "cameras": [camera.name for camera in record.cameras],
+        "bytes": record.bytes,
+        "session": record.session,
+        "jobs": jobs,
+        "board": record.board,
+        "size": asdict(record.cameras[0]),
+        "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
+        "verdict": record.verdict,
+        "faults": [fault.document() for fault in record.faults],
+        "warnings": documents_of(record.warnings),
+        "sync": None if record.shot is None else sync_line(record.shot),
+        "tags": [*record.tags],
+    }
+
+
+def sync_line(shot: Mapping[str, object]) -> SyncLine:
+    """Returns a sentence on how far the pictures of a shot are of one moment."""
+    lines = sync_of(shot)
+    late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
+    if late:
+        return {"message": compose("not-in-sync", cameras=late).document(), "good": False}
+    spread_ms = cast(SyncDocument, shot["sync"])["spread_ms"] if "sync" in shot else None
+    if spread_ms is None:
+        return {"message": compose("cameras-in-sync", count=len(lines)).document(), "good": True}
+    return {
+        "message": compose("cameras-in-sync-within", count=len(lines), spread_ms=spread_ms).document(),
+        "good": True,
+    }
+
+
+def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
+    """Returns status and skew of each camera from the certificate of a shot, of a real rig or of
+    the simulated studio."""
+    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
+    return certificate.get("cameras", {})
+
+
+def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLine]:
+    """Returns the newest sessions, newest first, and the ``chosen`` one where it is older."""
+
+    def make() -> list[Session]:
+        return [*service.sessions.page(limit=SESSIONS_SHOWN).items]
+
+    sessions = shared.get("sessions", 0.5, make)
+    if chosen and all(session.id != chosen for session in sessions):
+        with suppress(NotFound):
+            sessions = [*sessions, service.sessions.get(chosen)]
+    return [session_line(session) for session in sessions]
+
+
+def session_line(session: Session) -> SessionLine:
+    return {
+        "id": session.id,
+        "created": session.created,
+        "label": session.label,
+        "consent": session.consent,
+        "captures": sum(capture not in removals for capture in session.captures),
+    }
