@@ -245,15 +245,15 @@ HTTP_TYPES = {
 
 
 def type_of_input(subject: str) -> str:
-    """Returns the type of an ``InputError``."""
+    """Returns the problem type of an ``InputError`` with this subject."""
     return INPUT_TYPES.get(subject, "invalid-input")
 
 
 def type_of_failure(kind: str) -> str:
-    """Returns the type of a failed piece of work."""
+    """Returns the problem type of failed work. ``kind``: the class of its error, or how its child process ended."""
     return FAILURE_TYPES.get(kind, "eigenhead-error")
 
 
 def type_of_status(status: int) -> str:
-    """Returns the type of what the web framework refuses."""
+    """Returns the problem type of what the web framework itself refuses with this HTTP status."""
     return HTTP_TYPES.get(status, "http-error")

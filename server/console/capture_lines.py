@@ -1,4 +1,4 @@
-"""What pages show of captures and sessions: the lines of their lists."""
+"""Makes what pages show of captures and sessions: the lines of their lists."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -27,15 +27,15 @@ class JobOfCapture(TypedDict):
 
 
 class SyncLine(TypedDict):
-    """Holds a sentence on how far the pictures of a shot are of one moment."""
+    """Holds a sentence on how nearly the pictures of a shot show the same moment. ``good``: they do."""
 
     message: MessageDocument
     good: bool
 
 
 class CaptureLine(TypedDict):
-    """Holds a capture as the list shows it. ``size``: of the first camera's pictures (px); ``jobs``: all its jobs,
-    newest first."""
+    """Holds a capture as a list shows it. ``size``: of the first camera's pictures (px); ``sizes``: width and height by
+    camera; ``jobs``: all its jobs, newest first."""
 
     id: str
     created: str
@@ -59,7 +59,7 @@ class CaptureLine(TypedDict):
 
 
 class SessionLine(TypedDict):
-    """Holds a session as the list shows it. ``captures``: their number."""
+    """Holds a session as a list shows it. ``captures``: how many it has."""
 
     id: str
     created: str
@@ -69,7 +69,8 @@ class SessionLine(TypedDict):
 
 
 def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCapture]]:
-    """Returns the jobs of each capture, newest first, with the progress of those that run."""
+    """Returns the jobs of each capture, newest first, with the progress of those that run. Jobs that are being removed
+    are left out."""
     found = service.jobs.of_captures(captures)
     running = [job for jobs in found.values() for job, state in jobs if state == "running"]
     progress = {job.id: job.progress for job in service.jobs.of(running)}
@@ -82,6 +83,7 @@ def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCa
 
 
 def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine:
+    """Returns the line of a capture, with the jobs of ``jobs_of``."""
     return {
         "id": record.id,
         "created": record.created,
@@ -106,7 +108,7 @@ def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine
 
 
 def sync_line(shot: Mapping[str, object]) -> SyncLine:
-    """Returns a sentence on how far the pictures of a shot are of one moment."""
+    """Makes a sentence on how nearly the pictures of a shot show the same moment. ``shot`` is its certificate."""
     lines = sync_of(shot)
     late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
     if late:
@@ -121,14 +123,14 @@ def sync_line(shot: Mapping[str, object]) -> SyncLine:
 
 
 def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
-    """Returns status and skew of each camera from the certificate of a shot, of a real rig or of
-    the simulated studio."""
+    """Returns the sync status and skew of each camera from the certificate of a shot, of a real rig or of the simulated
+    studio."""
     certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
     return certificate.get("cameras", {})
 
 
 def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLine]:
-    """Returns the newest sessions, newest first, and the ``chosen`` one where it is older."""
+    """Returns the newest ``SESSIONS_SHOWN`` sessions, newest first, and the session ``chosen`` even if it is older."""
 
     def make() -> list[Session]:
         return [*service.sessions.page(limit=SESSIONS_SHOWN).items]
@@ -141,6 +143,7 @@ def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLi
 
 
 def session_line(session: Session) -> SessionLine:
+    """Returns the line of a session. Captures that are being removed do not count."""
     return {
         "id": session.id,
         "created": session.created,

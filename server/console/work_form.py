@@ -1,4 +1,4 @@
-"""What a page asks before a job is sent: model, preset and template."""
+"""What a page asks before a job is queued: model, preset and template."""
 
 from typing import NotRequired, TypedDict, cast
 
@@ -10,20 +10,22 @@ from server.services.work import ReconstructionRequest
 
 
 class PresetLine(TypedDict):
+    """Holds a preset as forms list it."""
+
     id: str
     title: MessageDocument
     explanation: MessageDocument
 
 
 class TemplateLine(TypedDict):
-    """Holds a template as forms list it. ``models``: names of the model that carries it."""
+    """Holds a template as forms list it. ``models``: names of the model that has it."""
 
     name: str
     models: list[str]
 
 
 class WorkForm(Chosen):
-    """Holds what a form asks before a job is sent. ``method``: id of a preset."""
+    """Holds what a form asks before a job is queued. ``method``: id of a preset."""
 
     model: NotRequired[str | None]
     method: NotRequired[str | None]
@@ -31,10 +33,12 @@ class WorkForm(Chosen):
 
 
 def preset_lines() -> list[PresetLine]:
+    """Returns all presets as forms list them."""
     return [{"id": p.id, "title": p.title.document(), "explanation": p.explanation.document()} for p in PRESETS]
 
 
 def template_lines() -> list[TemplateLine]:
+    """Returns the templates whose model is at hand, as forms list them."""
     return [{"name": found.name, "models": list(found.models)} for found in templates_at_hand() if found.models]
 
 

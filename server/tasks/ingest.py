@@ -58,7 +58,7 @@ def ingest_archive(
     """Unpacks the archive of a capture, checks it, and leaves in ``folder`` exactly the capture's files. Photographs
     without cameras are calibrated first.
 
-    Returns the content for the capture's record. Raises InputError naming every fault; ``folder`` may then hold rests.
+    Returns the content for the capture's record. Raises InputError naming every fault; a part of them may then lie there.
     """
     target = Path(folder)
     unpacked = target.with_name(target.name + ".unpacked")
@@ -200,8 +200,8 @@ def check_capture(
 ) -> CaptureContent:
     """Checks a capture folder and returns its content. Raises InputError naming every fault.
 
-    Pictures that belong to no camera are faults unless ``strays_pass``. ``measured``: the pictures were measured
-    before, so only the subject's place is looked for. With ``networks`` the subject's face is looked for, too.
+    ``measured``: only the subject's place is looked for in the pictures, since the shot measured the rest;
+    ``strays_pass``: pictures of no camera are no faults; ``networks``: look for the subject's face with these.
     """
     rig_file = find_rig_file(root)
     if rig_file is None:
@@ -237,11 +237,7 @@ def check_capture(
         faults.append(compose("every-picture-its-plate"))
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
-    for path in rig_file_parts(rig_file):
-        digests[path.relative_to(root).as_posix()] = _sha256(path)
-    if has_known_length(root):
-        read_scale(root / SCALE, rig.names)
-        digests[SCALE] = _sha256(root / SCALE)
+    digests |= _camera_digests(root, rig_file, rig)
     return CaptureContent(
         cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
         front=rig.front_camera(),
@@ -251,6 +247,15 @@ def check_capture(
         checks={name: view.document() for name, view in views.items()},
         face=_face_of(small, rig, networks, is_metric=_is_metric(root)) if networks is not None and small else None,
     )
+
+
+def _camera_digests(root: Path, rig_file: Path, rig: Rig) -> dict[str, str]:
+    """Returns the SHA-256 of the rig's files and of scale.json. Raises InputError for a wrong scale.json."""
+    digests = {path.relative_to(root).as_posix(): _sha256(path) for path in rig_file_parts(rig_file)}
+    if has_known_length(root):
+        read_scale(root / SCALE, rig.names)
+        digests[SCALE] = _sha256(root / SCALE)
+    return digests
 
 
 def _features_file_faults(path: Path, rig: Rig) -> list[Message]:

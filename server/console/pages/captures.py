@@ -1,4 +1,4 @@
-"""Captures: what there is, uploads, silhouettes over the images, jobs to start, removal with undo."""
+"""The page Captures: the list, uploads, outlines over the images, jobs to start, and removal with undo."""
 
 from collections.abc import Mapping
 from typing import NotRequired, TypedDict, cast, get_args
@@ -30,7 +30,8 @@ ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
 
 
 class CapturesState(TypedDict):
-    """Holds one page of captures. ``chosen``: the capture that is looked at, which may lie on another page."""
+    """Holds one page of the list of captures. ``chosen``: the selected capture, which may be on another page of the
+    list."""
 
     captures: list[CaptureLine]
     chosen: CaptureLine | None
@@ -44,7 +45,7 @@ class CapturesState(TypedDict):
 
 
 class EditForm(Chosen):
-    """Holds changes to a capture. ``tags``: separated by commas."""
+    """Holds changes to a capture. Fields that are left out stay; ``tags`` are separated by commas."""
 
     label: NotRequired[str]
     expression: NotRequired[str]
@@ -53,16 +54,19 @@ class EditForm(Chosen):
 
 
 class SessionForm(TypedDict):
+    """Holds the label and the consent note of a session."""
+
     label: NotRequired[str]
     consent: NotRequired[str]
 
 
 class SessionEditForm(Chosen, SessionForm):
-    pass
+    """Holds changes to a session. Fields that are left out stay."""
 
 
 class BulkForm(WorkForm):
-    """Holds an action on all ``ids``. ``id``: the session to move to, empty for none; ``tags``: separated by commas."""
+    """Holds one action on all captures ``ids``. ``id``: the session to move them to, empty for none; ``tags``:
+    separated by commas."""
 
     ids: list[str]
     action: str
@@ -70,6 +74,8 @@ class BulkForm(WorkForm):
 
 
 class CapturesPage(Page, component="captures.js"):
+    """Shows the page Captures."""
+
     def look(self) -> CapturesState:
         """Returns the state of the page. The selected capture stays selected when others arrive, so that nobody removes
         a capture other than the one shown."""
@@ -83,7 +89,8 @@ class CapturesPage(Page, component="captures.js"):
 
 
 def captures_state(service: Service, requested: Mapping[str, str | None]) -> CapturesState:
-    """Returns one page of the captures that match what is requested, each with its jobs."""
+    """Returns one page of the captures that match what is requested, each with its jobs. Captures that are being
+    removed are left out."""
     order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
@@ -107,12 +114,14 @@ def captures_state(service: Service, requested: Mapping[str, str | None]) -> Cap
 
 
 def reconstruct(page: Page, event: WorkForm) -> Message:
+    """Queues a job for a capture; its head opens when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.started(job.id, opens=True)
     return compose("job-queued-watch", job=job.id[-6:])
 
 
 def reconstruct_session(page: Page, event: WorkForm) -> Message:
+    """Queues a job for every capture of a session that shows a head. Raises what ``Jobs.submit_session`` raises."""
     work = chosen_work(event)
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
     page.started(*(job.id for job in jobs))
@@ -120,7 +129,7 @@ def reconstruct_session(page: Page, event: WorkForm) -> Message:
 
 
 def sample(page: Page, event: object) -> Message:
-    """Takes a capture of the simulated studio, for those who have no pictures yet."""
+    """Takes a capture of the simulated studio and selects it, for people who have no pictures yet."""
     record = page.service.captures.sample()
     page.choice["capture"] = record.id
     forget_captures()
@@ -128,6 +137,7 @@ def sample(page: Page, event: object) -> Message:
 
 
 def edit(page: Page, event: EditForm) -> None:
+    """Changes label, expression, session or tags of a capture. Raises NotFound and InputError."""
     changes: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     tags = typed_tags(event["tags"]) if "tags" in event else None
     page.service.captures.edit(event["id"], changes, tags=tags)
@@ -135,30 +145,36 @@ def edit(page: Page, event: EditForm) -> None:
 
 
 def new_session(page: Page, event: SessionForm) -> Message:
+    """Makes a session. Raises InputError for invalid texts."""
     made = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
     forget_captures()
     return compose("session-begun", name=made.label or made.id[-6:])
 
 
 def edit_consent(page: Page, event: SessionEditForm) -> None:
+    """Changes the label or the consent note of a session. Raises NotFound and InputError."""
     changes = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
     page.service.sessions.edit(event["id"], label=changes.get("label"), consent=changes.get("consent"))
     forget_captures()
 
 
 def erase(page: Page, event: Chosen) -> Message:
+    """Erases a session for good, without undo, as ``Sessions.erase`` does. Raises NotFound and Unavailable."""
     page.service.sessions.erase(event["id"])
     shared.clear()  # reports of its heads among them
     return compose("session-erased")
 
 
 def erase_capture(page: Page, event: Chosen) -> Message:
+    """Erases a capture for good, without undo, as ``Captures.erase`` does. Raises NotFound and Unavailable."""
     page.service.captures.erase(event["id"])
     shared.clear()
     return compose("capture-erased")
 
 
 def discard(page: Page, event: Chosen) -> None:
+    """Removes a capture after the time to undo that has passed; the message says how many heads stay. Raises NotFound,
+    and Conflict while a queued or running job needs it."""
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
     heads = len(service.captures.holdings(identity).heads)
@@ -169,8 +185,8 @@ def discard(page: Page, event: Chosen) -> None:
 
 
 def bulk(page: Page, event: BulkForm) -> Message | None:
-    """Does one action to all captures that are ticked. Raises InvalidInput with the reasons where it is refused for
-    some."""
+    """Does one action to all ticked captures. Where it is refused for some, the others are done, and InvalidInput is
+    raised with the reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")
@@ -204,7 +220,7 @@ def bulk(page: Page, event: BulkForm) -> Message | None:
 
 
 def said_of(action: str, count: int) -> Message:
-    """Returns the message of what was done to ``count`` captures."""
+    """Returns the message that says what was done to ``count`` captures."""
     said = {
         "reconstruct": compose("captures-queued", count=count),
         "move": compose("captures-moved", count=count),
@@ -216,6 +232,7 @@ def said_of(action: str, count: int) -> Message:
 
 
 def forget_captures() -> None:
+    """Drops the cached lists that show captures, sessions, tags or subjects."""
     shared.forget("captures", "sessions", "tags", "subjects")
 
 
@@ -237,5 +254,6 @@ CapturesPage.actions = {
 async def captures_page(
     capture: str = "", find: str = "", session: str = "", verdict: str = "", tag: str = "", sort: str = ""
 ) -> RedirectResponse | None:
+    """Serves the page Captures. ``capture`` selects one; the other parameters restrict or order the list."""
     requested = {"capture": capture, "find": find, "session": session, "verdict": verdict, "tag": tag, "sort": sort}
     return await show("captures", CapturesPage, **requested)
