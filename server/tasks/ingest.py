@@ -58,7 +58,7 @@ def ingest_archive(
     """Unpacks the archive of a capture, checks it, and leaves in ``folder`` exactly the capture's files. Photographs
     without cameras are calibrated first.
 
-    Returns the content for the capture's record. Raises InputError naming every fault; a part of them may then lie there.
+    Returns the content for the capture's record. Raises InputError naming every fault; the folder is useless then.
     """
     target = Path(folder)
     unpacked = target.with_name(target.name + ".unpacked")
