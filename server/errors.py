@@ -63,7 +63,7 @@ class InvalidInput(Refused):
 
 
 class TooMany(Refused):
-    """Refuses more at once than the caller may have."""
+    """Refuses a caller who has as many jobs or batches at once as the settings allow."""
 
 
 class Unavailable(Refused):

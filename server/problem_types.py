@@ -245,15 +245,16 @@ HTTP_TYPES = {
 
 
 def type_of_input(subject: str) -> str:
-    """Returns the problem type of an ``InputError`` with this subject."""
+    """Returns the stable name of the problem that an ``InputError`` with this subject becomes."""
     return INPUT_TYPES.get(subject, "invalid-input")
 
 
 def type_of_failure(kind: str) -> str:
-    """Returns the problem type of failed work. ``kind``: the class of its error, or how its child process ended."""
+    """Returns the stable name of the problem that failed work becomes. ``kind``: the class of its error, or how its
+    child process ended."""
     return FAILURE_TYPES.get(kind, "eigenhead-error")
 
 
 def type_of_status(status: int) -> str:
-    """Returns the problem type of what the web framework itself refuses with this HTTP status."""
+    """Returns the stable name of the problem that the web framework's own refusal with this HTTP status becomes."""
     return HTTP_TYPES.get(status, "http-error")

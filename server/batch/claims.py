@@ -27,7 +27,8 @@ SUFFIX = ".json"
 
 
 class Claims:
-    """Takes and releases the claims of this process in a folder that all processes of a batch share. Thread-safe."""
+    """Takes and releases claims for this process, so that no two processes work on the same thing. ``folder`` is shared
+    by all processes of a batch. Thread-safe."""
 
     def __init__(self, folder: Path, *, silent_s: float = HEARTBEAT_TIMEOUT_S) -> None:
         self.token = secrets.token_hex(8)

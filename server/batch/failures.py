@@ -11,8 +11,8 @@ SIGKILL = 9
 
 
 def failure_of(error: EigenheadError | OSError, capture: Path, attempt: str, origin: Origin | None) -> FailureRecord:
-    """Returns the failure record for an error. ``attempt``: token of the process; ``origin``: None if the capture could
-    not be read."""
+    """Returns the failure record for an error. ``attempt``: token of the process (``Claims.token``); ``origin``: None
+    if the capture could not be read."""
     if isinstance(error, WorkFailed):
         return FailureRecord(attempt, error.kind, _of_work(error), error.faults, origin, error.trace)
     if isinstance(error, EigenheadError):

@@ -54,7 +54,8 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class FailureRecord:
-    """Holds why the latest attempt at a capture failed. ``attempt``: token of the process that made it."""
+    """Holds why the latest attempt at a capture failed. ``attempt``: token of the process that made it
+    (``Claims.token``)."""
 
     attempt: str
     kind: str
@@ -93,8 +94,8 @@ class BatchFolder:
         return json.loads((self.result(name) / REPORT).read_text(encoding="utf-8"))
 
     def new_attempt(self, token: str) -> Path:
-        """Makes an empty folder for one attempt at a result, with the folders ``result`` and ``scratch`` in it.
-        ``token`` is that of the process."""
+        """Makes a folder for one attempt at a result, with the empty folders ``result`` and ``scratch`` in it.
+        ``token`` names the process that makes the attempt (``Claims.token``)."""
         number = 0
         while True:
             attempt = self.attempts / f"{token}.{number}"
@@ -135,7 +136,7 @@ class BatchFolder:
             raise ForeignFiles(self.result(name), foreign)
 
     def remove_attempts(self, is_alive: Callable[[str], bool]) -> None:
-        """Removes the attempts of processes for whose token ``is_alive`` returns False."""
+        """Removes the attempts of processes that have ended. ``is_alive`` is asked for each process by its token."""
         for path in self._attempts():
             if not is_alive(path.name.partition(".")[0]):
                 shutil.rmtree(path, ignore_errors=True)
@@ -168,7 +169,7 @@ class BatchFolder:
         return self.work / "failures" / f"{file_name(name)}.json"
 
     def forget_failures_but_of(self, names: set[str]) -> None:
-        """Removes all failure records except those of the captures ``names``, and files that a kill left half
+        """Removes the failure records of all captures that are not in ``names``, and files that a kill left half
         written."""
         retained = {self.failure_file(name).name for name in names}
         with suppress(FileNotFoundError):

@@ -12,7 +12,7 @@ SHARDS_MOST = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """Holds one share of a batch: ``number`` (from 1) of ``count``."""
+    """Holds one share of a batch, to be made by one machine: ``number`` (from 1) of ``count`` shares."""
 
     number: int
     count: int

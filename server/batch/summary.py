@@ -46,12 +46,12 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
 
 
 def table_row(outcome: Outcome, columns: Sequence[Column]) -> Row:
-    """Returns the table's row of a capture."""
+    """Returns the row of the batch's table that describes a capture. ``columns``: all columns of the table."""
     return row_of(outcome.capture, columns, report=outcome.report, origin=outcome.origin, failure=outcome.failure)
 
 
 def sheet_card(outcome: Outcome, row: Row) -> Card:
-    """Returns the sheet's card of a capture from its row of the table."""
+    """Returns the card of the contact sheet that shows a capture. ``row``: the capture's row of the table."""
     capture, report = outcome.capture, outcome.report
     of = " / ".join(text for text in (capture.subject, capture.session) if text)
     turntable = None if report is None else outcome.result / "turntable.png"
@@ -86,7 +86,8 @@ def _why(failure: FailureRecord | None) -> tuple[MessageDocument, ...]:
 
 
 def expressions_of(models: Iterable[str | None]) -> list[str]:
-    """Returns the names of the expressions of all models, each once. None: the default model. Raises UnknownModel."""
+    """Returns the names of all expressions that the models have, each name once. ``models`` are names or files; None
+    stands for the default model. Raises UnknownModel."""
     names = [name for model in dict.fromkeys(models) for name in _of_model(model)]
     return list(dict.fromkeys(names))
 

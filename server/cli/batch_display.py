@@ -40,7 +40,8 @@ class BatchDisplay:
             yield cls(workers, expected_s, bar)
 
     def prepare(self, tasks: "Sequence[BatchTask]") -> None:
-        """Compiles the missing numerical loops once, so that not every worker compiles them for itself."""
+        """Compiles the numerical loops that the batch needs and that are not compiled on this machine yet, so that not
+        every worker compiles them for itself."""
         from pipeline.settings import settings_from_document
         from server.tasks.prepare import prepare_kernels
 

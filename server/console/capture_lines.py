@@ -1,4 +1,4 @@
-"""Makes what pages show of captures and sessions: the lines of their lists."""
+"""Converts captures and sessions to the entries of the lists on pages."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -83,7 +83,7 @@ def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCa
 
 
 def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine:
-    """Returns the line of a capture, with the jobs of ``jobs_of``."""
+    """Converts a capture's record to an entry of a list. ``jobs``: the capture's jobs, as ``jobs_of`` returns them."""
     return {
         "id": record.id,
         "created": record.created,
@@ -143,7 +143,7 @@ def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLi
 
 
 def session_line(session: Session) -> SessionLine:
-    """Returns the line of a session. Captures that are being removed do not count."""
+    """Converts a session to an entry of a list. Captures that are being removed do not count."""
     return {
         "id": session.id,
         "created": session.created,

@@ -1,4 +1,4 @@
-"""Computes what helps to pick one point in several views: epipolar guides, the triangulated point, the model's
+"""Computes aids for picking one feature point in several views: epipolar guides, the triangulated point, the model's
 landmark.
 
 Everything is a function of a rig and pixels. Lens distortion is kept, so that a guide is a curve.
@@ -44,7 +44,7 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
 
 
 class Helps(TypedDict):
-    """Holds what helps to pick points, by point and then by camera, in pixels.
+    """Holds the aids for picking feature points, by point and then by camera, in pixels.
 
     ``guides``: the other views' lines of sight as curves; ``reprojected``: where the triangulated point is seen;
     ``off_px``: distance of the picked pixel from there; ``predicted``: where the model's landmarks would be.
@@ -70,8 +70,8 @@ class Located:
 
 
 class Guides:
-    """Computes what helps to pick points in the pictures of one rig. It keeps results and computes again only what a
-    change affects, so that a click costs the same however many points there are."""
+    """Computes the aids for picking feature points in the pictures of one rig. It keeps results and computes again only
+    what a change affects, so that a click costs the same however many points there are."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -82,8 +82,11 @@ class Guides:
     def helps(
         self, points: Pixels, landmarks: Landmarks, shown: Collection[str], views: Collection[str] | None = None
     ) -> Helps:
-        """Computes what helps to pick ``points``. ``landmarks``: the model's (head frame, mm); ``shown``: points whose
-        curves are needed; ``views``: the cameras in which (None: all)."""
+        """Computes the aids for ``points``, the pixels picked so far, by point and camera.
+
+        ``landmarks``: the model's (head frame, mm); ``shown``: points whose guides are needed; ``views``: cameras in
+        which guides are needed (None: all).
+        """
         targets = self._rig.names if views is None else [name for name in self._rig.names if name in views]
         located = {name: self._of(name, views) for name, views in points.items()}
         places = {name: found.position for name, found in located.items() if found.position is not None}
@@ -143,7 +146,7 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
 
 
 def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
-    """Computes what helps to pick all points, in all views, without results of an earlier call."""
+    """Computes the aids for all points in all views, without results of an earlier call."""
     return Guides(rig).helps(points, landmarks, list(points))
 
 

@@ -31,7 +31,7 @@ log = structlog.get_logger()
 
 
 class Source(Protocol):
-    """Declares where the pictures of the live view come from. Methods block."""
+    """Declares where the live view gets its pictures: from real cameras or the simulated studio. Methods block."""
 
     def frames(self) -> list[LiveFrame]:
         """Returns the present picture of each camera, with its measurements. ``jpeg`` is None if the camera delivers

@@ -1,4 +1,4 @@
-"""Declares what the live view shows of one camera."""
+"""Declares the document in which the live view holds one camera's picture and measurements."""
 
 from typing import NotRequired, TypedDict
 

@@ -67,7 +67,7 @@ async def _answer_problem(request: Request, error: Exception) -> Response:
 
 
 def live_view(service: Service) -> LiveView:
-    """Returns the live view of a service, of which there is one."""
+    """Returns the live view of a service. All pages share it."""
     return _live.setdefault(id(service), LiveView(service))
 
 
@@ -179,8 +179,8 @@ def portrait(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/first-view.jpg")
 def first_view(who: Reader, job_id: str) -> Response:
-    """Returns a picture of the head as the page Result shows it first. Answers 204 without content for a head.ply of
-    another program."""
+    """Returns a picture of the head as the page Result shows it first. Answers 204 without content if the head.ply was
+    not written by this program."""
     try:
         return FileResponse(head_picture(who[0], job_id, "first-view.jpg"), headers=FOREVER)
     except InputError:

@@ -90,7 +90,7 @@ class PagesMount(Mount):
         self._settings = settings
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
-        """Matches the paths in ``PAGES`` and those below ``FOLDERS``."""
+        """Tells Starlette whether a request is for the pages: its path is in ``PAGES`` or below ``FOLDERS``."""
         if scope["type"] in ("http", "websocket"):
             path = path_below(scope)
             if path not in PAGES and not path.startswith(FOLDERS):

@@ -1,4 +1,5 @@
-"""What all pages share: a component that shows a state document, actions that run in threads, and cached values."""
+"""Holds what all pages share: a component that shows a state document, actions that run in threads, and cached
+values."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -105,7 +106,7 @@ class Cache:
                 self._locks.pop(key, None)
 
     def clear(self) -> None:
-        """Drops all values."""
+        """Drops all values, so that the next look of every page reads them anew."""
         with self._lock:
             self._forgets += 1
             self._values.clear()
@@ -146,7 +147,7 @@ class Page(Element):
         self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
 
     def look(self) -> Mapping[str, object]:
-        """Returns the state of the page as a document, which must be JSON. Runs in a thread and may block."""
+        """Returns the document that the page shows. It consists of JSON values. Runs in a thread and may block."""
         raise NotImplementedError
 
     def preloads(self) -> Iterable[tuple[str, str]]:
@@ -276,8 +277,8 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: M
 
 
 def as_problem(error: Exception) -> Problem:
-    """Converts an error to the problem that a page shows. Of an input with one fault that fault is the text, since
-    nobody sends a document again from a page."""
+    """Converts an error to the problem that a page shows. An InputError with a single fault is shown as that fault
+    alone."""
     if isinstance(error, WorkFailed) and error.kind != "bug":
         return Problem(500, type_of_failure(error.kind), error.message, error.faults)
     problem = problem_from(error)

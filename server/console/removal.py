@@ -62,7 +62,7 @@ class Removals:
         return removal is not None
 
     def waiting(self) -> dict[str, Removal]:
-        """Returns the removals that can still be taken back, by id."""
+        """Returns the removals that can still be taken back, by the id with which they were added."""
         with self._lock:
             return dict(self._waiting)
 

@@ -1,4 +1,4 @@
-"""Adapts messages of refusals and failures to pages."""
+"""Shortens the messages of refusals and failures for pages, on which nobody sends a document again."""
 
 from rig.messages.message import Message
 from server.services.documents import ErrorDocument, failure_document

@@ -18,8 +18,8 @@ def open_suggestions(suggested: PixelsOfPoints, points: PixelsOfPoints) -> Pixel
 def take_suggestions(
     points: PixelsOfPoints, suggested: PixelsOfPoints, point: str | None = None, camera: str | None = None
 ) -> PixelsOfPoints:
-    """Returns the points with suggestions added: those of one point in one view, of one point in all views, or all.
-    Points that are set already stay."""
+    """Returns the points with suggestions added: those of ``point`` in the view ``camera``, of ``point`` in all views
+    if ``camera`` is None, or all if both are None. Points that are set already stay."""
     taken = {name: dict(views) for name, views in points.items()}
     for name, view, at in _of(open_suggestions(suggested, points), point, camera):
         taken.setdefault(name, {})[view] = at
@@ -27,8 +27,8 @@ def take_suggestions(
 
 
 def drop_suggestions(suggested: PixelsOfPoints, point: str | None = None, camera: str | None = None) -> PixelsOfPoints:
-    """Returns the suggestions without the selected ones: those of one point in one view, of one point in all views, or
-    all."""
+    """Returns the suggestions without those of ``point`` in the view ``camera``, of ``point`` in all views if
+    ``camera`` is None, or without any if both are None."""
     left = {name: dict(views) for name, views in suggested.items()}
     for name, view, _ in _of(suggested, point, camera):
         left[name].pop(view)

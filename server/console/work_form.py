@@ -1,4 +1,4 @@
-"""What a page asks before a job is queued: model, preset and template."""
+"""Converts what a form asks before a job is queued (model, preset, template) to a request, and lists the choices."""
 
 from typing import NotRequired, TypedDict, cast
 
@@ -10,7 +10,7 @@ from server.services.work import ReconstructionRequest
 
 
 class PresetLine(TypedDict):
-    """Holds a preset as forms list it."""
+    """Holds a preset (a named choice of settings) as an entry of a form's list."""
 
     id: str
     title: MessageDocument
@@ -18,7 +18,7 @@ class PresetLine(TypedDict):
 
 
 class TemplateLine(TypedDict):
-    """Holds a template as forms list it. ``models``: names of the model that has it."""
+    """Holds a template as an entry of a form's list. ``models``: names of the model that has it."""
 
     name: str
     models: list[str]
@@ -33,12 +33,12 @@ class WorkForm(Chosen):
 
 
 def preset_lines() -> list[PresetLine]:
-    """Returns all presets as forms list them."""
+    """Converts all presets to entries of a form's list."""
     return [{"id": p.id, "title": p.title.document(), "explanation": p.explanation.document()} for p in PRESETS]
 
 
 def template_lines() -> list[TemplateLine]:
-    """Returns the templates whose model is at hand, as forms list them."""
+    """Converts the templates whose model is at hand to entries of a form's list."""
     return [{"name": found.name, "models": list(found.models)} for found in templates_at_hand() if found.models]
 
 

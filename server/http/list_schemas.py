@@ -78,13 +78,13 @@ class JobList(Listed):
 
 
 class JobBatch(Answer):
-    """Holds the jobs that one request has queued."""
+    """Holds the jobs that one request has queued, one for each capture."""
 
     jobs: list[JobOut]
 
 
 class RefusedOne(Answer):
-    """Describes why an action was refused for one thing."""
+    """Describes why an action was refused for one of the ids in a request."""
 
     id: str
     type: str = Field(description="as of a problem document")

@@ -26,6 +26,6 @@ class MessageOut(BaseModel):
 
 
 class WarningOut(MessageOut):
-    """Holds a warning as in report.json."""
+    """Holds a warning with its code and parameters, as report.json has it."""
 
     code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")

@@ -32,7 +32,7 @@ class Received(BaseModel):
 
 
 class Answer(BaseModel):
-    """Takes its fields from a record of the service; the base of all response bodies."""
+    """Reads its fields from a record of the service that has the same fields; the base of all response bodies."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -74,7 +74,7 @@ class NewImport(Received):
 
 
 class SessionEdit(Received):
-    """Changes a session. Keys that are left out keep their values."""
+    """Changes the label or the consent note of a session. Keys that are left out keep their values."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna B."}]})
 

@@ -1,5 +1,5 @@
-"""Shapes of the JSON documents in which clients get captures, jobs and failures: the command line and the pages'
-components."""
+"""Declares the JSON documents in which the command line and the components of the pages receive captures, jobs and
+failures."""
 
 from typing import TypedDict
 

@@ -143,7 +143,7 @@ class Info:
 
 
 def about(service: Service) -> Info:
-    """Returns the version, load, limits and default settings of a service."""
+    """Returns the service's version, its load, its limits and the default settings of a job."""
     jobs, limits = service.jobs.counts(), service.settings
     return Info(
         version("eigenhead"),

@@ -58,7 +58,7 @@ class ApiKey:
 
 
 class Keys:
-    """Manages the API keys in the database."""
+    """Makes, lists, checks and removes the API keys in the database. Methods block."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine

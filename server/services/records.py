@@ -1,4 +1,4 @@
-"""Values that the services return to routes, pages and the command line."""
+"""Declares the values that the services return to routes, pages and the command line."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -87,7 +87,7 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Holds a session: captures of one subject, and the note of their consent."""
+    """Holds a session: the ids of captures of one subject, and the note of the subject's consent."""
 
     id: str
     created: str

@@ -1,4 +1,4 @@
-"""Counts what lies in the data folder, by kind."""
+"""Counts the bytes that captures, results, caches and so on take in the data folder."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""Thread pools of bounded size, for functions that block."""
+"""Runs blocking functions in thread pools of bounded size."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar

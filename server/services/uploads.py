@@ -16,7 +16,7 @@ from server.storage.store import Store, is_id, new_id
 
 
 def too_large(settings: ServiceSettings) -> TooLarge:
-    """Returns the error for an upload that is larger than the settings allow."""
+    """Returns the error that refuses an upload larger than the settings allow."""
     return TooLarge("upload-too-large", compose("upload-too-large", bytes=settings.body_bytes))
 
 

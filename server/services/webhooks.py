@@ -56,7 +56,7 @@ class Webhooks:
             return [Webhook(row.id, row.url) for row in rows]
 
     def remove(self, identity: str) -> None:
-        """Removes a webhook. Raises NotFound."""
+        """Removes a webhook, which gets no further messages. Raises NotFound."""
         with self._engine.begin() as connection:
             if not connection.execute(sa.delete(webhooks).where(webhooks.c.id == identity)).rowcount:
                 raise NotFound(compose("thing-webhook"), identity)
@@ -80,8 +80,8 @@ class Webhooks:
             enqueue(_delivery(identity), message)
 
     def announce_batch(self, batch_id: str, round_number: int, enqueue: Callable[..., Any]) -> None:
-        """Queues one message for each webhook that a batch has finished. A batch finishes once a round; repeating the
-        call for the same round changes nothing."""
+        """Queues a message for each webhook that a batch has finished. A retry of failed jobs begins the batch's next
+        round; for each round a webhook gets one message, even if the call is repeated."""
         for hook in self.all():
             identity = f"hook-{hook.id}-{batch_id}-{round_number}"
             message: WebhookMessage = {

@@ -1,4 +1,4 @@
-"""What a job is to do, and with which captures it can be done."""
+"""Declares what a job is to do, and checks whether it can be done."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

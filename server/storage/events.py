@@ -59,6 +59,6 @@ class EventLog:
             return {row.job_id: JobEvent(row.seq, row.at, json.loads(row.document)) for row in rows}
 
     def remove(self, job_ids: list[str]) -> None:
-        """Removes all events of the jobs."""
+        """Removes all events of these jobs."""
         with self._engine.begin() as connection:
             connection.execute(sa.delete(events).where(events.c.job_id.in_(job_ids)))

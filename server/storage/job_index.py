@@ -38,7 +38,7 @@ class JobQuery:
 
 @dataclass(frozen=True, slots=True)
 class JobOfCapture:
-    """Holds the id of a job and its status in the engine's words."""
+    """Holds the id of a job, and its status in the job engine's words ("PENDING")."""
 
     id: str
     status: str
@@ -53,7 +53,8 @@ class Queued:
 
 
 class JobIndex:
-    """Finds the jobs of one of the job engine's workflows. Methods block on the database."""
+    """Finds jobs by words, capture, session, batch and state. ``workflow``: the job engine's name for this kind of job.
+    Methods block on the database."""
 
     def __init__(self, engine: sa.Engine, workflow: str) -> None:
         self._engine, self._workflow = engine, workflow
@@ -106,7 +107,7 @@ class JobIndex:
             return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
 
     def counts(self) -> dict[str, int]:
-        """Returns the number of jobs by the engine's status."""
+        """Returns the number of jobs by the job engine's status."""
         status = self._status.c
         query = sa.select(status.status, sa.func.count()).where(status.name == self._workflow).group_by(status.status)
         with self._engine.connect() as connection:

@@ -61,22 +61,22 @@ class Library:
         self._engine = engine
 
     def put_capture(self, record: CaptureRecord, changed: int) -> None:
-        """Writes the index row and the tags of a capture, replacing earlier ones. ``changed``: time of the record's
-        file (ns)."""
+        """Writes a capture, with its tags, to the index, replacing earlier ones. ``changed``: time of the record's file
+        (ns)."""
         self._put(capture_index, [_capture_row(record, changed)])
         self._put_tags([record])
 
     def drop_capture(self, identity: str) -> None:
-        """Removes the index row and the tags of a capture."""
+        """Removes a capture, with its tags, from the index."""
         self._drop(capture_index, [identity])
         self._drop_tags([identity])
 
     def put_session(self, record: SessionRecord, changed: int) -> None:
-        """Writes the index row of a session, replacing an earlier one. ``changed``: time of the record's file (ns)."""
+        """Writes a session to the index, replacing an earlier one. ``changed``: time of the record's file (ns)."""
         self._put(session_index, [_session_row(record, changed)])
 
     def drop_session(self, identity: str) -> None:
-        """Removes the index row of a session."""
+        """Removes a session from the index."""
         self._drop(session_index, [identity])
 
     def scrub(self) -> None:
@@ -124,7 +124,7 @@ class Library:
             return [*connection.scalars(query.order_by(sa.func.count().desc(), table.folded).limit(limit))]
 
     def tags_of(self, captures: Collection[str]) -> dict[str, list[str]]:
-        """Returns the tags of each of the captures."""
+        """Returns the tags of each of these captures; captures without tags are left out."""
         found: dict[str, list[str]] = {}
         query = sa.select(capture_tags.c.capture_id, capture_tags.c.name).order_by(capture_tags.c.folded)
         with self._engine.connect() as connection:

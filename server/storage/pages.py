@@ -41,7 +41,7 @@ class Order:
     descending: bool
 
     def by(self) -> tuple[sa.ColumnElement, ...]:
-        """Returns the expressions of SQL's ORDER BY."""
+        """Returns the columns of the order as SQL's ORDER BY needs them."""
         columns = dict.fromkeys((self.column, self.identity))
         return tuple(column.desc() if self.descending else column.asc() for column in columns)
 
@@ -101,8 +101,11 @@ def no_cursor() -> InputError:
 def page_of(
     connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, *, searched: bool = False
 ) -> CursorPage:
-    """Returns one page of ``rows``, a query whose columns are still to be chosen. ``searched``: finding the rows takes
-    long, so that they are counted in the same query. Raises InputError for a wrong cursor."""
+    """Returns one page of a list: the rows of the query ``rows`` in ``order``, after ``cursor``, ``limit`` at most.
+
+    ``searched``: the query is slow, so the total is counted within it and not by a second one. Raises InputError for a
+    cursor of another list.
+    """
     wanted = rows.with_only_columns(order.identity.label("id"), order.column.label("value"))
     if cursor is not None:
         total, wanted = place_of(cursor).total, wanted.where(order.after(cursor))

@@ -76,7 +76,8 @@ class StoredFile:
 
 
 class RecordIndex(Protocol):
-    """Declares the methods that ``Store`` calls after a record was written or removed."""
+    """Declares the methods of an index of the data folder. ``Store`` calls them after it has written or removed a
+    record."""
 
     def put_capture(self, record: CaptureRecord, changed: int) -> None:
         """Notes that a capture's record was written at ``changed`` (time of the file, ns)."""
@@ -123,7 +124,7 @@ class Store:
         return self.data / kind / identity
 
     def ids(self, kind: str) -> list[str]:
-        """Lists the ids of all things of a kind, newest first."""
+        """Lists the ids of all things of a kind ("captures", "jobs" and so on), newest first."""
         with suppress(FileNotFoundError):
             names = (entry.name.removesuffix(".json") for entry in os.scandir(self.data / kind))
             return sorted((name for name in names if is_id(name)), reverse=True)

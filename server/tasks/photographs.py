@@ -56,7 +56,7 @@ class Prepared:
 
 
 def photographs_alone(folder: Path) -> bool:
-    """Returns whether a folder has photographs but no cameras."""
+    """Returns whether a folder has photographs but no cameras, so that these must be estimated."""
     root = capture_root(folder)
     if find_rig_file(root) is not None:
         return False

@@ -14,14 +14,15 @@ if TYPE_CHECKING:
 
 
 class SimulatedSync(TypedDict):
-    """Holds when a simulated camera took its picture: always "in sync", 0 ms off."""
+    """Holds a camera's entry in the sync certificate of a simulated shot: its delay is always 0 ms."""
 
     status: str
     skew_ms: float
 
 
 class SimulatedCertificate(TypedDict):
-    """Holds the sync certificate of a shot of the simulated studio."""
+    """Holds the sync certificate of a simulated shot: the subject, when each camera took its picture, and planted
+    faults."""
 
     kind: str
     subject: str

@@ -1,5 +1,5 @@
-"""Limits how long a body may be silent. A client that vanished sends nothing more, and would otherwise keep its
-connection and its locks for ever."""
+"""Limits the pause between two pieces of a request's body. A client that vanished sends nothing more, and would
+otherwise keep its connection and its locks for ever."""
 
 from collections.abc import AsyncIterator
 

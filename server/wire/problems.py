@@ -115,7 +115,7 @@ class Problem(EigenheadError):
         self.errors, self.headers = tuple(message_of(error) for error in errors), dict(headers or {})
 
     def document(self) -> ProblemDocument:
-        """Returns the problem document."""
+        """Returns the problem as a JSON document of RFC 9457."""
         return {
             "type": URN + self.kind,
             "title": PROBLEM_TYPES.get(self.kind, self.kind),
@@ -127,7 +127,7 @@ class Problem(EigenheadError):
         }
 
     def response(self) -> JSONResponse:
-        """Returns the HTTP response that carries the document."""
+        """Returns the HTTP response that carries the problem document."""
         return JSONResponse(self.document(), self.status, headers=self.headers, media_type=MEDIA_TYPE)
 
 

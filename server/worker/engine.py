@@ -1,8 +1,9 @@
 """Configures the job engine (DBOS) for the worker, and takes jobs of dead workers back.
 
 DBOS's public resume_workflow is not used for that: it takes a job from whoever has it by now, revives a cancelled one,
-and forgets how many workers the job took down. ``DBOS._recover_pending_workflows``, which the engine itself calls when
-it starts, changes only rows that still belong to the named executors. A test checks that it exists in this form.
+and forgets how many workers the job took down. ``DBOS._recover_pending_workflows``, which DBOS itself calls when it
+starts, changes only rows that still belong to the named workers ("executors" in DBOS). A test checks that this private
+function still exists in this form.
 """
 
 from collections.abc import Sequence

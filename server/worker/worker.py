@@ -61,8 +61,8 @@ log = structlog.get_logger()
 
 
 class Worker:
-    """Takes jobs from the queue of the settings and runs them. The job engine is a singleton, so a process has one
-    worker."""
+    """Takes jobs from one queue, which the settings name, and runs them. The job engine is a singleton, so a process
+    has one worker."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings

@@ -26,7 +26,7 @@ ASKED = ("find", "state", "after")
 
 
 class BatchLine(TypedDict):
-    """Holds a batch as the page shows it; the fields are those of ``Batch``."""
+    """Holds a batch as an entry of the page's list. The fields are those of ``server.services.records.Batch``."""
 
     id: str
     label: str
@@ -78,7 +78,7 @@ class BatchForm(TypedDict):
 
 
 class BatchesPage(Page, component="batches.js"):
-    """Shows the page Batches."""
+    """Shows the list of batches, and the selected one with its progress and failed jobs."""
 
     def look(self) -> BatchesShown:
         """Returns the state of the page: a page of the list, and the selected batch with its failed jobs."""
@@ -104,7 +104,7 @@ def batches_state(service: Service, requested: Mapping[str, str | None]) -> Batc
 
 
 def batch_line(batch: Batch) -> BatchLine:
-    """Returns a batch as the page shows it."""
+    """Converts a batch to an entry of the page's list."""
     line = asdict(batch) | {"notice": None if batch.notice is None else batch.notice.document()}
     return cast(BatchLine, line)
 
@@ -135,7 +135,8 @@ def begin(page: Page, event: BatchForm) -> Message:
 
 
 def changes(change: Callable[[Service, str], object]) -> Callable[[Page, Chosen], None]:
-    """Returns the function of an action that changes a batch. ``change`` gets the service and the batch's id."""
+    """Makes the function of an action that changes a batch and refreshes the lists. ``change`` gets the service and the
+    batch's id."""
 
     def act(page: Page, event: Chosen) -> None:
         change(page.service, event["id"])

@@ -100,7 +100,7 @@ class UseForm(Chosen):
 
 
 class CalibrationPage(Page, component="calibration.js"):
-    """Shows the page Calibration."""
+    """Shows the shots of the board so far, and the list of calibrations with their reports."""
 
     def look(self) -> CalibrationState:
         """Returns the state of the page, which is the same for all callers."""
@@ -185,7 +185,7 @@ def take_back(page: Page, event: object) -> None:
 
 
 def start_over(page: Page, event: object) -> None:
-    """Empties the collection of shots."""
+    """Empties the collection of board shots; the captures stay."""
     shots.clear()
     shared.forget("calibration page")
 

@@ -74,7 +74,7 @@ class BulkForm(WorkForm):
 
 
 class CapturesPage(Page, component="captures.js"):
-    """Shows the page Captures."""
+    """Shows the list of captures, and the selected one with its pictures, outlines and jobs."""
 
     def look(self) -> CapturesState:
         """Returns the state of the page. The selected capture stays selected when others arrive, so that nobody removes

@@ -52,7 +52,7 @@ class Size(TypedDict):
 
 
 class Picking(Helps):
-    """Holds the points of one capture and what helps to pick them; pixels are those of the picture files.
+    """Holds the points of one capture and the aids for picking more; pixels are those of the picture files.
 
     ``names``: all points, of which the first seven are those of section 4.2; ``suggested``: suggestions that nobody has
     accepted yet; ``dirty``: there are points that are not saved; ``is_contradictory``: contradictions must be confirmed
@@ -139,12 +139,13 @@ drafts = Drafts()
 
 
 class FeaturesPage(Page, component="features.js"):
-    """Shows the page Features. Points belong to one open page until they are saved."""
+    """Shows the views of one capture, in which feature points are picked. Points belong to one open page until they are
+    saved."""
 
     picked: Picked | None = None
 
     def look(self) -> FeaturesShown:
-        """Returns the captures to choose from, and the points of the chosen one with what helps to pick more."""
+        """Returns the captures to choose from, and the points of the chosen one with the aids for picking more."""
         captures: list[CaptureChoice] = shared.get("choices", 2.0, lambda: captures_to_pick(self.service))
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         known = any(capture["id"] == chosen for capture in captures)
@@ -196,12 +197,13 @@ def captures_to_pick(service: Service) -> list[CaptureChoice]:
 
 
 def choice_of(record: CaptureRecord) -> CaptureChoice:
-    """Returns a capture as the list to choose from shows it."""
+    """Converts a capture's record to an entry of the list to choose from."""
     return {"id": record.id, "label": record.label, "created": record.created, "features": record.features}
 
 
 def rig_of(service: Service, capture_id: str) -> Rig:
-    """Reads the rig from the files of a capture. Raises NotFound for a text that is no id, and InputError."""
+    """Reads the rig from the files of a capture. Raises NotFound for a text that is no id, and InputError for a damaged
+    file."""
     path = find_rig_file(service.store.folder("captures", capture_id) / "files")
     assert path is not None  # it was accepted with one
     return read_rig_file(Path(path))
@@ -267,7 +269,7 @@ def accept(page: FeaturesPage, event: SuggestedPlaces) -> None:
 
 
 def reject(page: FeaturesPage, event: SuggestedPlaces) -> None:
-    """Drops the selected suggestions."""
+    """Drops the selected suggestions without setting points."""
     picked = page.of_capture()
     picked.suggested = drop_suggestions(picked.suggested, event.get("point"), event.get("camera"))
 

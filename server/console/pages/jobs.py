@@ -105,7 +105,7 @@ class SettingsForm(TypedDict, total=False):
 
 
 class BulkForm(TypedDict):
-    """Holds one action on all jobs ``ids``."""
+    """Holds one action (cancel, restart, remove) on all jobs ``ids``."""
 
     ids: list[str]
     action: str
@@ -128,7 +128,7 @@ class ListedJob:
 
 
 class JobsPage(Page, component="jobs.js"):
-    """Shows the page Jobs."""
+    """Shows the list of jobs, and the selected one with its log and, once it has finished, its figures."""
 
     def look(self) -> JobsShown:
         """Returns one page of the list, and the selected job with its details. Without a selection that is a running
@@ -191,7 +191,7 @@ def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
 
 
 def job_line(listed: ListedJob) -> ShownJob:
-    """Returns a job as the list shows it."""
+    """Converts a job to an entry of the page's list."""
     job, notice = listed.job, listed.job.notice
     line = asdict(replace(job, error=None, notice=None, files={}))
     line |= {"error": shown_failure(job.error), "notice": None if notice is None else notice.text}
@@ -223,7 +223,7 @@ def job_detail(service: Service, job_id: str) -> JobDetail:
 
 
 def camera_line(name: str, camera: CameraReport) -> CameraLine:
-    """Returns what report.json says of a camera."""
+    """Reads the figures of one camera from its part of report.json."""
     view = camera.get("view")
     return {
         "name": name,

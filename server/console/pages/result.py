@@ -71,7 +71,7 @@ class ResultShown(TypedDict):
 
 
 class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
-    """Shows the page Result."""
+    """Shows one head in 3D with its figures, and the heads to choose from."""
 
     def look(self) -> ResultShown:
         """Returns the shown head and the heads to choose from. A head that arrives meanwhile does not replace the shown
@@ -122,7 +122,7 @@ def heads_of_subject(service: Service, head: ResultLine) -> list[ResultLine]:
 
 
 def result_lines(service: Service, jobs: Iterable[Job]) -> list[ResultLine]:
-    """Returns the jobs as the page lists them, with capture and subject of each."""
+    """Converts jobs that have a result to entries of the page's list, with the capture and the subject of each."""
     found = []
     for listed in listed_jobs(service, jobs):
         subject = ""
@@ -134,7 +134,7 @@ def result_lines(service: Service, jobs: Iterable[Job]) -> list[ResultLine]:
 
 
 def result_line(listed: ListedJob, subject: str) -> ResultLine:
-    """Returns a job as the page lists it."""
+    """Converts a job that has a result to an entry of the page's list."""
     job = listed.job
     return {
         "id": job.id,

@@ -46,7 +46,7 @@ class InUse(TypedDict):
 
 
 class LastCapture(TypedDict):
-    """Holds the newest capture."""
+    """Holds the id, time and source of the newest capture."""
 
     id: str
     created: str
@@ -105,10 +105,10 @@ class RigPageShown(RigShown):
 
 
 class RigPage(Page, component="rig.js"):
-    """Shows the page of the rig."""
+    """Shows the rig: live pictures, state, calibration and clean plates, and the shot that was just taken."""
 
     def look(self) -> RigPageShown:
-        """Returns the state of the rig, and the shot and job of this page."""
+        """Returns the state of the rig, and the shot and job that were started on this page."""
         state: RigShown = shared.get("rig", 0.4, lambda: rig_state(self.service))
         job = job_strip(self.service, self.choice.get("job"))
         return {**state, "shot": shot_taken(self.service, self.choice.get("shot")), "job": job}
@@ -132,7 +132,8 @@ def job_strip(service: Service, identity: str | None) -> JobStrip | None:
 
 
 def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
-    """Returns the capture on which the operator has not decided; None if there is none or it was removed."""
+    """Returns the capture about which the operator has not decided yet whether to keep it; None if there is none or it
+    was removed."""
     if identity is None or identity in removals:
         return None
     with suppress(NotFound):
@@ -238,7 +239,7 @@ def capture(page: Page, event: Mapping[str, str | None]) -> Message:
 
 
 def keep(page: Page, event: object) -> None:
-    """Keeps the shot that was shown for a decision."""
+    """Keeps the shot that was just taken, and stops showing it for a decision."""
     page.choice["shot"] = None
 
 

@@ -1,4 +1,4 @@
-"""The page Service: API keys, what is kept and removed next, and what lies on the disk."""
+"""The page about the service itself: API keys, what is kept and removed next, and what lies on the disk."""
 
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -75,8 +75,8 @@ class KeyForm(TypedDict):
 
 
 class ServicePage(Page, component="service.js"):
-    """Shows the page Service. The secret of a new key is sent over the page's socket once and is never part of the
-    state."""
+    """Shows API keys, retention and the use of the disk. The secret of a new key is sent over the page's socket once
+    and is never part of the page's state."""
 
     secret: str | None = None  # of a key that was made a moment ago, until the page has it
 
@@ -102,7 +102,7 @@ class ServicePage(Page, component="service.js"):
 
 
 def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
-    """Returns all API keys as the page shows them, oldest first."""
+    """Converts all API keys to entries of the page's list, oldest first. ``caller`` decides which key is yours."""
     return [
         {
             "id": key.id,
@@ -116,7 +116,7 @@ def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
 
 
 def setting_lines(s: ServiceSettings) -> list[SettingLine]:
-    """Returns the settings of retention with their values in words."""
+    """Converts the settings of retention to entries of the page's list, with their values in words."""
     values = {
         "keep_captures_days": _days(s.keep_captures_days),
         "keep_results_days": _days(s.keep_results_days),
@@ -199,12 +199,12 @@ def sweep_now(page: ServicePage, event: object) -> Message:
 
 
 def count_again(page: ServicePage, event: object) -> None:
-    """Has the data folder counted anew."""
+    """Starts to count the bytes in the data folder anew."""
     forget_storage(page.service)
 
 
 def forget_storage(service: Service) -> None:
-    """Drops the cached figures of the disk and of what is removed next."""
+    """Drops the cached figures of the disk and of what retention removes next, so that they are computed anew."""
     service.storage.forget()
     shared.forget("storage", "upcoming")
 
@@ -221,5 +221,5 @@ ServicePage.actions = {
 
 @ui.page("/service")
 async def service_page() -> RedirectResponse | None:
-    """Serves the page Service."""
+    """Serves the page about the service itself."""
     return await show("service", ServicePage)

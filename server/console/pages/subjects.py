@@ -27,7 +27,7 @@ class SubjectsState(TypedDict):
 
 
 class SubjectsPage(Page, component="subjects.js"):
-    """Shows the page Subjects."""
+    """Shows the people of the library, each with a picture of the newest head."""
 
     def look(self) -> SubjectsState:
         """Returns one page of the list of subjects."""

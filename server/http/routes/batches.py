@@ -137,7 +137,7 @@ def pause_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOu
 
 @router.post("/batches/{batch_id}/resume", responses=documented(404, 409))
 def resume_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """Continues a paused batch."""
+    """Resumes a paused batch: its captures get jobs again."""
     return BatchOut.model_validate(service.batches.resume(batch_id))
 
 

@@ -158,7 +158,7 @@ def get_image(service: ServiceOf, caller: Reader, request: Request, capture_id: 
 @router.head("/captures/{capture_id}/backgrounds/{camera}", include_in_schema=False)
 @router.get("/captures/{capture_id}/backgrounds/{camera}", responses=IMAGE_RESPONSES, response_class=FileResponse)
 def get_background(service: ServiceOf, caller: Reader, request: Request, capture_id: str, camera: str) -> Response:
-    """Returns the first clean plate of a camera."""
+    """Returns a clean plate of a camera, the first one if there are several."""
     return send_file(request, service.captures.image(capture_id, "background", camera))
 
 
@@ -170,7 +170,7 @@ def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: N
 
 @router.get("/captures/{capture_id}/features", responses=documented(404))
 def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeatures:
-    """Returns the stored feature points."""
+    """Returns the stored feature points, in pixels, by point and camera."""
     return NewFeatures(points=service.captures.features(capture_id))
 
 

@@ -46,7 +46,7 @@ def submit_job(
 
 @router.post("/sessions/{session_id}/jobs", status_code=202, responses=documented(400, 404, 413, 415, 507))
 def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wanted: NewSessionJobs) -> JobBatch:
-    """Queues a reconstruction of every capture of a session."""
+    """Queues a reconstruction of every capture of a session that shows a head."""
     work = ReconstructionRequest(wanted.model, wanted.settings)
     jobs = service.jobs.submit_session(session_id, work, key=caller.key, priority=wanted.priority)
     return JobBatch(jobs=[JobOut.model_validate(job) for job in jobs])

@@ -46,7 +46,7 @@ def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
     responses={200: {"content": {"image/jpeg": {}}}, **documented(404)},
 )
 def rig_preview(service: ServiceOf, caller: Reader, name: str) -> Response:
-    """Returns the camera's present picture."""
+    """Returns a camera's present picture, at most 640 pixels wide."""
     return Response(service.rig.preview(name), media_type="image/jpeg", headers=UNKEPT)
 
 

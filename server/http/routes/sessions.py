@@ -18,7 +18,7 @@ Taker = Annotated[Caller, Depends(require("capture"))]
 
 @router.post("/sessions", status_code=201, responses=documented(400, 413, 415, 507))
 def make_session(service: ServiceOf, caller: Taker, wanted: NewSession, response: Response) -> SessionOut:
-    """Begins a session of one subject."""
+    """Begins a session, which holds captures of one subject."""
     made = service.sessions.add(wanted.label, wanted.consent)
     response.headers["Location"] = f"/v1/sessions/{made.id}"
     return SessionOut.model_validate(made)
@@ -60,7 +60,7 @@ def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionO
 
 @router.patch("/sessions/{session_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: SessionEdit) -> SessionOut:
-    """Changes the label or the consent note."""
+    """Changes the label or the consent note of a session. Keys that are left out keep their values."""
     changed = service.sessions.edit(session_id, label=wanted.label, consent=wanted.consent)
     return SessionOut.model_validate(changed)
 

@@ -1,4 +1,4 @@
-"""What the service needs of a rig, and what every rig shares."""
+"""Declares the methods that the service needs of a rig, and holds helpers that every rig uses."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A rig of real cameras, those of a rig.toml, as the service's rig."""
+"""Makes the real cameras that a rig.toml describes usable as the service's rig."""
 
 import json
 import threading

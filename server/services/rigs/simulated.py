@@ -1,4 +1,4 @@
-"""The simulated studio as the service's rig."""
+"""Makes the simulated studio usable as the service's rig."""
 
 import threading
 from collections.abc import Mapping
@@ -46,7 +46,7 @@ class SimulatedRig:
         return shot
 
     def look(self) -> Mapping[str, ImageRgb]:
-        """Renders what each camera sees, the same subject every time."""
+        """Renders what each camera sees. The subject is the same every time."""
         with self._one_at_a_time:
             return self._child.remote(look)(cameras=list(self._rig().names))
 
@@ -97,7 +97,7 @@ class SimulatedRig:
         write_rig(read_rig(calibration), self._calibration)
 
     def close(self) -> None:
-        """Ends the child process."""
+        """Ends the child process that renders."""
         self._child.close()
 
     @staticmethod
