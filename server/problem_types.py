@@ -1,7 +1,8 @@
-"""Every public type of a problem and of a failed job, with its title: stable names for programs, in one table.
+"""Lists the public type of every problem and of every failed job, with its title: stable names on which programs may
+rely.
 
-A type is written out here and never made of a class's name or a message, which may change. ``urn:eigenhead:problem:``
-stands before it on the wire.
+Types are written out here. They are not derived from names of classes or from messages, since those may change. On the
+wire ``urn:eigenhead:problem:`` stands before a type.
 """
 
 URN = "urn:eigenhead:problem:"

@@ -82,7 +82,7 @@ class Guides:
     def helps(
         self, points: Pixels, landmarks: Landmarks, shown: Collection[str], views: Collection[str] | None = None
     ) -> Helps:
-        """Computes the aids for ``points``, the pixels picked so far, by point and camera.
+        """Computes the aids for picking feature points. ``points``: the pixels picked so far, by point and camera.
 
         ``landmarks``: the model's (head frame, mm); ``shown``: points whose guides are needed; ``views``: cameras in
         which guides are needed (None: all).
@@ -146,7 +146,7 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
 
 
 def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
-    """Computes the aids for all points in all views, without results of an earlier call."""
+    """Computes the aids for picking feature points, for all points in all views, without results of an earlier call."""
     return Guides(rig).helps(points, landmarks, list(points))
 
 

@@ -72,8 +72,8 @@ def is_foreign(scope: Scope, settings: ServiceSettings) -> bool:
 
 
 def is_rebound(scope: Scope, settings: ServiceSettings) -> bool:
-    """Returns whether a request to a service that listens on loopback only names another host than loopback or the
-    public one, as in an attack by DNS rebinding."""
+    """Returns whether a request names a host that is neither loopback nor the public one, although the service listens
+    on loopback only. A browser sends such requests in an attack by DNS rebinding."""
     host = Headers(scope=scope).get("host", "")
     name = host.rpartition(":")
     return is_loopback(settings.host) and host != settings.public_host and not is_loopback(name[0] or name[2])

@@ -42,8 +42,8 @@ class WorkerProcess:
         self._thread.start()
 
     def expect_end(self) -> None:
-        """Lets the worker end from now on without being restarted, since a signal to a process group or a container
-        ends it too."""
+        """Stops restarting the worker. To be called when this process is asked to end: the signal may have gone to the
+        whole process group or container, and ends the worker, too."""
         self._stop.set()
 
     def close(self) -> None:

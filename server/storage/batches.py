@@ -28,7 +28,8 @@ NONE = "-"  # in the place of a job's id: none is to be made, since the capture 
 @dataclass(frozen=True, slots=True)
 class BatchRow:
     """Holds a batch. ``wish`` is what its owner wants: running, paused or cancelled. ``finished`` is when nothing was
-    left to do (ms since 1970), None before. ``rounds`` counts how often it finished or failed jobs were tried again."""
+    left to do (ms since 1970), None before. ``rounds`` grows whenever it finishes and whenever its failed jobs are
+    tried again."""
 
     id: str
     created: int

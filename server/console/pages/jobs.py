@@ -257,8 +257,8 @@ def restart(page: Page, event: RestartForm) -> Message:
 
 
 def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
-    """Reads the settings of a form: method, detail, front, and further ones from JSON. Raises InputError if that is no
-    JSON object."""
+    """Reads the settings of a form: method, detail, front, and further ones from a JSON text. Raises InputError if that
+    text is no JSON object."""
     try:
         settings = json.loads(event.get("more") or "{}")
     except ValueError as error:
