@@ -246,16 +246,17 @@ HTTP_TYPES = {
 
 
 def type_of_input(subject: str) -> str:
-    """Returns the stable name of the problem that an ``InputError`` with this subject becomes."""
+    """Returns the stable name of the problem for an ``InputError`` with this subject."""
     return INPUT_TYPES.get(subject, "invalid-input")
 
 
 def type_of_failure(kind: str) -> str:
-    """Returns the stable name of the problem that failed work becomes. ``kind``: the class of its error, or how its
-    child process ended."""
+    """Returns the stable name of the problem for failed work. ``kind``: the class of its error, or how its child
+    process ended."""
     return FAILURE_TYPES.get(kind, "eigenhead-error")
 
 
 def type_of_status(status: int) -> str:
-    """Returns the stable name of the problem that the web framework's own refusal with this HTTP status becomes."""
+    """Returns the stable name of the problem for a request that the web framework itself refuses with this HTTP
+    status."""
     return HTTP_TYPES.get(status, "http-error")

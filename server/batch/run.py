@@ -81,7 +81,7 @@ class Observer(Protocol):
         ...
 
     def leave(self, name: str) -> None:
-        """Receives that another process works on the capture."""
+        """Receives that this process stops working on the capture because another one has it."""
         ...
 
     def end(self, outcome: Outcome) -> None:

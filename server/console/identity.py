@@ -35,7 +35,8 @@ def sign_in(service: Service, token: str) -> Caller | None:
 
 
 def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
-    """Returns the caller whose user storage is ``stored``. Returns None if an API key must be given first. Blocks."""
+    """Identifies the caller by ``stored``, the user storage of the browser's session. Returns None if an API key must
+    be given first. Blocks."""
     keys = {key.id: key for key in service.keys.all()}
     if not keys and service.settings.is_private:
         return Caller(LOCAL, frozenset(SCOPES))

@@ -1,7 +1,7 @@
-"""Routes of what the pages fetch by address: the live view, thumbnails, silhouettes, uploads, files of results and
-numbers by vertex.
+"""Declares the routes by which the pages fetch and send files: live view, thumbnails, silhouettes, uploads, files of
+results, numbers by vertex.
 
-Each identifies the caller by the browser's session, as the API does by an API key.
+Each route identifies the caller by the browser's session, as the API does by an API key.
 """
 
 import asyncio

@@ -1,4 +1,5 @@
-"""Captures: shot with the rig or made from an archive, searched, given feature points, changed, removed."""
+"""Manages captures: shoots them with the rig or makes them from archives, searches, changes and removes them, and
+stores their feature points."""
 
 import hashlib
 import json
