@@ -201,7 +201,7 @@ def check_capture(
     """Checks a capture folder and returns its content. Raises InputError naming every fault.
 
     ``measured``: only the subject's place is looked for in the pictures, since the shot measured the rest;
-    ``strays_pass``: pictures of no camera are no faults; ``networks``: look for the subject's face with these.
+    ``strays_pass``: accept pictures that belong to no camera; ``networks``: look for the subject's face with these.
     """
     rig_file = find_rig_file(root)
     if rig_file is None:

@@ -63,8 +63,8 @@ class RealRig:
         return rig_state(self._config.name, "real", cameras, faults, None if rig is None else "own")
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument:
-        """Takes a shot and writes the capture, with hard links to the clean plates. Nothing is written if a camera
-        failed.
+        """Takes a shot and writes the capture, with links to the clean plates, or copies of them where the disk has no
+        links. Nothing is written if a camera failed.
 
         Raises InputError for a seed, and Unavailable if the rig has no calibration (unless ``board`` is set), cannot be
         opened, or a camera fails.
