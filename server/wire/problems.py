@@ -50,6 +50,7 @@ MESSAGE_SCHEMA = {
 
 PROBLEM_SCHEMA = {
     "type": "object",
+    "description": "Describes why a request was refused or failed, after RFC 9457.",
     "required": ["type", "title", "status", "detail", "errors"],
     "properties": {
         "type": {"type": "string", "description": f"stable name, {URN}<kind>"},
