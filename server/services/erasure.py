@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from rig.messages.message import compose
 from server.errors import Unavailable
-from server.services.job_states import FINISHED
+from server.services.job_rows import FINISHED
 from server.services.jobs import Jobs
 from server.storage.store import Store, folder_bytes
 

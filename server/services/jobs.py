@@ -12,7 +12,7 @@ from typing import cast
 
 import sqlalchemy as sa
 import structlog
-from dbos import DBOS, DBOSClient, EnqueueOptions, WorkflowStatus
+from dbos import DBOS, DBOSClient, WorkflowStatus
 
 from rig.errors import InputError
 from rig.messages.message import Message, compose
@@ -21,16 +21,18 @@ from server.log import log_file
 from server.origins import target
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
-from server.services.job_states import (
+from server.services.job_rows import (
     APPLICATION,
-    APPLICATION_VERSION,
     FINISHED,
     STATES,
     STATUSES,
     WORKFLOW,
-    select_by_state,
+    by_state,
+    enqueue_options,
+    moment,
+    request_of,
 )
-from server.services.records import Found, Job, moment_of
+from server.services.records import Found, Job
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
@@ -128,10 +130,10 @@ class Jobs:
             self._check_count(key)
             self.index.add(job_id, request, session)
             attributes = {"capture": request["capture_id"], "session": session, "key": key}
-            self.client.enqueue(_options(job_id, queue or self._settings.queue, priority, attributes), request)
+            self.client.enqueue(enqueue_options(job_id, queue or self._settings.queue, priority, attributes), request)
             first = self._status(job_id)
             assert first is not None
-        if not self._asks_the_same(_request(first), request):
+        if not self._asks_the_same(request_of(first), request):
             detail = compose("idempotency-key-reused")
             raise Conflict("idempotency-conflict", detail)
         return self._jobs([first])[0]
@@ -144,7 +146,7 @@ class Jobs:
         job_id = new_id()
         self.index.add_within(connection, job_id, request, session)
         attributes = {"capture": request["capture_id"], "session": session, "batch": batch.id}
-        options = _options(job_id, batch.queue, batch.priority, attributes)
+        options = enqueue_options(job_id, batch.queue, batch.priority, attributes)
         self.client.enqueue_in_transaction(connection, options, request)
         return job_id
 
@@ -162,7 +164,7 @@ class Jobs:
 
     def webhook(self, job_id: str) -> JobWebhook | None:
         """Returns the webhook that a job was submitted with, if any. Raises NotFound."""
-        return (_request(self._known(job_id)) or {}).get("webhook")
+        return (request_of(self._known(job_id)) or {}).get("webhook")
 
     def state(self, job_id: str) -> str:
         """Returns the state of a job: "queued", "running", "succeeded", "failed" or "cancelled". Raises NotFound."""
@@ -191,7 +193,7 @@ class Jobs:
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
         """Returns one page of the jobs that match a query, ``limit`` at most. A word of the search that names a state
         ("failed") selects jobs in that state. Raises InputError for a cursor of another list."""
-        page = self.index.page(select_by_state(query), limit, cursor)
+        page = self.index.page(by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[Job]:
@@ -273,7 +275,7 @@ class Jobs:
         capture is gone, and TooMany."""
         wanted.check()
         row = self._known(job_id)
-        request = _request(row)
+        request = request_of(row)
         if request is None:
             raise NotFound(compose("thing-job-request"), job_id)
         request = cast(JobRequest, {**request, "restart_of": job_id})
@@ -296,7 +298,7 @@ class Jobs:
 
     def _requests(self, jobs: list[str]) -> dict[str, JobRequest]:
         rows = self.client.list_workflows(workflow_ids=jobs, name=WORKFLOW, load_output=False)
-        return {row.workflow_id: request for row in rows if (request := _request(row)) is not None}
+        return {row.workflow_id: request for row in rows if (request := request_of(row)) is not None}
 
     def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
         latest = self.events.latest([row.workflow_id for row in rows])
@@ -344,7 +346,7 @@ class Jobs:
     def _job(self, row: WorkflowStatus, event: JobEvent | None, places: Mapping[str, int]) -> Job:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
-        request = _request(row)
+        request = request_of(row)
         attributes = row.attributes or {}
         return Job(
             id=row.workflow_id,
@@ -363,28 +365,8 @@ class Jobs:
             queue=row.queue_name,
             priority=row.priority or 0,
             queue_position=places.get(row.workflow_id) if state == "queued" else None,
-            created=_moment(row.created_at),
-            started=_moment(row.dequeued_at),
-            finished=_moment(row.completed_at) if state in FINISHED else None,
+            created=moment(row.created_at),
+            started=moment(row.dequeued_at),
+            finished=moment(row.completed_at) if state in FINISHED else None,
             files=dict(row.output or {}) if state == "succeeded" else {},
         )
-
-
-def _options(job_id: str, queue: str, priority: int, attributes: dict[str, str | None]) -> EnqueueOptions:
-    return {
-        "workflow_name": WORKFLOW,
-        "queue_name": queue,
-        "workflow_id": job_id,
-        "app_version": APPLICATION_VERSION,
-        "priority": priority,
-        "attributes": attributes,
-    }
-
-
-def _request(row: WorkflowStatus) -> JobRequest | None:
-    """A copy of what the job was asked for; None where its input cannot be read."""
-    return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
-
-
-def _moment(milliseconds: int | None) -> str | None:
-    return None if milliseconds is None else moment_of(milliseconds)

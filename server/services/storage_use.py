@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from server.services.job_states import STATUSES
+from server.services.job_rows import STATUSES
 from server.services.jobs import Jobs
 from server.settings import ServiceSettings
 from server.storage.job_index import JobQuery

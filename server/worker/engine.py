@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from dbos import DBOS, DBOSConfig
 
-from server.services.job_states import APPLICATION, APPLICATION_VERSION
+from server.services.job_rows import APPLICATION, APPLICATION_VERSION
 from server.settings import ServiceSettings
 
 

@@ -8,7 +8,7 @@ import pytest
 import sqlalchemy as sa
 
 from server.cli import doctor
-from server.services.job_states import WORKFLOW
+from server.services.job_rows import WORKFLOW
 from server.services.jobs import migrate
 from server.services.keys import Keys
 from server.settings import ServiceSettings
