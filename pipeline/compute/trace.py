@@ -8,12 +8,15 @@ on a busy machine only the latter say what work there was.
 
 import functools
 import json
+import math
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import count
+from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar
 
 FORMAT = "eigenhead-trace/1"
@@ -68,6 +71,7 @@ class Trace:
             "threads": threads,
             "cpus": len(os.sched_getaffinity(0)),
             "before_cpu_s": self._before_s,
+            "peak_memory_mb": peak_memory_mb(),
         }
         names: list[dict[str, Any]] = [
             {"ph": "M", "name": "thread_name", "pid": os.getpid(), "tid": thread, "args": {"name": name}}
@@ -76,6 +80,18 @@ class Trace:
         events = names + sorted(self._events, key=lambda event: (event["ts"], -event["dur"]))
         lines = ",\n".join(json.dumps(event) for event in events)
         return f'{json.dumps(header)[:-1]}, "traceEvents": [\n{lines}\n]}}\n'.encode()
+
+
+def peak_memory_mb() -> float:
+    """Returns the most memory (MiB) that this process has held since its program was loaded; NaN where the system does
+    not say.
+
+    ``getrusage`` gives more: its maximum outlives ``exec``, so that a child of a large process begins with the parent's
+    (proc(5), ``VmHWM``).
+    """
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.is_file() else None
+    return int(found[1]) / 1024 if found else math.nan
 
 
 _active: Trace | None = None

@@ -126,9 +126,9 @@ def run_job(capture: Path, command: JobCommand, threads: int, folder: Path | Non
         if child.returncode:
             lines = log.read_text(errors="replace").strip().splitlines()
             raise JobFailed(capture, lines[-1] if lines else f"exit status {child.returncode}")
-        work = row_of(work_of(json.loads(path.read_text())))
-    spent = {"wall_s": wall_s, "process_cpu_s": usage.ru_utime + usage.ru_stime, "peak_mb": usage.ru_maxrss / 1024}
-    return spent | work
+        document = json.loads(path.read_text())
+    spent = {"wall_s": wall_s, "process_cpu_s": usage.ru_utime + usage.ru_stime, "peak_mb": document["peak_memory_mb"]}
+    return spent | row_of(work_of(document))
 
 
 def _figures(row: Row) -> dict[str, float]:
