@@ -29,6 +29,7 @@ class Found:
 
     @property
     def words(self) -> str:
+        """Returns the expression's name in plain words."""
         return words(self.name)
 
 

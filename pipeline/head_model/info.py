@@ -7,12 +7,15 @@ from pipeline.head_model.model import HeadModel
 
 
 class LevelInfo(TypedDict):
+    """Describes the size of a mesh level."""
+
     vertices: int
     faces: int
 
 
 class ModelInfo(TypedDict):
-    """Holds what is known of a model. Vertices and faces are those of the full level; what nobody measured is None."""
+    """Describes a head model. ``vertices`` and ``faces`` are those of the full level; figures that were never measured
+    are None."""
 
     name: str
     licence: str
