@@ -15,6 +15,7 @@ class RigidTransform:
 
     @classmethod
     def identity(cls) -> "RigidTransform":
+        """Returns the transform that changes nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     def __matmul__(self, other: "RigidTransform") -> "RigidTransform":
@@ -41,6 +42,7 @@ class Similarity:
 
     @classmethod
     def identity(cls) -> "Similarity":
+        """Returns the similarity that changes nothing."""
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @classmethod

@@ -37,6 +37,7 @@ class Planted:
     start: Similarity
 
     def vertices(self, model: HeadModel, level: str = "full") -> Float[np.ndarray, "v 3"]:
+        """Returns the true vertices of a mesh level, world frame, mm."""
         return self.world_from_head.apply(model.vertices(self.coefficients, level))
 
 

@@ -16,11 +16,13 @@ VERBATIM = "verbatim"  # the code of text that another program or an earlier ver
 
 @runtime_checkable
 class Scalar(Protocol):
-    """Stands for a number of NumPy, which this room does not load: a command line that only refuses something starts at
-    once."""
+    """Describes a number of NumPy. NumPy itself is not imported here, so that a command that only prints a message
+    starts at once."""
 
     @property
-    def dtype(self) -> Any: ...
+    def dtype(self) -> Any:
+        """Returns NumPy's type of the number."""
+        ...
 
     def item(self) -> Any:
         """Returns the plain number."""

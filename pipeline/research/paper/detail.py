@@ -84,7 +84,7 @@ class Known:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """Holds what one level of detail made of a capture."""
+    """Holds the fit of one level of detail to a capture."""
 
     fit: Fit
     model: HeadModel  # with the modes that the fit has
@@ -92,6 +92,7 @@ class Fitted:
     seconds: float
 
     def mesh(self) -> Mesh:
+        """Returns the fitted head on the full level, world frame, mm."""
         vertices = self.fit.world_from_head.apply(self.model.vertices(self.fit.coefficients))
         return Mesh(vertices, self.model.levels["full"].faces)
 
@@ -212,6 +213,7 @@ def every_level(
 
 
 def hull_row(known: Callable[[], Known]) -> Row:
+    """Computes the visual hull of a capture, and returns its distances (mm) from the true face."""
     subject = known()
     silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=discard_progress)
     return {"hull": surface_error(subject, visual_hull(silhouettes, subject.rig))}

@@ -74,13 +74,14 @@ class Task:
 
 
 class Counted:
-    """Holds a function that counts its calls and their seconds."""
+    """Wraps a function and counts its calls and their seconds."""
 
     def __init__(self, function: Callable[[np.ndarray], float]) -> None:
         self._function = function
         self.calls, self.seconds = 0, 0.0
 
     def __call__(self, x: Float[np.ndarray, " m"]) -> float:
+        """Returns the function's value at ``x``, and counts the call."""
         began = time.perf_counter()
         value = self._function(x)
         self.calls += 1
@@ -159,12 +160,14 @@ def derivative_free(minimise: Minimiser) -> Callable[[Task], Row]:
 
 
 def error_row(task: Task, fit: Fit) -> Row:
+    """Returns the mean distance (mm) of the face region's vertices from their true positions, and the evaluations that
+    the fit took."""
     return {"error_mm": mean_error_mm(task.whole, fit, task.subject), "evaluations": fit.evaluations}
 
 
 def nelder_mead(function: Counted, start: Float[np.ndarray, " m"], *, adaptive: bool) -> Float[np.ndarray, " m"]:
-    """Runs scipy's, stopped by the relative spread of its values, which scipy itself does not offer: it is run a few
-    moves at a time, and goes on from its own simplex, whose values are remembered."""
+    """Minimises a function by SciPy's downhill simplex, until the relative spread of its values is small. SciPy has no
+    such rule: it is run for a few moves at a time, and goes on from its own simplex, whose values are remembered."""
     known: dict[bytes, float] = {}
 
     def remembered(x: Float[np.ndarray, " m"]) -> float:
@@ -186,6 +189,7 @@ def nelder_mead(function: Counted, start: Float[np.ndarray, " m"], *, adaptive: 
 
 
 def diagonal_cma(function: Counted, start: Float[np.ndarray, " m"], level: int) -> Float[np.ndarray, " m"]:
+    """Minimises a function by CMA-ES with a diagonal covariance (the library cma), from the same seed each time."""
     import cma
 
     options = {"CMA_diagonal": True, "maxfevals": LIMIT, "seed": 1, "verbose": -9}
@@ -195,6 +199,7 @@ def diagonal_cma(function: Counted, start: Float[np.ndarray, " m"], level: int) 
 
 
 def bobyqa(function: Counted, start: Float[np.ndarray, " m"], level: int) -> Float[np.ndarray, " m"]:
+    """Minimises a function by BOBYQA, Powell's trust region without derivatives (the library Py-BOBYQA)."""
     import pybobyqa
 
     first, last = BOBYQA_RADII[level]
@@ -205,6 +210,8 @@ def bobyqa(function: Counted, start: Float[np.ndarray, " m"], level: int) -> Flo
 
 
 def soft(task: Task, *, whole: bool = False) -> Row:
+    """Fits the shape with a differentiable soft rasteriser. ``whole`` takes all modes of the model, else as many as the
+    paper."""
     pose, model = task.subject.world_from_head, task.whole if whole else task.model
     coefficients, steps = soft_rasteriser.fit_soft(
         model, pose, task.silhouettes, task.rig, renderer=task.renderer, modes=len(model.modes)
@@ -213,7 +220,7 @@ def soft(task: Task, *, whole: bool = False) -> Row:
 
 
 def hull(task: Task) -> Row:
-    """Returns the distance of the true face's vertices to the hull."""
+    """Computes the visual hull, and returns the mean distance (mm) of the true face's vertices from it."""
     mesh = visual_hull(task.silhouettes, task.rig)
     face = task.subject.vertices(task.whole)[task.model.levels["full"].face_region]
     distances = SurfaceIndex(mesh.vertices, mesh.faces, 1.0).closest(face).distances
@@ -221,6 +228,8 @@ def hull(task: Task) -> Row:
 
 
 def ours(task: Task, *, whole: bool = False) -> Row:
+    """Fits the shape with this project's contour solver. ``whole`` takes all modes of the model, else as many as the
+    paper."""
     model = task.whole if whole else task.model
     fit = fit_contour(model, task.subject.start, task.silhouettes, task.rig, FittingSettings())
     return error_row(task, fit)
@@ -242,7 +251,8 @@ WARMED = ("contour", "contour_all", "hull", "soft", "soft_all")
 
 
 def figures(rows: list[Row]) -> dict[str, float]:
-    """Means over the subjects; ratios of sums, so that no subject counts more than its seconds."""
+    """Returns the means over the subjects, by solver, and each solver's ratios to the contour solver. These are ratios
+    of sums, so that no subject counts more than its seconds."""
     found: dict[str, float] = {"subjects": len(rows)}
     found["mean_head_mm"] = float(np.mean([row["mean_head_mm"] for row in rows]))
     total = {name: {q: sum(row[name][q] for row in rows) for q in ("seconds", "error_mm")} for name in SOLVERS}
@@ -256,6 +266,8 @@ def figures(rows: list[Row]) -> dict[str, float]:
 
 
 def as_markdown(found: dict[str, float]) -> str:
+    """Returns the figures as a Markdown table with a row for each solver."""
+
     def row(name: str) -> list[markdown.Cell]:
         quantities = ("seconds", "evaluations", "ms_per_evaluation", "error_mm")
         ratios = (f"speedup_over_{name}", f"error_ratio_{name}")

@@ -79,6 +79,7 @@ class Case:
 
     @property
     def name(self) -> str:
+        """Returns the row's name: subject, arrangement of cameras, and what is known."""
         return f"{self.subject} {self.kind} {self.evidence}"
 
 

@@ -57,7 +57,8 @@ class Loop:
 
 @dataclass(slots=True, eq=False)
 class Section:
-    """Holds a stage or a part of one: its visits' processor seconds of all threads, and the loops that it shares."""
+    """Holds the work of a stage or of a part of one: processor seconds of all threads, and the loops that threads
+    share."""
 
     name: str
     cpu_s: float = 0.0
@@ -74,13 +75,14 @@ class Section:
         return max(0.0, self.cpu_s - self.shared_s)
 
     def seconds(self, cores: int) -> float:
+        """Returns how long the section takes on so many cores."""
         return self.serial_s + sum(loop.seconds(cores) for loop in self.loops)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JobWork:
-    """Holds what a job worked: by stage in their order, ``start`` (what was loaded before) and ``between`` the stages
-    included; and by part, named "stage: part"."""
+    """Holds the work of a job: by stage in their order, with ``start`` (what was loaded before) and ``between`` the
+    stages; and by part, named "stage: part"."""
 
     stages: tuple[Section, ...]
     parts: tuple[Section, ...]
@@ -88,6 +90,7 @@ class JobWork:
 
     @property
     def cpu_s(self) -> float:
+        """Returns the processor seconds of all stages."""
         return sum(stage.cpu_s for stage in self.stages)
 
     @property

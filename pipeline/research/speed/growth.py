@@ -46,6 +46,7 @@ class Size:
 
     @property
     def name(self) -> str:
+        """Returns the size in words: number of views and millions of pixels."""
         return f"{self.views} views of {self.megapixels:.2g} Mpx"
 
     def rig(self) -> Rig:

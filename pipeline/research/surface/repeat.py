@@ -143,6 +143,8 @@ def moved(rng: np.random.Generator) -> tuple[Lamp, ...]:
 
 
 def reconstructed(scene: Scene, capture: Capture, model: HeadModel, renderer: Renderer) -> Shot:
+    """Reconstructs a simulated capture, and returns the head with its stated deviations, the truth, and the
+    warnings."""
     settings = Settings(outputs=OutputSettings(surface="head"))
     done = reconstruct(ReconstructionContext(capture, scene.rig, model, settings, renderer))
     codes = frozenset(warning.code for warning in done.warnings)

@@ -54,7 +54,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Holds a subject and what surfaces are made of; each is made when it is first asked for."""
+    """Holds a subject and what surfaces are made from; silhouettes and depth maps are computed when first used."""
 
     known: Known
     model: HeadModel
@@ -62,10 +62,12 @@ class Shown:
 
     @cached_property
     def silhouettes(self) -> dict[str, Silhouette]:
+        """Computes the silhouettes of the capture, by camera."""
         return segment(self.known.capture, self.known.rig, Settings().segmentation, report=discard_progress)
 
     @cached_property
     def depth_maps(self) -> tuple[DepthMap, ...]:
+        """Computes the depth maps of the capture, with the head fitted at the level ``photo``."""
         known = self.known
         head = every_level(known.capture, known.rig, self.model, ("photo",), self.renderer)["photo"].mesh()
         return estimate_depth(
@@ -131,6 +133,8 @@ def peer_row(known: Known, make: Callable[[], tuple[Mesh, float]]) -> Row:
 
 
 def ours(shown: Shown) -> tuple[Mesh, float]:
+    """Makes the bust of this project. Returns it with the processor seconds of the whole job. Raises PeerFailed without
+    a bust."""
     before, known = time.process_time(), shown.known
     found = reconstruct(ReconstructionContext(known.capture, known.rig, shown.model, Settings(), shown.renderer))
     if found.bust is None:
@@ -139,11 +143,14 @@ def ours(shown: Shown) -> tuple[Mesh, float]:
 
 
 def hull(shown: Shown) -> tuple[Mesh, float]:
+    """Makes the visual hull. Returns it with its processor seconds, silhouettes excluded."""
     silhouettes, before = shown.silhouettes, time.process_time()
     return visual_hull(silhouettes, shown.known.rig), time.process_time() - before
 
 
 def poisson(shown: Shown) -> tuple[Mesh, float]:
+    """Makes a surface from the depth maps by Open3D's screened Poisson reconstruction. Returns it with its processor
+    seconds, depth maps excluded."""
     import open3d
 
     maps, before = shown.depth_maps, time.process_time()
@@ -161,12 +168,15 @@ def poisson(shown: Shown) -> tuple[Mesh, float]:
 
 
 def by_openmvs(shown: Shown, *, programs: Mapping[str, Path]) -> tuple[Mesh, float]:
+    """Makes a surface from the photographs by OpenMVS, starting from the visual hull. Returns it with its processor
+    seconds."""
     with tempfile.TemporaryDirectory(prefix="openmvs-") as folder:
         body = visual_hull(shown.silhouettes, shown.known.rig)
         return surface_by_openmvs(shown.depth_maps, body, programs, Path(folder))
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
+    """Returns the numbers of all rows by name: capture, surface and column joined."""
     return {
         f"{row['name']}_{row['peer']}_{key}": value
         for row in rows
