@@ -1,4 +1,4 @@
-"""What a head model is made of, as ``eigenhead model info --json`` says it."""
+"""Describes a head model, as ``eigenhead model info --json`` prints it."""
 
 from collections.abc import Mapping
 from typing import TypedDict

@@ -1,6 +1,7 @@
-"""What parts are told apart by, on a coarse grid of every photograph: colour, fine structure, and place on the head.
+"""Computes what distinguishes the parts, on a coarse grid of every photograph: colour, fine structure, and position on
+the head.
 
-A cell is a square of pixels, some two millimetres wide on the subject whatever the camera's resolution.
+A cell is a square of pixels, about two millimetres wide on the subject whatever the camera's resolution.
 """
 
 from collections.abc import Mapping
@@ -32,8 +33,9 @@ DETAIL_BLUR_CELLS = 1.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadGuide:
-    """Holds where each vertex of a fitted head lies: its signed distance (mm) from the border of the face region,
-    positive within, its height (mm) above the chin along the head's upward axis, and that axis."""
+    """Holds the position of each vertex of a fitted head: its signed distance (mm) from the border of the face region,
+    positive inside, and its height (mm) above the chin along the head's upward axis; also which vertices are cheeks,
+    features, or the underside of the jaw."""
 
     mesh: Mesh  # world frame
     into_face_mm: Float[np.ndarray, " v"]

@@ -1,4 +1,4 @@
-"""Tables as people read them."""
+"""Formats tables as Markdown."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,11 +1,10 @@
-"""Background subtraction (section 5.4): a capture to one silhouette a camera.
+"""Subtracts the background (section 5.4): from a capture to one silhouette for each camera.
 
-``pipeline.segmentation.foreground`` decides what is subject, asking the other cameras where it is in doubt;
-``pipeline.segmentation.matting`` then finds the sub-pixel contour, and ``pipeline.segmentation.view_consistency``
-compares what the cameras say.
-
-The paper says only "background subtraction". A view whose mask cannot be trusted is reported: ``quality.usable`` is
-False where it would hurt a fit, and ``quality.warnings`` say why. Operator masks override everything.
+``pipeline.segmentation.foreground`` decides what is subject, with the help of other cameras where it is in doubt;
+``pipeline.segmentation.matting`` then finds the sub-pixel contour; ``pipeline.segmentation.view_consistency`` compares
+the cameras. The paper says only "background subtraction". A view whose mask is unreliable is reported:
+``quality.usable`` is False if it would harm a fit, and ``quality.warnings`` say why. Masks of the operator override
+everything.
 """
 
 from collections.abc import Mapping

@@ -119,10 +119,10 @@ def blur_px(image: ImageRgb) -> float | None:
 
 
 def register(image: ImageRgb, plate: ImageRgb) -> Registration:
-    """Finds the background of ``plate`` in ``image``, which a subject may hide in part, and returns how far it moved.
+    """Finds the background of ``plate`` in ``image``, which a subject may partly hide, and returns how far it moved.
 
-    Textured patches of the plate are searched for near their places by normalised correlation, which brightness and
-    contrast do not change; those that a common similarity explains (RANSAC) were found.
+    Textured patches of the plate are searched near their positions by normalised correlation, which brightness and
+    contrast do not change. Those that one similarity explains (RANSAC) count as found.
     """
     if image.shape != plate.shape:
         return Registration(_PATCHES_MOST, 0.0, 0.0)

@@ -124,14 +124,15 @@ class RigSession:
             self._look(deadline_s + self.config.shot.timeout_s)
 
     def look(self, only: Collection[str] | None = None) -> Mapping[str, ImageRgb]:
-        """Returns a picture of each camera that shows one, of no given moment. ``only``: cameras to ask (None: all)."""
+        """Returns a current picture of each camera that delivers one, without synchronisation. ``only`` names the
+        cameras; None takes all."""
         with self._busy:
             self._lights_on()
             frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s, only)
             return {name: frame.image for name, frame in frames.items()}
 
     def shoot(self) -> Shot:
-        """Takes one synchronised shot. No device makes it raise: what is wrong is told by the shot's faults."""
+        """Takes one synchronised shot. It raises nothing for a failing device: the shot's faults say what is wrong."""
         with self._busy:
             self._lights_on()
             self._glance()

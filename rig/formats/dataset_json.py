@@ -73,8 +73,8 @@ def dataset_documents(rig: Rig, form: DatasetFormat, *, with_points: bool) -> di
 
 
 def camera_kept_back(rig: Rig) -> str:
-    """Returns the camera that is not trained on: the one whose two nearest neighbours are nearest, which is missed
-    least."""
+    """Returns the camera that is left out of training, to test the result: the one whose two nearest neighbours are
+    nearest, and which is therefore missed least."""
     centres = np.stack([camera.centre_world for camera in rig])
     distances = np.sort(np.linalg.norm(centres[:, None] - centres[None], axis=2), axis=1)
     return rig.names[int(np.argmin(distances[:, 1:3].sum(axis=1)))]

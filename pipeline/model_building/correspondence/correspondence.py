@@ -37,7 +37,7 @@ _SMOOTHINGS = 4  # pairs of steps: they halve the noise of points; 8 would remov
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Holds the settings of one stage of searching a head's points on a scan. Lengths in mm."""
+    """Holds the limits of one stage in which points of a head are searched on a scan. Lengths in mm."""
 
     steps: int
     reach_mm: float  # a match farther than this is another part of the head

@@ -145,7 +145,8 @@ class HeadCut:
 
     @property
     def place(self) -> dict[int, int]:
-        """Returns the cage index of each base vertex that the cut has not moved."""
+        """Returns, for each vertex of the base mesh, its index in the cage; vertices that the cut moved or removed have
+        none."""
         return {int(self.kept[k]): int(k) for k in np.flatnonzero(self.share == 0)}
 
     def cage(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V0 3"]:

@@ -1,20 +1,22 @@
-"""What the contour solver loses when the input is worse than it should be.
+"""Measures how much the contour solver loses when its input is worse than it should be.
 
-Bare heads of section 5.2's kind on exact cameras with binary masks are the base; every other condition has the same
-heads and the same start, and its error is given beside the base's:
+The base are heads without hair as in section 5.2, with exact cameras and binary masks. Every other condition has the
+same heads and the same start, and its error is compared with the base's:
 
 - one and three cameras missing, drawn anew for each head;
 - hair over the ears, and hair with a fringe down the forehead, both with a shirt;
-- a fifth of each contour wrong: disks of 6 to 18 px stuck on or bitten out along it;
+- a fifth of each contour wrong: disks of 6 to 18 px added or cut out along it;
 - images of a half and a quarter of the size.
 
-Calibration errors of 0.1, 0.2 and 0.5 px (a head moves by so much in each image) are measured against the joint bound:
-the Cramer-Rao bound of shape, pose and cameras together for 0.3 px of Gaussian contour noise, the errors known in size
-alone. Once they are stated as the cameras' covariance, once they are not, and the solver takes its default of 0.2 px.
+Calibration errors of 0.1, 0.2 and 0.5 px (a head moves by so much in each image) are compared with the joint bound: the
+Cramer-Rao bound of shape, pose and cameras together for 0.3 px of Gaussian contour noise, when only the size of the
+errors is known. They are stated as the cameras' covariance in one run; in the other they are not, and the solver
+assumes its default of 0.2 px.
 
-Two cameras swapped, one camera knocked by 1 and by 5 degrees: the subject has hair and a shirt, the masks go through
-``reconstruct``'s own checks (agreement of the masks, drift), and a fault counts as found where every bad camera is left
-out by name. The error is that of the fit to the remaining cameras, beside the same capture's without the fault.
+Two cameras swapped, and one camera turned by 1 and by 5 degrees: the subject has hair and a shirt, and the masks go
+through ``reconstruct``'s own checks (agreement of the masks, drift). A fault counts as found if every bad camera is
+left out by name. The error is that of the fit to the remaining cameras, compared with the same capture's without the
+fault.
 """
 
 from collections.abc import Callable, Mapping
@@ -121,7 +123,7 @@ def wrong_contours(model: HeadModel, subject: Planted, renderer: Renderer, rng: 
 
 
 def spoiled(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Bool[np.ndarray, "h w"]:
-    """Returns the mask with ``WRONG_SHARE`` of its contour inside disks that were stuck on or bitten out."""
+    """Returns the mask with disks added or cut out until ``WRONG_SHARE`` of its contour is wrong."""
     edge = mask & ~_eroded(mask)
     at = np.argwhere(edge)
     wrong, out = np.zeros(len(at), bool), mask.copy()
@@ -145,8 +147,8 @@ def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def calibration(
     error_px: float, known: bool, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator
 ) -> Row:
-    """Returns root mean square error and the joint bound; the cameras that take the picture are where the rig does not
-    say."""
+    """Fits a subject with cameras that stand elsewhere than the rig says, by ``error_px`` in the image. ``known``: the
+    rig states that error as covariance. Returns the root mean square error and the joint Cramer-Rao bound, mm."""
     rig, clean = default_layout(), _clean(model, subject, renderer)
     believed = off_by(stated(rig, error_px) if known else rig, error_px, rng)
     noisy = {n: limit.with_noise(s, CONTOUR_NOISE_PX, limit.CORRELATION_PX, rng) for n, s in clean.items()}
@@ -166,8 +168,8 @@ def _clean(model: HeadModel, subject: Planted, renderer: Renderer) -> dict[str, 
 
 
 def faulty(kind: str, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
-    """Returns which cameras ``reconstruct`` leaves out, and what is left of the error; ``none`` tells of false
-    alarms."""
+    """Fits a subject with a fault of the cameras. Returns which cameras ``reconstruct`` leaves out, and the remaining
+    error; the kind ``none`` shows false alarms."""
     rig = default_layout()
     first, second = rng.choice(rig.names, 2, replace=False).tolist()
     true, bad = rig, []

@@ -1,23 +1,23 @@
-"""Ours beside what others would use, in one run: the same subjects, the same masks.
+"""Compares this project's solver with others in one run, on the same subjects and masks.
 
-Peers search the 60 coefficients at the true pose, which is the best case for them: the paper never moves the pose after
-the feature points. Ours starts 2 degrees and 4 mm off and has to find pose and scale as well.
+The others search the 60 coefficients at the true pose, which is the best case for them: the paper never changes the
+pose that the feature points give. This project's starts 2 degrees and 4 mm off, and has to find pose and scale as well.
 
-- ``simplex``: scipy's Nelder-Mead as the paper has it: eq. (5) on the renderer, its two levels (section 5.1), its
-  initial simplex (section 4.4); a level ends at a relative spread of 1e-4 or 3,500 evaluations. The face's outline
-  speaks alone, which served it better and faster than the whole head's (0.73 mm against 0.84, 1.68 against 2.16).
+- ``simplex``: scipy's Nelder-Mead as in the paper: eq. (5) on the renderer, its two levels (section 5.1), its initial
+  simplex (section 4.4). A level ends at a relative spread of 1e-4 or 3,500 evaluations. Only the face's outline counts,
+  which was better and faster than the whole head's (0.73 mm against 0.84, 1.68 against 2.16).
 - ``simplex_adaptive``: the same with the parameters of Gao and Han 2012.
-- ``cma``: CMA-ES with a diagonal covariance (Hansen's ``cma``); the full one needs more than 3,500 evaluations in 60
-  dimensions to learn anything.
-- ``bobyqa``: Py-BOBYQA, quadratic models through 121 points; 1,000 evaluations a level at most, since in 60 dimensions
-  its own algebra takes longer than they do.
+- ``cma``: CMA-ES with a diagonal covariance (Hansen's ``cma``); a full covariance in 60 dimensions needs more than
+  3,500 evaluations before it helps.
+- ``bobyqa``: Py-BOBYQA, quadratic models through 121 points, with at most 1,000 evaluations a level, since in 60
+  dimensions its own algebra takes longer than these.
 - ``soft``: a soft rasteriser with Adam (soft_rasteriser.py).
-- ``contour_all`` and ``soft_all``: with every mode of the model instead of 60, which only those that know derivatives
-  can search. The database's subjects are then in the span, as the paper's were in its database.
+- ``contour_all`` and ``soft_all``: with every mode of the model instead of 60, which only solvers with derivatives can
+  search. The database's subjects are then in the span, as the paper's were in its database.
 - ``hull``: the visual hull. It has no vertices to compare, so its error is the distance of the true face to it.
 
-The error is the mean over the face region's vertices, world frame, no realignment. Seconds are those of the search from
-silhouettes to vertices, each solver warm, all on the same cores. Needs the dependency group ``peers``.
+The error is the mean over the face region's vertices, world frame, without realignment. Seconds are those of the search
+from silhouettes to vertices, each solver warmed up, all on the same cores. Needs the dependency group ``peers``.
 """
 
 # pyright: reportMissingImports=false
@@ -63,7 +63,7 @@ BOBYQA_RADII = ((1.0, 0.05), (0.5, 0.02))  # first and last trust region of each
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """Holds one subject as all solvers get it."""
+    """Holds one subject, as every solver gets it."""
 
     whole: HeadModel
     model: HeadModel  # its first 60 modes, which every solver has
@@ -96,8 +96,8 @@ def peers(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 10,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns seconds, evaluations and errors of every solver on ``subjects`` of section 5.2's hundred, evenly
-    taken."""
+    """Runs the experiment. Returns seconds, evaluations and errors of every solver on ``subjects`` of section 5.2's
+    hundred, taken at even steps."""
     span, rig = with_modes(model, MODES), exact(default_layout())
     everyone = subjects_of_section_5_2(model, 100)
     chosen = [everyone[i] for i in np.linspace(0, len(everyone) - 1, subjects).round().astype(int)]
@@ -119,18 +119,18 @@ def peers(
 
 
 def machine(renderer: Renderer) -> str:
-    """Returns what seconds depend on."""
+    """Describes the machine and libraries on which seconds depend."""
     return f"{len(os.sched_getaffinity(0))} cores, {renderer.context.description}"
 
 
 def mean_head(subject: Planted) -> Fit:
-    """Returns where the peers start: the mean head at the true pose."""
+    """Returns the start of the other solvers: the mean head at the true pose."""
     return Fit("mean head", np.zeros(MODES), subject.world_from_head, 0, "")
 
 
 def timed(name: str, solve: Callable[[Task], Row], task: Task, warm: set[str]) -> Row:
-    """Returns the solver's row with its seconds; before its first one, compiled code is warmed up where there is
-    any."""
+    """Runs a solver and returns its row with its seconds. Before the first run of a solver with compiled code, it is
+    warmed up."""
     if name in WARMED and name not in warm:
         solve(task)
     warm.add(name)
@@ -140,7 +140,7 @@ def timed(name: str, solve: Callable[[Task], Row], task: Task, warm: set[str]) -
 
 
 def derivative_free(minimise: Minimiser) -> Callable[[Task], Row]:
-    """Returns a solver that knows only the values of eq. (5), on the paper's two levels."""
+    """Returns a solver that runs ``minimise`` on values of eq. (5) alone, on the paper's two levels."""
 
     def solve(task: Task) -> Row:
         coefficients, calls, seconds = np.zeros(MODES), 0, 0.0

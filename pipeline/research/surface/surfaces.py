@@ -1,13 +1,14 @@
-"""All that the cameras see, by us and by peers: the same photographs and masks, one scorer, CPU seconds.
+"""Compares the whole visible surface with other programs' results: the same photographs and masks, one scorer,
+processor seconds.
 
-- ``eigenhead``: bust.ply of the default job, head.ply made beside it.
+- ``eigenhead``: bust.ply of the default job, which also makes head.ply.
 - ``hull``: the visual hull of our silhouettes.
-- ``poisson``: screened Poisson (Kazhdan and Hoppe 2013, by Open3D) on the points and normals of our own depth maps;
-  its seconds are its own, those of the depth are ours.
-- ``openmvs``: densify, reconstruct, refine, where the folder of its programs is named; its seconds are its own.
+- ``poisson``: screened Poisson (Kazhdan and Hoppe 2013, by Open3D) on the points and normals of our depth maps; seconds
+  are without those of the depth maps.
+- ``openmvs``: densify, reconstruct, refine, if the folder of its programs is given; seconds are its own.
 
-The face is scored by the distances of the true face region to each surface. What a machine lacks is named among the
-rows as left out, and so is a peer that finds no surface.
+The face is scored by the distances of the true face region to each surface. A program that the machine lacks, or that
+finds no surface, is listed as left out.
 """
 
 # pyright: reportMissingImports=false
@@ -84,17 +85,17 @@ def surfaces(
     openmvs: Path | None = None,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<capture>_<peer>_<quantity>``.
+    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<capture>_<peer>_<quantity>``.
 
     Args:
         model: fitted.
         captures: folders with a truth beside them, by name.
         renderer: for the fit.
-        report: told the capture and the peer.
-        openmvs: the folder of its programs; without it that peer is left out.
-        folder: keeps rows, so that a stopped run goes on.
+        report: called with the capture and the program.
+        openmvs: folder of the programs of OpenMVS; None leaves it out.
+        folder: keeps rows, so that a stopped run can continue.
 
-    Raises InputError where ``openmvs`` lacks a program.
+    Raises InputError if ``openmvs`` lacks a program.
     """
     programs = None if openmvs is None else programs_in(openmvs)
     makers: dict[str, Callable[[Shown], tuple[Mesh, float]]] = {"eigenhead": ours, "hull": hull}
@@ -122,7 +123,7 @@ def surfaces(
 
 
 def peer_row(known: Known, make: Callable[[], tuple[Mesh, float]]) -> Row:
-    """Returns its scores, or why it has none."""
+    """Returns the scores of a surface, or why there is none."""
     try:
         mesh, seconds = make()
     except EigenheadError as failed:
@@ -186,7 +187,7 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """Returns a row a surface; what is left out stands below with its reason."""
+    """Returns a Markdown table with a row for each surface; what is left out is listed below with its reason."""
     scored = [row for row in rows if "left_out" not in row]
     cells = [[row["name"], row["peer"], *(row.get(column) for column in COLUMNS)] for row in scored]
     header = ("capture", "surface", *(column.replace("_", " ") for column in COLUMNS))
