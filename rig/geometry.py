@@ -22,7 +22,7 @@ class RigidTransform:
         return RigidTransform(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def inverse(self) -> "RigidTransform":
-        """Returns a_from_b."""
+        """Returns the inverse, a_from_b, which maps coordinates in frame b to frame a."""
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
     def apply(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
@@ -55,7 +55,7 @@ class Similarity:
         return Similarity(self.scale * inner, self.rotation @ other.rotation, self.apply(other.translation))
 
     def inverse(self) -> "Similarity":
-        """Returns a_from_b."""
+        """Returns the inverse, a_from_b, which maps coordinates in frame b to frame a."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 

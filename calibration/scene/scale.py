@@ -129,8 +129,8 @@ def find_tags(photographs: Photographs, known: TagSize) -> Tags:
 
 
 def find_tags_of_shot(images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], known: TagSize) -> Tags:
-    """Finds the tags of a dictionary in the pictures of one shot. Returns their corners (px) by ("", number of the
-    tag), then by camera."""
+    """Finds the tags of a dictionary in the pictures of one shot. Returns their corners (px) by tag, then by camera.
+    The key of a tag is ("", its number), since the shot has no name."""
     detector = _tag_detector(known)
     tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
     for camera, image in images.items():

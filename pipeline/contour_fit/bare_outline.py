@@ -1,8 +1,8 @@
-"""Which stretches of a silhouette are a bare skull's: the head, and no hair around it.
+"""Finds the stretches of a silhouette's outline that are the hairless head itself.
 
-An outline that a population's skulls do not explain is taken for hair (``noise_model.is_hairless``), though a skull may
-just lie outside the population. What the pixels show decides: along a bare skull skin reaches up to the outline, and
-the outline is smooth. Hair that is as light as skin fails the second test, for strands and tufts stand out of it.
+An outline that a population's heads do not explain is taken for hair (``noise_model.is_hairless``), though a head may
+just lie outside the population. The pixels decide: along a hairless head skin reaches up to the outline, and the
+outline is smooth. Hair as light as skin fails the second test, for strands and tufts stand out of it.
 """
 
 from collections.abc import Mapping
@@ -63,7 +63,7 @@ def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Float32[np.nda
 def find_bare(
     problem: ContourProblem, state: State, skin: Mapping[str, Float32[np.ndarray, "h w"]]
 ) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near an outline that belongs to a bare skull."""
+    """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near an outline that is a hairless head's."""
     views, maps = problem.views, []
     for k, camera in enumerate(problem.rig):
         (width, height), first = views.size[k], views.offset[k]
@@ -79,8 +79,8 @@ def find_bare(
 def bare_cells(
     distance: Float32[np.ndarray, "h w"], skin: Float32[np.ndarray, "h w"], px_per_mm: float
 ) -> Bool[np.ndarray, "_ _"]:
-    """Marks the square cells (``CELL_PX`` pixels wide) within ``REACH_MM`` of a bare skull's outline in one view. An
-    outline is a bare skull's where it is smooth and skin reaches up to it.
+    """Marks the square cells (``CELL_PX`` pixels wide) within ``REACH_MM`` of a hairless head's outline in one view: of
+    an outline that is smooth, with skin up to it.
 
     Args:
         distance: signed distance to the outline (px), negative inside.

@@ -144,7 +144,7 @@ class RimNoise:
         floor_px: the smallest robust scale to use: three standard deviations of the model's misfit.
         clutter: for each view, the cells with hair or clothes; None before they were searched.
         is_settled: whether ``clutter`` comes from a fit rather than from the start pose.
-        bare: for each view, the cells near the outline of a bare skull; None before they were searched.
+        bare: for each view, the cells near the outline of a hairless head; None before they were searched.
     """
 
     unit: float

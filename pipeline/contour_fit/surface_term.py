@@ -32,8 +32,8 @@ def surface_residual(
     world_from_head: Similarity,
     camera_shift: Float[np.ndarray, "k 6"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Returns the residual e (mm) of each observation and the current positions of the vertices (world, mm). The
-    residual of a bound that is kept is 0."""
+    """Returns the residual e (mm) of each observation, as the module defines it, and the current positions of the
+    vertices (world, mm). An observation that is only a bound (of hair) has the residual 0 if the head keeps it."""
     count = len(coefficients)
     moved = (coefficients.astype(np.float32) @ seen.basis[:count].reshape(count, -1)).reshape(-1, 3)
     points = world_from_head.apply(seen.mean + moved)

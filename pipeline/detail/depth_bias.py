@@ -53,9 +53,9 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
 
 
 def measure_bias(seen: OnFace) -> WindowBias:
-    """Measures the bias by a robust straight line: the offsets of the points from the fitted face over its windowed
-    height. The intercept is the common bias (mm), the slope is the share. Returns no bias for fewer than ``MIN_POINTS``
-    points."""
+    """Measures the bias of the matching windows: fits a robust straight line to the points' offsets from the fitted
+    face as a function of its windowed height. The intercept is the common bias (mm), the slope is the share. Returns no
+    bias for fewer than ``MIN_POINTS`` points."""
     if len(seen.row) < MIN_POINTS:
         return WindowBias()
     columns = np.stack([np.ones(len(seen.row)), seen.windowed_mm], axis=1)

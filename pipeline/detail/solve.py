@@ -35,8 +35,8 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directions:
-    """Holds the matrix (3 v, d n) that turns the field into displacements: rows are the coordinates of the v vertices,
-    columns the d directions of the n nodes."""
+    """Holds the matrix (3 v, d n) that turns the solver's unknowns, d at each of n nodes, into displacements (mm) of
+    the head's v vertices: x, y and z of each vertex are three rows."""
 
     matrix: sparse.csr_array
     count: int  # d

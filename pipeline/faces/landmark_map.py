@@ -72,11 +72,9 @@ class LandmarkMap:
 
 
 def landmark_map(model: HeadModel) -> LandmarkMap:
-    """Returns the landmark map of a head model. A built-in model, known by its triangles, has a measured one; for any
-    other the points are carried over from the default model's mean head.
-
-    Raises NoLandmarkMap where the model names too few landmarks.
-    """
+    """Returns the landmark map of a head model. Models whose triangles are known have a measured one; for any other,
+    the points are transferred from the default model's mean head. Raises NoLandmarkMap if the model names too few
+    landmarks."""
     digest = faces_digest(model)
     for name in BUILT_IN:
         if str(_table()[f"{name}_faces"]) == digest:

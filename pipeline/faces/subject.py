@@ -126,7 +126,7 @@ class _Scene:
     effort: SearchEffort
 
     def match(self, found: Mapping[str, tuple[FaceDetection, ...]]) -> TriangulatedFace | None:
-        """The subject among the faces of all views."""
+        """Finds the subject among the faces of all views."""
         return find_subject_face(found, self.rig, self.eye_distance_mm)
 
 

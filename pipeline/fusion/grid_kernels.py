@@ -8,8 +8,9 @@ from pipeline.geometry.surface_nets_kernels import corners_of
 
 @njit(cache=True, nogil=True)
 def halved(wanted: np.ndarray) -> np.ndarray:
-    """Returns the nodes of a grid of half the step that lie next to the ``wanted`` nodes (nx, ny, nz), as indices (n,
-    3) int32 in the order of their keys: twice each wanted index, and that plus one along any of the axes."""
+    """Returns the nodes of a grid with half the step, as positions (n, 3) int32 in the order of their keys. Each
+    ``wanted`` node (i, j, k) becomes up to eight nodes: (2 i, 2 j, 2 k), and those one further along x, y and z that
+    are inside the grid."""
     nx, ny, nz = wanted.shape
     count = 0
     for i in range(nx):

@@ -175,9 +175,9 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> F
 
 
 def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
-    """Returns the guess (mm, negative inside) on a whole box without thin fins and horns: parts into which no ball of
-    radius ``HORN_MM`` fits. They arise where no outline bounds the cones of sight. Within ``AWAY_MM`` of seen places
-    the guess stays."""
+    """Removes thin fins and horns, into which no ball of radius ``HORN_MM`` fits, from the signed distance ``guess``
+    (mm, negative inside) on a whole box. They arise where no silhouette limits how far the subject may extend along the
+    lines of sight. Within ``AWAY_MM`` of points that a view sees, the guess is kept."""
     from scipy.ndimage import distance_transform_edt  # 0.05 s, and only a bust needs it
 
     radius = HORN_MM / grid.step_mm

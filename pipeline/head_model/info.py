@@ -35,7 +35,7 @@ class ModelInfo(TypedDict):
 
 
 def model_info(model: HeadModel) -> ModelInfo:
-    """Returns what a model is made of, as plain values that JSON can hold."""
+    """Returns the description of a model as JSON types."""
     full = model.levels["full"]
     return {
         "name": model.name,

@@ -37,8 +37,9 @@ def write_image_motion(view, places, axes, cameras, ahead, slides):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def add_by_camera(view, pull, slides, by_camera):
-    """Adds ``pull * slides``, summed over the image axes of each view, to the six columns of the view's camera in
-    ``by_camera`` (n, 6 k), in place."""
+    """Fills how the depth of each patch depends on the cameras: adds ``pull * slides``, summed over the image axes of
+    each view, to the six columns of the view's camera in ``by_camera`` (n, 6 k), in place. ``pull`` (n, a) is the
+    derivative of the depth by an image shift, ``slides`` (n, a, 6) that of the shift by the camera."""
     for n in range(len(view)):
         for row in range(pull.shape[1]):
             first = 6 * view[n, row // 2]
@@ -50,8 +51,13 @@ def add_by_camera(view, pull, slides, by_camera):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def add_cameras(view, stiff, slope, slides, information, matrix, gradient):
-    """Adds ``slides^T stiff slides`` to ``matrix`` (6 k, 6 k) and ``-slides^T slope`` to ``gradient`` (6 k), in place,
-    over all patches, each weighted by its ``information``."""
+    """Sums up, over all patches, the quadratic form in the cameras' corrections: adds ``slides^T stiff slides`` to
+    ``matrix`` (6 k, 6 k) and ``-slides^T slope`` to ``gradient`` (6 k), in place, for k cameras.
+
+    ``stiff`` (n, a, a) and ``slope`` (n, a) are the second and first derivatives of a patch's cost by its image shifts,
+    ``slides`` (n, a, 6) the derivatives of these shifts by their camera, ``information`` (n) the weight of the patch,
+    and ``view`` (n, v) its cameras, -1 for none.
+    """
     pulled = np.empty(6)
     for n in range(len(view)):
         for a in range(stiff.shape[1]):

@@ -116,10 +116,10 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
     """Returns the rounds of the search for a rig whose depths are ``factor`` times less precise than the usual rig's (1
     or more).
 
-    Each round has as many steps as usual, over a range ``factor`` times as wide. Whenever the factor doubles, the last
-    round is repeated twice more, once of it over half the range: with three cameras in front, outlines leave the middle
-    of a face open by 8 mm, and what is far off takes long to converge. Shading is then removed in the last rounds, too,
-    since gloss looks like depth.
+    Each round has as many steps as usual, over a range ``factor`` times as wide. For each doubling of the factor, the
+    last round is repeated once, and once more over half its range: with three cameras in front, outlines leave the
+    middle of a face open by 8 mm, and what is far off takes long to converge. Shading is then removed in the last
+    rounds, too, since gloss looks like depth.
     """
     more = round(math.log2(factor))
     wider = [replace(each, reach_mm=factor * each.reach_mm) for each in ROUNDS]

@@ -36,7 +36,8 @@ class Planes(NamedTuple):
 
 @runtime_checkable  # the tests check types of calls
 class Matcher(Protocol):
-    """Describes what compares the windows of one view, which lie on planes, with the same surface in its neighbours."""
+    """Describes an object that compares windows of one view with its neighbours, on the assumption that each window
+    lies on a plane."""
 
     def sweep(
         self, room: DepthRange, strides: Int32[np.ndarray, "h w"], labels: int

@@ -171,7 +171,8 @@ def correlate(way, place, sight, loaded):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def match(way, sight, loaded, z, z_x, z_y, reach, place):
     """Returns the correlation of the loaded window with another view if the surface is the given plane. Returns NO_SAY
-    if that view does not see it, and AGAINST if it shows the point outside the subject. Changes ``place``."""
+    if that view does not see it, and AGAINST if it shows the point outside the subject. Fills ``place`` as
+    ``place_window`` does."""
     if not place_window(way, z, z_x, z_y, loaded.column, loaded.row, reach, place):
         return NO_SAY
     beside = distance_there(way, place, sight.distance_px)

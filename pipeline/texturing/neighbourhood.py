@@ -27,7 +27,7 @@ class Neighbourhood:
 
     @property
     def rows(self) -> Int32[np.ndarray, " e"]:
-        """Returns the vertex to whose row each entry of ``indices`` belongs."""
+        """Returns, for each entry of ``indices``, the vertex whose neighbour it is."""
         return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
 
     def calmed(self, values: Float[np.ndarray, "v c"], rounds: int) -> Float[np.ndarray, "v c"]:

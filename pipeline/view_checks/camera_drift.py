@@ -134,10 +134,10 @@ def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftEquations:
     """Holds the equations ``normal . shift + outward * loose = excess`` of one camera's n tangencies, in its pixels.
-    Unknown are the shift of its image and how much too large (``loose``) its mask is.
+    Unknown are the shift of its image and by how many pixels its mask is too large all around (``loose``).
 
-    ``pixels`` is the error of each equation if contours in both pictures are wrong by one pixel; ``contour_noise_px``
-    is the standard deviation of the contours.
+    ``outward`` is 1 where ``normal`` points out of the subject, else -1. ``pixels`` is the error of each equation if
+    contours in both pictures are wrong by one pixel; ``contour_noise_px`` is the standard deviation of the contours.
     """
 
     normals: Float[np.ndarray, "n 2"]

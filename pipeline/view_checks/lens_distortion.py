@@ -80,8 +80,8 @@ def _around_front(rig: Rig) -> Rig:
 
 
 def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence[float] | np.ndarray) -> Estimate:
-    """Estimates the number for which the rig that ``read`` returns has the smallest reprojection errors. The search
-    starts at the best of ``values``."""
+    """Estimates one number on which a rig depends: the one at which the tracks' reprojection errors are smallest.
+    ``read`` returns the rig for a number. The search starts at the best of ``values``."""
     from scipy.optimize import fminbound  # a quarter of a second
 
     def missed(value: float) -> Float[np.ndarray, "n 2"]:

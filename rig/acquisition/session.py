@@ -49,7 +49,7 @@ class _Release:
 
 
 class RigSession:
-    """Owns the devices of a rig while a block runs. ``close`` ends all threads but those that hang in a driver."""
+    """Owns the devices of a rig while a block runs. ``close`` ends all threads except those that hang in a driver."""
 
     def __init__(self, config: RigConfig, make_driver: MakeDriver = driver_for) -> None:
         self.config = config

@@ -100,8 +100,8 @@ def read_base(source: Source) -> Base:
 
 
 def read_targets(source: Source, folders: tuple[str, ...], vertices: int) -> dict[str, Float[np.ndarray, "V 3"]]:
-    """Returns the displacements of the targets directly in the given folders (MakeHuman units, float32), by file name
-    without suffix."""
+    """Reads MakeHuman's targets, which are sparse displacements of the base mesh, from the given folders (without their
+    subfolders). Returns them by file name without suffix, for all ``vertices``, in decimetres (float32)."""
     wanted = [
         name
         for name in source.names()

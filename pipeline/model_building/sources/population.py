@@ -165,8 +165,8 @@ def _clipped(rng: np.random.Generator, limit: float) -> float:
 def sample_shapes(
     base: Base, targets: Targets, sampling: Sampling, *, report: Progress | None = None
 ) -> Float[np.ndarray, "N V 3"]:
-    """Returns the base meshes (MakeHuman units) of all subjects, males first. Subject k depends only on the seed and
-    k."""
+    """Draws the subjects of the database. Returns their whole base meshes (decimetres), males first. Subject k depends
+    only on the seed and k."""
     shapes = []
     for k in range(SUBJECTS["total"]):
         rng = np.random.default_rng([sampling.seed, k])

@@ -47,8 +47,8 @@ def drift(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Runs the experiment. Returns the share of turned cameras that are named, and of good cameras that are, by
-    condition and by warning."""
+    """Runs this module's experiment. Returns the share of turned cameras that are named, and of good cameras that are,
+    by condition and by warning."""
     records = Records(folder, "drift", key_of(model.sha256, camera_drift, tangency, TURN_DEG, LOOSE_PX))
     span, rows = with_modes(model, 60), []
     for i, subject in enumerate(random_subjects(subjects, seed=17)):

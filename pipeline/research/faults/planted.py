@@ -46,8 +46,8 @@ SEED = 400
 def planted(
     model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = 2, folder: Path | None = None
 ) -> Outcome:
-    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is ``<fault>_<quantity>``, the mean
-    over the subjects whose job had a result; ``refused`` is the share of those without one.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is ``<fault>_<quantity>``,
+    the mean over the subjects whose job had a result; ``refused`` is the share of those without one.
 
     Args:
         model: fitted; heads are drawn from it, too.

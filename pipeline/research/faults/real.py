@@ -54,8 +54,8 @@ class RealCapture:
 def real(
     model: HeadModel, captures: list[RealCapture], *, renderer: Renderer, settings: Settings, report: Progress
 ) -> Outcome:
-    """Runs the experiment. Returns a row for every capture, and their figures. Raises InputError if a folder has no
-    more views than are used."""
+    """Runs this module's experiment. Returns a row for every capture, and their figures. Raises InputError if a folder
+    has no more views than are used."""
     rows: list[Row] = []
     for one in captures:
         rows.append({"name": one.name, **judge(model, one, renderer=renderer, settings=settings, report=report)})

@@ -31,7 +31,7 @@ def convergence(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 500,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Runs the experiment. Returns, for both sets of heads, the share that converges and the errors."""
+    """Runs this module's experiment. Returns, for both sets of heads, the share that converges and the errors."""
     records = Records(folder, "convergence", key_of(model.sha256, FittingSettings(), *CONTOUR))
     span, rig = with_modes(model, 60), exact(default_layout())
     jobs: list[tuple[str, Planted]] = []

@@ -56,7 +56,7 @@ def cost(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Runs the experiment. Returns the errors by solver and cost, and those of the mean head."""
+    """Runs this module's experiment. Returns the errors by solver and cost, and those of the mean head."""
     sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "cost", key_of(model.sha256, FittingSettings(), STYLE, *sources))
     span, rig = with_modes(model, 60), exact(default_layout())

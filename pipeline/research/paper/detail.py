@@ -109,7 +109,7 @@ def run(
     held_out: bool = True,
     folder: Path | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
     ``<subject>_<model>_<level>_<quantity>``.
 
     Args:
@@ -335,8 +335,8 @@ def colour_psnr(
 
 
 def figures(rows: list[Row]) -> dict[str, float]:
-    """Returns figures: of a subject its own values; of draws, in-span heads and held-out cameras means and worst
-    ones."""
+    """Summarises the rows: values of each subject, and means and worst values over random heads, heads in the span, and
+    left-out cameras."""
     values: dict[str, list[float]] = {}
     for row in rows:
         subject, _, label = row["name"].rpartition("_")

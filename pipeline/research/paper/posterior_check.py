@@ -48,8 +48,8 @@ def posterior_check(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Runs the experiment. Returns the chain's standard deviations divided by the Laplace ones: of coefficients and
-    pose, and of the face's points along the axes."""
+    """Runs this module's experiment. Returns the chain's standard deviations divided by the Laplace ones: of
+    coefficients and pose, and of the face's points along the axes."""
     records = Records(folder, "posterior", key_of(model.sha256, *CONTOUR, STEPS, BETA))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []

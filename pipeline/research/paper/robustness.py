@@ -69,7 +69,8 @@ def robustness(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns errors by condition, their ratios to the base and to the bound, and how often faults are found."""
+    """Returns the contour solver's errors under each condition of this module, their ratios to those of perfect input
+    and to the best possible error (the Cramer-Rao bound), and how often faulty cameras are found."""
     records = Records(folder, "robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
     span = with_modes(model, 60)
     rows = []

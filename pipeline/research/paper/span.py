@@ -45,8 +45,8 @@ def run(
     counts: Sequence[int] = (60, 0),
     report: Progress | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``: floors of each model on each truth, for each
-    count of modes (0: all).
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``: floors of each model on each truth,
+    for each count of modes (0: all).
 
     ``figures`` is flat: ``<model>_<modes>_<truth>_{median,mean}_mm`` and ``_largest_sigma`` for each single truth, and
     ``<model>_<modes>_draws_...`` as means over the truths whose names start with ``draw:``; besides these

@@ -44,8 +44,8 @@ def views(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 12,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Runs the experiment. Returns the planned directions, and limit and error of every arrangement over ``subjects``
-    heads that were not used for planning."""
+    """Runs this module's experiment. Returns the planned directions, and limit and error of every arrangement over
+    ``subjects`` heads that were not used for planning."""
     span = with_modes(model, 60)
     records = Records(folder, "views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
     heads = random_subjects(CHOSEN_ON + subjects, seed=33)

@@ -96,8 +96,8 @@ def peers(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 10,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Runs the experiment. Returns seconds, evaluations and errors of every solver on ``subjects`` of section 5.2's
-    hundred, taken at even steps."""
+    """Runs this module's experiment. Returns seconds, evaluations and errors of every solver on ``subjects`` of section
+    5.2's hundred, taken at even steps."""
     span, rig = with_modes(model, MODES), exact(default_layout())
     everyone = subjects_of_section_5_2(model, 100)
     chosen = [everyone[i] for i in np.linspace(0, len(everyone) - 1, subjects).round().astype(int)]

@@ -65,7 +65,8 @@ def fit_soft(
     modes: int = 60,
     phases: tuple[Phase, ...] = PHASES,
 ) -> tuple[Float[np.ndarray, " m"], int]:
-    """Returns coefficients (standard deviations) at a given pose, and the number of gradients taken."""
+    """Fits the head's coefficients at a given pose with Adam. Returns the coefficients (standard deviations), and the
+    number of gradients that were computed."""
     scaled, faces = rig.scaled(IMAGE_SCALE), model.levels[MESH].faces
     coverage = np.stack([input_coverage(silhouettes[camera.name], IMAGE_SCALE) for camera in scaled])
     shape = shape_of(model, world_from_head, scaled, modes)

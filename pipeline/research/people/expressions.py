@@ -43,7 +43,7 @@ def expressions(
     models: Mapping[str, HeadModel], *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 4,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Runs the experiment. Returns distances by model: ``<model>_posed_median_mm``,
+    """Runs this module's experiment. Returns distances by model: ``<model>_posed_median_mm``,
     ``<model>_neutral_before_median_mm`` and so on.
 
     Of the expression weights there are the correlation with the true ones (``<model>_weights_correlation`` over the ten

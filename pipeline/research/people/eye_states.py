@@ -46,7 +46,7 @@ def eyes(
     heads: int = HEADS,
     folder: Path | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``eyes_wrong`` of ``eyes_heads``, and ``eyes_<state>_wrong``.
+    """Runs this module's experiment. Returns ``eyes_wrong`` of ``eyes_heads``, and ``eyes_<state>_wrong``.
 
     Args:
         models: from which heads are drawn, by name.
@@ -122,7 +122,7 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Writes a Markdown table, the wrong ones marked."""
+    """Returns a Markdown table of the rows, in which wrong ones are marked."""
     header = ("head", "closed", "told", "wrong")
     cells = [
         [

@@ -62,7 +62,7 @@ def people(
     detail: str | None = None,
     folder: Path | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
     ``<kind>_<evidence>_<quantity>`` and ``<quantity>`` over all rows, with ``eyes_wrong`` among them if eyes are
     requested.
 
@@ -239,7 +239,7 @@ def summary(prefix: str, rows: Sequence[Row]) -> dict[str, float]:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Writes a Markdown table, a row a case; ``!`` marks what is silently wrong."""
+    """Returns a Markdown table with a row for each case; ``!`` marks results that are silently wrong."""
     header = (
         *("rig", "evidence", "subject", "turn, deg", "shift, mm", "face median, mm", "p90", "stated, mm"),
         *("off, stated", "in 95 %", "told", "s"),
@@ -249,7 +249,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def summary_table(rows: Sequence[Row]) -> str:
-    """Writes a Markdown table, a row for each kind of rig with each evidence."""
+    """Returns a Markdown table with a row for each kind of rig and evidence."""
     keys = ("rows", "refused", "crashed", "unwarned_share", "worst_unwarned_turn_deg", "worst_unwarned_shift_mm")
     header = (
         *("rig", "evidence", "rows", "refused", "crashed", "share not warned of", "its worst turn, deg"),

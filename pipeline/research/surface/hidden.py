@@ -78,7 +78,7 @@ def hidden(
     subjects: int = 4,
     folder: Path | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is
     ``<group>_<level>_<seen|hidden>_<region>_<quantity>`` or ``<group>_<level>_<landmarks|measurements>_within_95``, the
     mean over the group: ``studio``, ``draws``, both as ``all``, or a capture by its name.
 

@@ -78,8 +78,8 @@ def light(
     subjects: int = SUBJECTS,
     folder: Path | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of lights, and
-    a row for each subject.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of
+    lights, and a row for each subject.
 
     Args:
         model: fitted; heads are drawn from it, too.

@@ -66,8 +66,8 @@ class Shot:
 def repeat(
     model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = SHOTS, folder: Path | None = None
 ) -> Outcome:
-    """Runs the experiment. Returns scatter, stated deviation and repeated error by condition. ``subjects`` is the
-    number of shots, two or more."""
+    """Runs this module's experiment. Returns scatter, stated deviation and repeated error by condition. ``subjects`` is
+    the number of shots, two or more."""
     records = Records(
         folder, "repeat", key_of(model.sha256, Settings(), subjects, *CONTOUR, composition, repeatability)
     )

@@ -85,7 +85,8 @@ def surfaces(
     openmvs: Path | None = None,
     folder: Path | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<capture>_<peer>_<quantity>``.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is
+    ``<capture>_<peer>_<quantity>``.
 
     Args:
         model: fitted.

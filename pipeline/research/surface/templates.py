@@ -40,9 +40,9 @@ def templates(
     draws: int = 50,
     folder: Path | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``<model>_median_mm``, ``<model>_p95_mm`` and so on, over all vertices of all random
-    heads. ``facekit_drawn`` is ICT-FaceKit with a mesh that has the shape of one random head; ``_marked`` had the
-    twelve landmarks for its registration."""
+    """Runs this module's experiment. Returns ``<model>_median_mm``, ``<model>_p95_mm`` and so on, over all vertices of
+    all random heads. ``facekit_drawn`` is ICT-FaceKit with a mesh that has the shape of one random head; ``_marked``
+    had the twelve landmarks for its registration."""
     modules = (carrying, likeness, placement, registration)
     key = key_of(facekit.sha256, *(model.sha256 for model in models.values()), draws, *modules)
     records = Records(folder, "templates", key)

@@ -65,8 +65,8 @@ def texture(
     subjects: int = SUBJECTS,
     folder: Path | None = None,
 ) -> Outcome:
-    """Runs the experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``, the mean
-    over the group: ``studio``, or a capture by its name.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``,
+    the mean over the group: ``studio``, or a capture by its name.
 
     Args:
         model: fitted; heads are drawn from it, too.
