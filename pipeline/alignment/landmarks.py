@@ -103,7 +103,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     target = np.stack([point.position_world for point in points.values()])
     source, spread = landmark_statistics(model, names, settings.landmark_noise_mm)
     noise = np.stack([point.covariance for point in points.values()])
-    expected = np.sqrt((_own_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
+    expected = np.sqrt((_diagonal_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
     kept = consensus(source, target, expected)
     if kept is None:
         raise TooFewFeatures(points, compose("points-on-line"), remarks)
@@ -138,7 +138,7 @@ def _sides_exchanged(
     if float(kept.mean()) >= MIN_AGREED_SIDES or others == names or not all(name in model.landmarks for name in others):
         return False
     source, spread = landmark_statistics(model, others, settings.landmark_noise_mm)
-    expected = np.sqrt((_own_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
+    expected = np.sqrt((_diagonal_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
     found = consensus(source, target, expected)
     return found is not None and float(found.mean()) >= MIN_AGREED_SIDES and bool(found.sum() > kept.sum() + 1)
 
@@ -196,7 +196,7 @@ def flatness(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.hypot(singular[1], singular[2]) / np.sqrt(len(points)))
 
 
-def _own_blocks(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "n 3 3"]:
+def _diagonal_blocks(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "n 3 3"]:
     count = len(covariance) // 3
     blocks = covariance.reshape(count, 3, count, 3)
     return blocks[np.arange(count), :, np.arange(count), :]

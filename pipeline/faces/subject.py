@@ -146,10 +146,10 @@ def _search(
         found[name] = find(scene.pyramids[name], scene.networks)
         if found[name] and (face := scene.match(found)) is not None:
             for _ in range(scene.effort.rounds):
-                looked = {} if face is None else _look(scene, face, found)
-                if not looked:
+                added = {} if face is None else _search_missing(scene, face, found)
+                if not added:
                     break
-                found |= looked
+                found |= added
                 face = scene.match(found)
             if face is not None and len(face.detections) >= CONFIRMING_VIEWS:
                 break
@@ -183,11 +183,11 @@ def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> 
     return match_alone(name, face, rig[name])
 
 
-def _look(
+def _search_missing(
     scene: _Scene, face: TriangulatedFace, found: Mapping[str, tuple[FaceDetection, ...]]
 ) -> dict[str, tuple[FaceDetection, ...]]:
     """Looks for a face in the views in which it must be and was not found; what was found there comes after it."""
-    looked = {}
+    added = {}
     points = face.world_from_face.apply(point_table().shape_mm)
     for name in _expected(face.world_from_face, scene.rig, scene.effort.min_facing):
         if name in face.detections:
@@ -195,8 +195,8 @@ def _look(
         crop = crop_around(scene.rig[name].project(points))
         seen = find_face_at(scene.pyramids[name], crop, scene.networks, min_rounds=LOOKING_ROUNDS)
         if seen.score >= MIN_SCORE:
-            looked[name] = (seen, *found.get(name, ()))
-    return looked
+            added[name] = (seen, *found.get(name, ()))
+    return added
 
 
 def _expected(world_from_face: Similarity, rig: Rig, min_facing: float) -> Iterator[str]:

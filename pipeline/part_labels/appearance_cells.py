@@ -134,10 +134,10 @@ def make_cells(
     sizes = [_cell_px(camera, head.middle, cell_mm) for camera in cameras]
     shots = [images[camera.name] for camera in cameras]
 
-    def look(k: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    def read_view(k: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         return _linear(shots[k], sizes[k]), _seen(cameras[k], sizes[k], head, _grid(shots[k], sizes[k]))
 
-    light, seen = zip(*map_in_threads(look, len(cameras)), strict=True) if cameras else ((), ())
+    light, seen = zip(*map_in_threads(read_view, len(cameras)), strict=True) if cameras else ((), ())
     gains = _gains(cameras, sizes, list(light), [depth for depth, _ in seen], head)
 
     def cells(k: int) -> Cells:

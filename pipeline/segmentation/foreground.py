@@ -91,7 +91,7 @@ def decide(
     )
     mask, detached_component_areas = whole_subject(raw, plain, settings)
     mixed = (mixture > 1) & (away > (2 * background.noise @ CHANNEL_SUM / 3) ** 2)
-    own_odds = _own_odds(coarse, raw, paint, chi2, variance, settings)
+    own_odds = _subject_colour_odds(coarse, raw, paint, chi2, variance, settings)
     own_odds = np.where(other, np.maximum(own_odds, 0.5 * unexplained - settings.evidence), own_odds)
     return Decision(
         coarse, background, odds, probability, mask, detached_component_areas, paint, own_odds, clear, plain, mixed
@@ -118,7 +118,7 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: Se
     )
 
 
-def _own_odds(
+def _subject_colour_odds(
     image: Float32[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
     paint: Float32[np.ndarray, "h w 3"],

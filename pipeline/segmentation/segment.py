@@ -126,13 +126,13 @@ def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouet
     if weak <= settings.weak_share_warned:
         return silhouette
     text = compose("outline-guessed", share=weak)
-    kept = tuple(warning for warning in quality.warnings if not _speaks_of(warning, "outline-weak"))
+    kept = tuple(warning for warning in quality.warnings if not _concerns(warning, "outline-weak"))
     if weak > settings.weak_share_unusable:
         return replace(silhouette, quality=replace(quality, warnings=(*kept, compose("view-unused", remark=text))))
     return replace(silhouette, quality=replace(quality, warnings=kept, doubts=(text,)))
 
 
-def _speaks_of(message: Message, code: str) -> bool:
+def _concerns(message: Message, code: str) -> bool:
     """Tells whether a message has the given code, or has a remark with that code."""
     remark = message.parameters.get("remark")
     return message.code == code or (isinstance(remark, Message) and remark.code == code)

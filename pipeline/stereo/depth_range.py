@@ -17,7 +17,7 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.raster import depth_map
 from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import MAX_UNSEEN_PX, Crop
-from pipeline.stereo.depth_range_kernels import find_room
+from pipeline.stereo.depth_range_kernels import find_depth_range
 from pipeline.stereo.stack import Stack
 from rig.mesh import Mesh
 
@@ -83,7 +83,7 @@ def _bounds(
     width, height = least.size[view]
     others = np.delete(np.arange(len(least)), view)
     near, far = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
-    find_room(
+    find_depth_range(
         int(least.offset[view]), least.homographies(view, others), least.distance_px, SLACK_PX, max(middle - half, 1.0),
         middle + half, step, near, far,
     )  # fmt: skip

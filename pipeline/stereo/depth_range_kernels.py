@@ -15,7 +15,7 @@ def _distance_at(distance_px, way, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_room(start, ways, distance_px, slack_px, low, high, step, near, far):
+def find_depth_range(start, ways, distance_px, slack_px, low, high, step, near, far):
     """Fills ``near`` and ``far`` (h, w; mm of depth, 0 for none) for the pixels of one view: the first and the last
     depth at which the point of the ray is inside the visual hull. Depths between may be outside.
 

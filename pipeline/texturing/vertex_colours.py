@@ -92,14 +92,14 @@ def texture(
     if not len(views):
         return _untextured(len(normals))
 
-    def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
+    def read_view(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
         points, silhouette = mesh_world.vertices, silhouettes[name]
         sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
         return sight, image
 
-    found = map_in_threads(lambda k: look(views.cameras[k]), len(views))
+    found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:

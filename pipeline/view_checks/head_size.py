@@ -59,7 +59,7 @@ class WrongScale(EigenheadError):
     def __init__(self, diameter_mm: float, *, masks_given: bool = False) -> None:
         part = masks_given and diameter_mm < HEAD_MM
         remedy = compose("advice-whole-masks") if part else compose("advice-known-length")
-        super().__init__(compose("size-refused", size=_size_told(diameter_mm), remedy=remedy))
+        super().__init__(compose("size-refused", size=_size_message(diameter_mm), remedy=remedy))
 
 
 def judge_head_size(
@@ -80,10 +80,10 @@ def judge_head_size(
 def _outline_size(diameter_mm: float) -> Message:
     unless = compose("much-hair") if diameter_mm > HEAD_MM else compose("small-child")
     remedy = compose("advice-known-length")
-    return compose("outline-size", size=_size_told(diameter_mm), unless=unless, remedy=remedy)
+    return compose("outline-size", size=_size_message(diameter_mm), unless=unless, remedy=remedy)
 
 
-def _size_told(diameter_mm: float) -> Message:
+def _size_message(diameter_mm: float) -> Message:
     factor = diameter_mm / HEAD_MM
     ratio = f"{factor:.1f}" if factor >= 0.95 else f"{factor:.2f}"
     return compose("head-times-as-large", ratio=ratio, diameter_mm=diameter_mm)

@@ -76,7 +76,7 @@ def false_alarms(
     """Simulates good captures. Returns how many get a warning that pictures are exchanged, or that a camera moved or
     has a loose mask."""
     records = Records(folder, "false_alarms", key_of(model.sha256, *ASKED, camera_drift))
-    rows = _rows(_told_of_good, model, renderer, records, report, seed=19, subjects=subjects)
+    rows = _rows(_warnings_of_good, model, renderer, records, report, seed=19, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}
     found |= {code: sum(code in row["codes"] for row in rows) for code in GOOD_CODES}
     return {"figures": found, "rows": rows, "markdown": markdown.of_figures(found)}
@@ -178,7 +178,7 @@ def _error_mm(model: HeadModel, subject: Planted, silhouettes: Mapping[str, Silh
     return mean_error_mm(model, fit_contour(model, subject.start, silhouettes, rig, FittingSettings()), subject)
 
 
-def _told_of_good(
+def _warnings_of_good(
     model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator, *, worn: bool
 ) -> Row:
     """Codes of what is told of one good capture."""

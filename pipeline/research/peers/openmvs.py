@@ -91,7 +91,7 @@ def write_input(depth_maps: Sequence[DepthMap], hull_world: Mesh, folder: Path) 
     rng = np.random.default_rng(0)
     rows = rng.permutation(len(hull_world.vertices))[:SEEDS]
     points, normals = hull_world.vertices[rows], hull_world.normals()[rows]
-    seen = np.stack([_looks_at(each.camera, points, normals) for each in depth_maps])
+    seen = np.stack([_faces_camera(each.camera, points, normals) for each in depth_maps])
     points, seen = points[seen.sum(axis=0) >= 2], seen[:, seen.sum(axis=0) >= 2]
     for name in ("images", "masks", "sparse"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -124,7 +124,7 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.17g}" for value in values)
 
 
-def _looks_at(
+def _faces_camera(
     camera: Camera, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
     towards = camera.centre_world - points

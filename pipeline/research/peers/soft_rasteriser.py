@@ -223,7 +223,7 @@ def padded(pairs: Pairs) -> tuple[np.ndarray, ...]:
     """Returns pixel, target, weight, row, corner and present, padded to one of a few sizes, since JAX compiles for each
     size."""
     pixels, count = len(pairs.pixel), len(pairs.row)
-    more, spare = _room(pixels + 1) - pixels, _room(count) - count
+    more, spare = _capacity(pixels + 1) - pixels, _capacity(count) - count
     return (
         np.pad(pairs.pixel, ((0, more), (0, 0))),
         np.pad(pairs.target, (0, more)),
@@ -234,7 +234,7 @@ def padded(pairs: Pairs) -> tuple[np.ndarray, ...]:
     )
 
 
-def _room(count: int) -> int:
+def _capacity(count: int) -> int:
     """The next of 1, 1.5, 2, 3, 4, 6, 8 ..."""
     power = 1 << max(count - 1, 1).bit_length()
     return power * 3 // 4 if count <= power * 3 // 4 else power

@@ -76,7 +76,7 @@ def eye_row(model: HeadModel, number: int, state: str, job: Job, renderer: Rende
         warnings = job(shot.capture, shot.rig).warnings
     except EigenheadError as error:
         return {"closed": sorted(closed), "refused": str(error)[:120], "is_wrong": True}
-    named = told_sides(warnings)
+    named = warned_sides(warnings)
     return {"closed": sorted(closed), "told": sorted(named), "is_wrong": named != closed}
 
 
@@ -85,7 +85,7 @@ def closed_sides(number: int) -> frozenset[str]:
     return frozenset(SIDES if number % WINKS_EVERY else SIDES[:1])
 
 
-def told_sides(warnings: Sequence[ReportWarning]) -> frozenset[str]:
+def warned_sides(warnings: Sequence[ReportWarning]) -> frozenset[str]:
     """Returns the eyes that the warning ``eyes-closed`` names; both if it names none."""
     texts = [warning.text for warning in warnings if warning.code == "eyes-closed"]
     return frozenset(side for side in SIDES for text in texts if side in text or not any(s in text for s in SIDES))

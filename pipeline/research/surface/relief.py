@@ -117,15 +117,15 @@ def split_views(rig: Rig, world_from_head: Similarity) -> tuple[tuple[str, ...],
 def _reconstructed(
     capture: Capture, rig: Rig, names: tuple[str, ...], model: HeadModel, renderer: Renderer
 ) -> Reconstruction:
-    def kept(by_camera: Mapping) -> dict:
+    def selected(by_camera: Mapping) -> dict:
         return {name: value for name, value in by_camera.items() if name in names}
 
     seen = replace(
         capture,
-        images=kept(capture.images),
-        backgrounds=kept(capture.backgrounds),
-        masks=kept(capture.masks),
-        soft_masks=kept(capture.soft_masks),
+        images=selected(capture.images),
+        backgrounds=selected(capture.backgrounds),
+        masks=selected(capture.masks),
+        soft_masks=selected(capture.soft_masks),
         features=capture.features if names == rig.names else {},  # clicked in two views, of which a half has one
     )
     return reconstruct(ReconstructionContext(seen, rig.subset(names), model, Settings(), renderer))

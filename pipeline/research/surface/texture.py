@@ -104,7 +104,7 @@ def row_of(
     """Runs one subject without the ``number``-th nearest camera to the front one (counted in turn), and compares with
     that camera."""
     known = read()
-    kept = kept_back(known.rig, number)
+    kept = held_out_camera(known.rig, number)
     rig = known.rig.subset(name for name in known.rig.names if name != kept.name)
     images = {name: image for name, image in known.capture.images.items() if name != kept.name}
     capture = replace(known.capture, images=images)
@@ -133,7 +133,7 @@ def row_of(
     return row
 
 
-def kept_back(rig: Rig, number: int) -> Camera:
+def held_out_camera(rig: Rig, number: int) -> Camera:
     """Chooses the camera that is not used: one of those that see the face."""
     front = rig[rig.front_camera()]
     order = sorted(rig, key=lambda camera: -float(camera.axis_world @ front.axis_world))
