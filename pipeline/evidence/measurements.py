@@ -88,7 +88,8 @@ def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | N
 def measurements(
     model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None
 ) -> dict[str, Measurement]:
-    """Returns every distance of ``DISTANCES`` whose end points the model has; ``vertices`` as for ``landmarks``."""
+    """Returns every distance of ``DISTANCES`` (mm) whose end points the model has, with its standard deviation. If the
+    head was refined beyond the fit, ``vertices`` is the delivered head (full level, world, mm)."""
     rows = dict(model.landmarks) | _cranial_points(model, fit)
     found = {name: ends for name, ends in DISTANCES.items() if ends[0] in rows and ends[1] in rows}
     index = np.array([[rows[a], rows[b]] for a, b in found.values()], int).reshape(-1)

@@ -121,17 +121,15 @@ def correction_of(corners: tuple[int, int, int], c: int, k: int, channel: int, c
 
 @njit(cache=True, nogil=True)
 def paint_rows(
-    image: np.ndarray,
-    row: int,
-    rows: int,
-    which: np.ndarray,
-    texels: np.ndarray,
-    faces: np.ndarray,
-    source: np.ndarray,
-    pictures: Pictures,
-    choice: Choice,
-) -> None:
-    """Paints the triangles ``which`` into ``rows`` rows of the image from ``row`` on, in place, as blue, green, red."""
+    image: np.ndarray, row: int, rows: int, which: np.ndarray, texels: np.ndarray, faces: np.ndarray,
+    source: np.ndarray, pictures: Pictures, choice: Choice,
+) -> None:  # fmt: skip
+    """Paints the triangles ``which`` of a texture's layout into ``rows`` rows of ``image`` (h, w, 3; blue, green, red),
+    from ``row`` on, in place.
+
+    ``texels`` (n, 2) are the corners' places in the image, ``faces`` (f, 3) the layout's triangles, and ``source`` (n)
+    the vertex of the head to which each corner belongs.
+    """
     width = image.shape[1]
     code = np.zeros(3, np.float32)
     most = 3 * choice.slots.shape[1]
