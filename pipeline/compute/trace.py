@@ -27,7 +27,8 @@ T = TypeVar("T")
 
 
 class Trace:
-    """Collects the spans of all threads of this process, from its creation on."""
+    """Collects spans of all threads of this process, from its creation on. A span is a named piece of work of one
+    thread with its start and duration."""
 
     def __init__(self) -> None:
         self._began = time.perf_counter_ns()
@@ -42,8 +43,11 @@ class Trace:
 
     @contextmanager
     def span(self, kind: Kind, name: str, **arguments: object) -> Iterator[None]:
-        """Records the block as one span of the calling thread, with that thread's processor seconds as ``cpu_s`` and,
-        but for loops and slices, those of all threads as ``process_cpu_s``. A block that raises is recorded, too."""
+        """Records the block as one span of the calling thread, also if it raises.
+
+        ``cpu_s`` of the span are the processor seconds of that thread. Except for loops and slices, ``process_cpu_s``
+        are those of all threads during the span.
+        """
         whole = kind not in ("loop", "slice")
         before_s, process_s = time.thread_time(), time.process_time() if whole else 0.0
         began = time.perf_counter_ns()
@@ -124,7 +128,7 @@ def span(kind: Kind, name: str) -> AbstractContextManager[None]:
 
 
 def traced(function: Callable[P, T]) -> Callable[P, T]:
-    """Makes the decorated function record each call as a span, if a trace is active."""
+    """Decorates a function so that each of its calls is recorded as a span, if a trace is active."""
 
     @functools.wraps(function)
     def timed(*arguments: P.args, **options: P.kwargs) -> T:

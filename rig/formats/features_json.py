@@ -15,7 +15,7 @@ POINTS_MOST = 200  # feature points in features.json
 
 
 class FeaturesDocument(TypedDict):
-    """Pixels by point and camera."""
+    """Describes ``features.json``: pixels by point and camera."""
 
     format: str
     points: dict[str, dict[str, list[float]]]

@@ -185,7 +185,7 @@ class Calibrations:
 
 
 def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
-    """Hard-links the images of the captures to ``folder/images/<camera>/``, each capture as one shot. Raises NotFound
+    """Links (hard links) the images of the captures to ``folder/images/<camera>/``, each capture as one shot. Raises NotFound
     for an unknown capture, and InputError if none of them has images."""
     for number, identity in enumerate(captures):
         record = store.capture(identity)
