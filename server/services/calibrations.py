@@ -185,8 +185,8 @@ class Calibrations:
 
 
 def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
-    """Links (hard links) the images of the captures to ``folder/images/<camera>/``, each capture as one shot. Raises NotFound
-    for an unknown capture, and InputError if none of them has images."""
+    """Links the images of the captures to ``folder/images/<camera>/`` (hard links), each capture as one shot. Raises
+    NotFound for an unknown capture, and InputError if none of them has images."""
     for number, identity in enumerate(captures):
         record = store.capture(identity)
         files = store.folder("captures", identity) / "files"
