@@ -60,7 +60,10 @@ class NewCapture(Received):
 class NewImport(Received):
     model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://store.example/anna.tar.gz"}]})
 
-    url: str = Field(max_length=2000, description="of an archive of a capture, at a server that the operator allowed")
+    url: str = Field(
+        max_length=2000,
+        description="of an archive of a capture, at a server or in a store (s3://) that the operator allowed",
+    )
     session: Id | None = None
     label: Text = ""
     expression: Text = ""

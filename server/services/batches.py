@@ -21,7 +21,8 @@ from rig.digest import document_sha256
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, compose
 from server.errors import Conflict, DiskFull, NotFound, TooMany
-from server.services.jobs import STATES, STATUSES, Jobs
+from server.services.job_rows import STATES, STATUSES
+from server.services.jobs import Jobs
 from server.services.records import Batch, Found, Job, moment_of
 from server.services.texts import check_texts
 from server.services.webhooks import Webhooks

@@ -22,7 +22,7 @@ from rig.errors import InputError
 from rig.messages.message import Message, compose, read_message
 from server.errors import Conflict, NotFound
 from server.services.failures import failure
-from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES
+from server.services.job_rows import APPLICATION_VERSION, FINISHED, STATES
 from server.services.records import Calibration
 from server.services.texts import check_texts
 from server.storage.events import EventLog

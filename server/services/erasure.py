@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from rig.messages.message import compose
 from server.errors import Unavailable
-from server.services.jobs import FINISHED, Jobs
+from server.services.job_rows import FINISHED
+from server.services.jobs import Jobs
 from server.storage.store import Store, folder_bytes
 
 CANCEL_S = 5.0  # a cancelled job lets go of its files within one second

@@ -7,13 +7,12 @@ input, its state the workflow's status. Progress comes from the event log, files
 import json
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import sqlalchemy as sa
 import structlog
-from dbos import DBOS, DBOSClient, EnqueueOptions, WorkflowStatus
+from dbos import DBOS, DBOSClient, WorkflowStatus
 
 from rig.errors import InputError
 from rig.messages.message import Message, compose
@@ -22,7 +21,18 @@ from server.log import log_file
 from server.origins import target
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
-from server.services.records import Found, Job, moment_of
+from server.services.job_rows import (
+    APPLICATION,
+    FINISHED,
+    STATES,
+    STATUSES,
+    WORKFLOW,
+    by_state,
+    enqueue_options,
+    moment,
+    request_of,
+)
+from server.services.records import Found, Job
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
@@ -33,22 +43,7 @@ from server.storage.library import Library
 from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
 from server.storage.store import Store, StoredFile, is_id, new_id, repeatable_id
 
-APPLICATION = "eigenhead"
-APPLICATION_VERSION = "eigenhead-jobs-1"  # pinned: a job outlives an upgrade; changes only with the steps themselves
-WORKFLOW = "reconstruct"
-DELIVERY = "deliver"
-STATES = {
-    "DELAYED": "queued",
-    "ENQUEUED": "queued",
-    "PENDING": "running",
-    "SUCCESS": "succeeded",
-    "ERROR": "failed",
-    "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "failed",
-    "CANCELLED": "cancelled",
-}
-STATUSES = {state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())}
 WORKER_START_S = 60.0  # a worker loads for 5 s on idle cores, for 40 s where all cores are busy
-FINISHED = ("succeeded", "failed", "cancelled")
 
 log = structlog.get_logger()
 
@@ -132,10 +127,10 @@ class Jobs:
             self._check_count(key)
             self.index.add(job_id, request, session)
             attributes = {"capture": request["capture_id"], "session": session, "key": key}
-            self.client.enqueue(_options(job_id, queue or self._settings.queue, priority, attributes), request)
+            self.client.enqueue(enqueue_options(job_id, queue or self._settings.queue, priority, attributes), request)
             first = self._status(job_id)
             assert first is not None
-        if not self._asks_the_same(_request(first), request):
+        if not self._asks_the_same(request_of(first), request):
             detail = compose("idempotency-key-reused")
             raise Conflict("idempotency-conflict", detail)
         return self._jobs([first])[0]
@@ -148,7 +143,7 @@ class Jobs:
         job_id = new_id()
         self.index.add_within(connection, job_id, request, session)
         attributes = {"capture": request["capture_id"], "session": session, "batch": batch.id}
-        options = _options(job_id, batch.queue, batch.priority, attributes)
+        options = enqueue_options(job_id, batch.queue, batch.priority, attributes)
         self.client.enqueue_in_transaction(connection, options, request)
         return job_id
 
@@ -166,7 +161,7 @@ class Jobs:
 
     def webhook(self, job_id: str) -> JobWebhook | None:
         """Returns the webhook that a job was submitted with, if any. Raises NotFound."""
-        return (_request(self._known(job_id)) or {}).get("webhook")
+        return (request_of(self._known(job_id)) or {}).get("webhook")
 
     def state(self, job_id: str) -> str:
         return STATES[self._known(job_id, load=False).status]
@@ -193,7 +188,7 @@ class Jobs:
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
         """Returns one page of the jobs that match a query; a word that names a state selects jobs in that state. Raises
         InputError for a cursor of another list."""
-        page = self.index.page(_by_state(query), limit, cursor)
+        page = self.index.page(by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[Job]:
@@ -272,7 +267,7 @@ class Jobs:
         job's value is used. Raises InputError, NotFound and TooMany."""
         wanted.check()
         row = self._known(job_id)
-        request = _request(row)
+        request = request_of(row)
         if request is None:
             raise NotFound(compose("thing-job-request"), job_id)
         request = cast(JobRequest, {**request, "restart_of": job_id})
@@ -294,7 +289,7 @@ class Jobs:
 
     def _requests(self, jobs: list[str]) -> dict[str, JobRequest]:
         rows = self.client.list_workflows(workflow_ids=jobs, name=WORKFLOW, load_output=False)
-        return {row.workflow_id: request for row in rows if (request := _request(row)) is not None}
+        return {row.workflow_id: request for row in rows if (request := request_of(row)) is not None}
 
     def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
         latest = self.events.latest([row.workflow_id for row in rows])
@@ -340,7 +335,7 @@ class Jobs:
     def _job(self, row: WorkflowStatus, event: JobEvent | None, places: Mapping[str, int]) -> Job:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
-        request = _request(row)
+        request = request_of(row)
         attributes = row.attributes or {}
         return Job(
             id=row.workflow_id,
@@ -359,39 +354,8 @@ class Jobs:
             queue=row.queue_name,
             priority=row.priority or 0,
             queue_position=places.get(row.workflow_id) if state == "queued" else None,
-            created=_moment(row.created_at),
-            started=_moment(row.dequeued_at),
-            finished=_moment(row.completed_at) if state in FINISHED else None,
+            created=moment(row.created_at),
+            started=moment(row.dequeued_at),
+            finished=moment(row.completed_at) if state in FINISHED else None,
             files=dict(row.output or {}) if state == "succeeded" else {},
         )
-
-
-def _options(job_id: str, queue: str, priority: int, attributes: dict[str, str | None]) -> EnqueueOptions:
-    return {
-        "workflow_name": WORKFLOW,
-        "queue_name": queue,
-        "workflow_id": job_id,
-        "app_version": APPLICATION_VERSION,
-        "priority": priority,
-        "attributes": attributes,
-    }
-
-
-def _by_state(query: JobQuery) -> JobQuery:
-    words = query.sought.split()
-    states = [word.casefold() for word in words if word.casefold() in STATUSES]
-    if not states:
-        return query
-    statuses = [status for state in states for status in STATUSES[state]]
-    both = statuses if query.statuses is None else [status for status in statuses if status in query.statuses]
-    rest = " ".join(word for word in words if word.casefold() not in STATUSES)
-    return replace(query, sought=rest, statuses=both)
-
-
-def _request(row: WorkflowStatus) -> JobRequest | None:
-    """A copy of what the job was asked for; None where its input cannot be read."""
-    return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
-
-
-def _moment(milliseconds: int | None) -> str | None:
-    return None if milliseconds is None else moment_of(milliseconds)

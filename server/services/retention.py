@@ -12,7 +12,7 @@ import structlog
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 from server.errors import NotFound
-from server.services.jobs import DELIVERY, FINISHED, STATUSES
+from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
 from server.storage.job_index import JobQuery
 from server.storage.library import CaptureQuery

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from server.services.jobs import STATUSES, Jobs
+from server.services.job_rows import STATUSES
+from server.services.jobs import Jobs
 from server.settings import ServiceSettings
 from server.storage.job_index import JobQuery
 from server.storage.store import Store

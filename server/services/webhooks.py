@@ -22,7 +22,7 @@ from dbos import EnqueueOptions
 from rig.messages.message import compose
 from server.errors import NotFound
 from server.origins import parsed, target
-from server.services.jobs import APPLICATION_VERSION, DELIVERY
+from server.services.job_rows import APPLICATION_VERSION, DELIVERY
 from server.services.records import NewWebhook, Webhook
 from server.storage.database import now_sql, webhooks
 from server.storage.records import JobWebhook, WebhookMessage

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from dbos import DBOS, DBOSConfig
 
-from server.services.jobs import APPLICATION, APPLICATION_VERSION
+from server.services.job_rows import APPLICATION, APPLICATION_VERSION
 from server.settings import ServiceSettings
 
 

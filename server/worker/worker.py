@@ -39,7 +39,7 @@ from server.problem_types import type_of_failure
 from server.processes import process_identity
 from server.services import calibrations
 from server.services.failures import JobFailed
-from server.services.jobs import DELIVERY, WORKFLOW
+from server.services.job_rows import DELIVERY, WORKFLOW
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers

@@ -12,7 +12,7 @@ from server.batch.table_files import has_parquet
 from server.console.page import Action, Chosen, Page, shared, show
 from server.console.pages.jobs import listed_jobs
 from server.services.batches import BatchRequest, Selection
-from server.services.jobs import STATUSES
+from server.services.job_rows import STATUSES
 from server.services.records import Batch
 from server.services.service import Service
 from server.services.work import ReconstructionRequest

@@ -19,7 +19,7 @@ from server.console.shown_messages import shown_failure
 from server.errors import Conflict, InvalidInput
 from server.services.bulk import each
 from server.services.documents import JobLine
-from server.services.jobs import FINISHED, STATUSES
+from server.services.job_rows import FINISHED, STATUSES
 from server.services.records import Job
 from server.services.retention import ENDED
 from server.services.service import Service

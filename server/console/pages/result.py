@@ -16,7 +16,7 @@ from server.console.pages.jobs import ListedJob, listed_jobs
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.errors import NotFound
-from server.services.jobs import STATUSES
+from server.services.job_rows import STATUSES
 from server.services.records import Job
 from server.services.service import Service
 from server.storage.job_index import JobQuery

@@ -17,11 +17,13 @@ from server.http.rig_schemas import CaptureChecks, HoldingsOut
 from server.http.schemas import CaptureEdit, CaptureOut, Idempotency, JobOut, NewCapture, NewFeatures, NewImport
 from server.services.bulk import each
 from server.services.captures import CaptureMetadata
+from server.services.imports import fetch_stored_capture
 from server.services.keys import Caller
 from server.services.tags import checked_tags
 from server.services.texts import PLAIN, TEXT_MOST
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
+from server.storage.object_places import is_object_url
 from server.storage.records import CaptureRecord
 from server.wire.fetch import fetch_archive
 from server.wire.multipart import ABOUT, ARCHIVE, described_form, receive_capture
@@ -61,13 +63,18 @@ async def upload_capture(service: ServiceOf, caller: Taker, request: Request, re
 @router.post("/captures/imports", status_code=201, responses=documented(400, 404, 413, 415, 507))
 async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, response: Response) -> CaptureOut:
     """Downloads a capture folder as an archive from a server that the operator allowed (``EIGENHEAD_IMPORT_ORIGINS``;
-    403 if there is none). 422 names every fault in the archive."""
-    if not service.settings.import_origins:
-        detail = compose("imports-not-allowed")
-        raise Forbidden("imports-off", detail)
+    403 if there is none), or takes it from an object store (``EIGENHEAD_IMPORT_PREFIXES``): an archive, or with a slash
+    at the end of ``url`` all files below it. 422 names every fault in it."""
+    stored = is_object_url(wanted.url)
+    if not (service.settings.import_prefixes if stored else service.settings.import_origins):
+        raise Forbidden("imports-off", compose("stored-imports-not-allowed" if stored else "imports-not-allowed"))
     about = CaptureMetadata(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     with service.store.incoming() as folder:
-        archive = await fetch_archive(service, wanted.url, folder)
+        if stored:
+            fetch = partial(fetch_stored_capture, wanted.url, folder, service.store, service.settings)
+            archive = await service.threads.disk(fetch)
+        else:
+            archive = await fetch_archive(service, wanted.url, folder)
         record = await service.threads.check(service.captures.accept, archive, folder, about)
     return _created(record, response)
 

@@ -14,7 +14,7 @@ from server.http.auth import ServiceOf, require
 from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Key, Limit, Sought
 from server.http.schemas import Idempotency, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
 from server.services.bulk import each
-from server.services.jobs import FINISHED, STATUSES
+from server.services.job_rows import FINISHED, STATUSES
 from server.services.keys import Caller
 from server.services.records import Job
 from server.services.work import ReconstructionRequest
