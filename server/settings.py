@@ -45,6 +45,12 @@ class ServiceSettings(BaseSettings):
     import_prefixes: tuple[str, ...] = Field(
         default=(), description="where in object stores captures may lie, such as s3://studio/incoming/"
     )
+    deliver_prefixes: tuple[str, ...] = Field(
+        default=(), description="where in object stores jobs may deliver results, such as s3://studio/heads/"
+    )
+    deliver_hours: float = Field(
+        default=72.0, gt=0, description="how long a delivery waits for a store that does not answer"
+    )
     store_endpoint: str | None = Field(
         default=None,
         pattern=r"^https?://[^?#\s]+$",
@@ -132,7 +138,7 @@ class ServiceSettings(BaseSettings):
                 raise ValueError(f"{origin!r} is no origin; give scheme://host or scheme://host:port, no path")
         return origins
 
-    @field_validator("import_prefixes")
+    @field_validator("import_prefixes", "deliver_prefixes")
     @classmethod
     def _object_prefixes(cls, prefixes: tuple[str, ...]) -> tuple[str, ...]:
         for prefix in prefixes:

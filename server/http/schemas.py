@@ -117,6 +117,10 @@ class JobWebhook(Received):
     secret: Secret | None = Field(None, description="signs the messages (standardwebhooks.com)")
 
 
+DeliverTo = Annotated[str, Field(pattern="^(s3|file)://[^\\x00-\\x1f\\x7f]*$", max_length=1000)]
+DELIVER_TO = "where the result is delivered to, in a folder of the job's id; a place that the operator allowed"
+
+
 class NewJob(Received):
     model_config = ConfigDict(
         json_schema_extra={
@@ -133,6 +137,7 @@ class NewJob(Received):
     capture_id: Id
     name: Text = Field("", description="for people; need not be unique")
     webhook: JobWebhook | None = None
+    deliver_to: DeliverTo | None = Field(None, description=DELIVER_TO, examples=["s3://studio/heads/"])
     model: str | None = Field(None, max_length=200)
     settings: JobSettings | None = Field(None, description="of the pipeline; what is not given has its default")
     queue: str | None = Field(None, max_length=32)
@@ -243,6 +248,14 @@ class ResultList(Answer):
     files: list[ResultFile]
 
 
+class DeliveryOut(Answer):
+    """Where a job's result is delivered to."""
+
+    to: str = Field(description="where the files lie once they are delivered; delivery.json is the last of them")
+    state: Literal["waiting", "delivering", "delivered", "failed", "cancelled"]
+    error: JobError | None
+
+
 class JobOut(Answer):
     id: str
     name: str
@@ -267,6 +280,7 @@ class JobOut(Answer):
     started: Moment | None
     finished: Moment | None
     files: dict[str, FileOut]
+    delivery: DeliveryOut | None = None
 
 
 class ModelOut(Answer):

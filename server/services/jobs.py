@@ -19,6 +19,7 @@ from rig.messages.message import Message, compose
 from server.errors import Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
+from server.services.deliveries import UNDER_WAY, Deliveries, delivery_of, destination, enqueue_delivery
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
 from server.services.job_rows import (
@@ -32,7 +33,7 @@ from server.services.job_rows import (
     moment,
     request_of,
 )
-from server.services.records import Found, Job
+from server.services.records import Delivery, Found, Job
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
@@ -62,6 +63,7 @@ class Jobs:
         self.client = DBOSClient(
             system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
         )
+        self._deliveries = Deliveries(self.client)
         self.index.complete(self._requests)
         self._began = time.monotonic()
 
@@ -81,8 +83,9 @@ class Jobs:
         """Queues a reconstruction of a capture and returns the job. With a known idempotency key it returns the job of
         the first request.
 
-        Raises InputError for work that cannot be done, InvalidInput for a webhook that may not be called, NotFound,
-        DiskFull, TooMany, and Conflict where the key was used for another request.
+        Raises InputError for work that cannot be done, InvalidInput for a webhook that may not be called and a place
+        where results may not be delivered, NotFound, DiskFull, TooMany, and Conflict where the key was used for another
+        request.
         """
         wanted.check()
         capture = self._store.capture(capture_id)
@@ -99,6 +102,8 @@ class Jobs:
         if wanted.webhook is not None:
             target(wanted.webhook["url"], self._settings.webhook_origins)
             request["webhook"] = wanted.webhook
+        if wanted.deliver_to is not None:
+            request["deliver_to"] = destination(wanted.deliver_to, self._settings)
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
     def check_queue(self, queue: str | None) -> None:
@@ -278,10 +283,28 @@ class Jobs:
         self._store.capture(request["capture_id"])
         return self._enqueue(request, (row.attributes or {}).get("session"), key, row.queue_name, row.priority or 0)
 
+    def deliver(self, job_id: str, to: str | None = None) -> Job:
+        """Delivers the result of a job to a place in an object store, None: the one that it was submitted with. Raises
+        NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a job without
+        result and while it is being delivered."""
+        self.files(job_id)
+        request = request_of(self._known(job_id))
+        place = to or (request or {}).get("deliver_to")
+        if place is None:
+            raise InputError("to", [compose("delivery-place-missing")])
+        place = destination(place, self._settings)
+        begun = self._deliveries.of([job_id]).get(job_id)
+        if begun is not None and begun.state in UNDER_WAY:
+            raise Conflict("delivery-active", compose("delivery-active"))
+        self._deliveries.forget(job_id)
+        enqueue_delivery(self.client.enqueue, job_id, place, self._settings, (request or {}).get("webhook"))
+        return self.get(job_id)
+
     def delete(self, job_id: str) -> None:
         """Removes a finished job and its files. The files go first, which needs no room in the database."""
         if self.state(job_id) not in FINISHED:
             raise Conflict("job-active", compose("job-active"))
+        self._deliveries.forget(job_id)
         self._store.remove(self._store.folder("jobs", job_id))
         self.events.remove([job_id])
         self.client.delete_workflow(job_id)
@@ -294,7 +317,8 @@ class Jobs:
     def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
         latest = self.events.latest([row.workflow_id for row in rows])
         places = self.index.places() if any(STATES[row.status] == "queued" for row in rows) else {}
-        return [self._job(row, latest.get(row.workflow_id), places) for row in rows]
+        begun = self._deliveries.of([row.workflow_id for row in rows if STATES[row.status] == "succeeded"])
+        return [self._job(row, latest.get(row.workflow_id), places, begun) for row in rows]
 
     def _check_count(self, key: str) -> None:
         active = len(self.active(key=key))
@@ -332,7 +356,13 @@ class Jobs:
             raise NotFound(compose("thing-job"), job_id)
         return row
 
-    def _job(self, row: WorkflowStatus, event: JobEvent | None, places: Mapping[str, int]) -> Job:
+    def _job(
+        self,
+        row: WorkflowStatus,
+        event: JobEvent | None,
+        places: Mapping[str, int],
+        begun: Mapping[str, Delivery],
+    ) -> Job:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
         request = request_of(row)
@@ -358,4 +388,5 @@ class Jobs:
             started=moment(row.dequeued_at),
             finished=moment(row.completed_at) if state in FINISHED else None,
             files=dict(row.output or {}) if state == "succeeded" else {},
+            delivery=delivery_of(row.workflow_id, state, request, begun),
         )

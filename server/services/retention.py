@@ -12,6 +12,7 @@ import structlog
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 from server.errors import NotFound
+from server.services.deliveries import UNDER_WAY
 from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
 from server.storage.job_index import JobQuery
@@ -120,6 +121,8 @@ def _jobs(service: Service) -> int:
         full = s.make_room and service.store.free_bytes() < s.free_bytes
         if not (old or many or full):
             break
+        if job.delivery is not None and job.delivery.state in UNDER_WAY:
+            continue
         with suppress(EigenheadError):
             service.jobs.delete(job.id)
             removed += 1

@@ -13,13 +13,14 @@ from server.storage.records import CaptureRecord, JobWebhook
 
 @dataclass(frozen=True, slots=True)
 class ReconstructionRequest:
-    """Holds what a job is to do: a model's name and settings of the pipeline (None: the defaults), the job's name, and
-    a webhook that hears of its end beside those of the service."""
+    """Holds what a job is to do: a model's name and settings of the pipeline (None: the defaults), the job's name, a
+    webhook that hears of its end beside those of the service, and a place in an object store for its result."""
 
     model: str | None = None
     settings: Mapping[str, object] | None = None
     name: str = ""
     webhook: JobWebhook | None = None
+    deliver_to: str | None = None
 
     def check(self) -> None:
         """Raises InputError naming an invalid name, an unknown model, every wrong setting and a template that the model

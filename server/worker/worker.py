@@ -38,6 +38,7 @@ from server.errors import Refused, unusable_input
 from server.problem_types import type_of_failure
 from server.processes import process_identity
 from server.services import calibrations
+from server.services.deliveries import DELIVER, DELIVERIES_QUEUE, enqueue_delivery
 from server.services.failures import JobFailed
 from server.services.job_rows import DELIVERY, WORKFLOW
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
@@ -45,13 +46,20 @@ from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
 from server.storage.failure_counts import note_failure
-from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, JobWebhook, WebhookMessage
+from server.storage.records import (
+    CalibrationOutcome,
+    FileEntry,
+    JobRequest,
+    JobWebhook,
+    WebhookMessage,
+)
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkFailed, function_at
 from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
+from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
 from server.worker.engine import engine_config, take_over
 from server.worker.heartbeat import dead_workers
 
@@ -75,11 +83,13 @@ class Worker:
         self._webhooks = Webhooks(self.engine, settings.webhook_origins)
         self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
+        self._deliverer = Deliverer(settings, self.store, self._webhooks, self._stop)
 
     def start(self) -> None:
         DBOS(config=engine_config(self.settings, self.id))
         self._register()
-        DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE])
+        self._deliverer.register()
+        DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE, DELIVERIES_QUEUE])
         self._beat()  # before the first job: a worker without a heartbeat row would have nobody to notice its death
         DBOS.launch()
         limit = self.settings.concurrency
@@ -90,6 +100,7 @@ class Worker:
             on_conflict="always_update",
         )
         DBOS.register_queue(WEBHOOKS_QUEUE, worker_concurrency=8, on_conflict="always_update")
+        DBOS.register_queue(DELIVERIES_QUEUE, worker_concurrency=DELIVERIES_AT_ONCE, on_conflict="always_update")
         threading.Thread(target=self._keep_alive, name="heartbeat", daemon=True).start()
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
@@ -140,6 +151,9 @@ class Worker:
                     shutil.rmtree(worker.store.folder("jobs", job_id), ignore_errors=True)
                     raise
                 worker.publish_outcome(job_id, "succeeded", request.get("webhook"))
+                if "deliver_to" in request:
+                    place, hook = request["deliver_to"], request.get("webhook")
+                    enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, worker.settings, hook)
                 return files
 
         @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)
@@ -323,7 +337,7 @@ class Worker:
             return set(connection.scalars(sa.select(workers.c.id)))
 
     def _running(self) -> list[WorkflowStatus]:
-        names = [WORKFLOW, DELIVERY, calibrations.WORKFLOW]
+        names = [WORKFLOW, DELIVERY, DELIVER, calibrations.WORKFLOW]
         return DBOS.list_workflows(name=names, status="PENDING", load_input=False, load_output=False)
 
 
