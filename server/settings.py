@@ -51,6 +51,14 @@ class ServiceSettings(BaseSettings):
     deliver_hours: float = Field(
         default=72.0, gt=0, description="how long a delivery waits for a store that does not answer"
     )
+    results_store: str | None = Field(
+        default=None,
+        pattern=OBJECT_PREFIX.pattern,
+        description="where results lie, such as s3://studio/results/; without it in the data folder alone",
+    )
+    results_bytes: int = Field(
+        default=64 << 30, ge=0, description="the most that large files of results in that store take in the data folder"
+    )
     store_endpoint: str | None = Field(
         default=None,
         pattern=r"^https?://[^?#\s]+$",

@@ -44,7 +44,8 @@ def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
         with _drawing:
             if not kept.is_file():
                 try:  # the folder of a job that is erased meanwhile is not made anew: the face would stay
-                    write_image(kept, DRAWN[name](result), quality=QUALITY, parents=False)
+                    whole = service.jobs.result_folder(job_id)
+                    write_image(kept, DRAWN[name](whole), quality=QUALITY, parents=False)
                 except FileNotFoundError as error:
                     raise NotFound(compose("thing-job"), job_id) from error
     return kept

@@ -19,7 +19,7 @@ from rig.messages.message import Message, compose
 from server.errors import Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
-from server.services.deliveries import UNDER_WAY, Deliveries, delivery_of, destination, enqueue_delivery
+from server.services.deliveries import Deliveries, delivery_of, destination
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
 from server.services.job_rows import (
@@ -34,6 +34,7 @@ from server.services.job_rows import (
     request_of,
 )
 from server.services.records import Delivery, Found, Job
+from server.services.results import Results
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
@@ -41,7 +42,7 @@ from server.storage.database import alive_workers, workers
 from server.storage.events import EventLog, JobEvent
 from server.storage.job_index import JobIndex, JobQuery
 from server.storage.library import Library
-from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
+from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest
 from server.storage.store import Store, StoredFile, is_id, new_id, repeatable_id
 
 WORKER_START_S = 60.0  # a worker loads for 5 s on idle cores, for 40 s where all cores are busy
@@ -63,7 +64,7 @@ class Jobs:
         self.client = DBOSClient(
             system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
         )
-        self._deliveries = Deliveries(self.client)
+        self.deliveries, self.results = Deliveries(self.client), Results(store, settings)
         self.index.complete(self._requests)
         self._began = time.monotonic()
 
@@ -164,9 +165,9 @@ class Jobs:
         """Returns a job with its present state. Raises NotFound."""
         return self._jobs([self._known(job_id)])[0]
 
-    def webhook(self, job_id: str) -> JobWebhook | None:
-        """Returns the webhook that a job was submitted with, if any. Raises NotFound."""
-        return (request_of(self._known(job_id)) or {}).get("webhook")
+    def request(self, job_id: str) -> JobRequest | None:
+        """Returns what a job was submitted with, None where that cannot be read. Raises NotFound."""
+        return request_of(self._known(job_id))
 
     def state(self, job_id: str) -> str:
         return STATES[self._known(job_id, load=False).status]
@@ -253,6 +254,8 @@ class Jobs:
 
     def without_result(self) -> list[str]:
         """Lists the ids of succeeded jobs whose result is missing from the data folder, newest first."""
+        if self.results.elsewhere:
+            return []  # what the data folder lacks is fetched
         there = set(self._store.ids("jobs"))
         done = self.index.newest_first(STATUSES["succeeded"])
         return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
@@ -265,7 +268,21 @@ class Jobs:
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
-        return StoredFile(self._result(job_id) / name, file["sha256"])
+        stored = self.results.file(job_id, name, file)
+        self._unless_removed(job_id)
+        return stored
+
+    def result_folder(self, job_id: str) -> Path:
+        """Returns the folder with all files of a job's result. Raises NotFound and Conflict."""
+        folder = self.results.folder(job_id, self.files(job_id))
+        self._unless_removed(job_id)
+        return folder
+
+    def _unless_removed(self, job_id: str) -> None:
+        """Raises NotFound, and removes what was fetched, where the job was erased meanwhile."""
+        if self.results.elsewhere and self._status(job_id, load=False) is None:
+            self.results.erase(job_id)
+            raise NotFound(compose("thing-job"), job_id)
 
     def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> Job:
         """Submits a new job for the capture of an earlier job, which it names. Where ``wanted`` has None, the earlier
@@ -283,29 +300,12 @@ class Jobs:
         self._store.capture(request["capture_id"])
         return self._enqueue(request, (row.attributes or {}).get("session"), key, row.queue_name, row.priority or 0)
 
-    def deliver(self, job_id: str, to: str | None = None) -> Job:
-        """Delivers the result of a job to a place in an object store, None: the one that it was submitted with. Raises
-        NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a job without
-        result and while it is being delivered."""
-        self.files(job_id)
-        request = request_of(self._known(job_id))
-        place = to or (request or {}).get("deliver_to")
-        if place is None:
-            raise InputError("to", [compose("delivery-place-missing")])
-        place = destination(place, self._settings)
-        begun = self._deliveries.of([job_id]).get(job_id)
-        if begun is not None and begun.state in UNDER_WAY:
-            raise Conflict("delivery-active", compose("delivery-active"))
-        self._deliveries.forget(job_id)
-        enqueue_delivery(self.client.enqueue, job_id, place, self._settings, (request or {}).get("webhook"))
-        return self.get(job_id)
-
     def delete(self, job_id: str) -> None:
         """Removes a finished job and its files. The files go first, which needs no room in the database."""
         if self.state(job_id) not in FINISHED:
             raise Conflict("job-active", compose("job-active"))
-        self._deliveries.forget(job_id)
-        self._store.remove(self._store.folder("jobs", job_id))
+        self.deliveries.forget(job_id)
+        self.results.erase(job_id)
         self.events.remove([job_id])
         self.client.delete_workflow(job_id)
         self.index.remove(job_id)
@@ -317,7 +317,7 @@ class Jobs:
     def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
         latest = self.events.latest([row.workflow_id for row in rows])
         places = self.index.places() if any(STATES[row.status] == "queued" for row in rows) else {}
-        begun = self._deliveries.of([row.workflow_id for row in rows if STATES[row.status] == "succeeded"])
+        begun = self.deliveries.of([row.workflow_id for row in rows if STATES[row.status] == "succeeded"])
         return [self._job(row, latest.get(row.workflow_id), places, begun) for row in rows]
 
     def _check_count(self, key: str) -> None:
@@ -328,7 +328,7 @@ class Jobs:
 
     def _notice(self, job_id: str, state: str, queue: str | None) -> Message | None:
         """What keeps a queued job from beginning, or that the files of one that succeeded are gone."""
-        if state == "succeeded" and not self._result(job_id).is_dir():
+        if state == "succeeded" and not self.results.elsewhere and not self._result(job_id).is_dir():
             return compose("result-missing")
         return self.queue_notice(queue) if state == "queued" else None
 

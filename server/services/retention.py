@@ -43,6 +43,7 @@ def sweep(service: Service) -> dict[str, int]:
     gone["jobs"] = _jobs(service)
     gone["captures"] = _captures(service)
     gone["caches"] = _caches(service)
+    gone["results"] = service.jobs.results.bound(service.settings.results_bytes, service.jobs.files)
     gone["orphans"] = _orphans(service)
     gone["deliveries"] = _deliveries(service)
     _find_missing(service)

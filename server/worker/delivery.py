@@ -15,12 +15,13 @@ from server.errors import Refused
 from server.services.deliveries import DELIVER, MANIFEST, MANIFEST_FORMAT, delivery_id, place_of
 from server.services.failures import JobFailed
 from server.services.job_rows import request_of
+from server.services.results import Results
 from server.services.webhooks import Webhooks
 from server.settings import ServiceSettings
 from server.storage.object_places import locate, open_objects
 from server.storage.objects import ObjectStore, StoreDenied, StoreUnavailable, sha256_of
 from server.storage.records import DeliveryRequest, FileEntry
-from server.storage.store import Store
+from server.storage.store import Store, StoredFile
 
 DELIVERIES_AT_ONCE = 4  # of one worker; they wait for the store, not for cores
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # between two tries where the store is away
@@ -31,8 +32,11 @@ log = structlog.get_logger()
 class Deliverer:
     """Delivers results for one worker."""
 
-    def __init__(self, settings: ServiceSettings, store: Store, webhooks: Webhooks, stop: threading.Event) -> None:
-        self._settings, self._store, self._webhooks, self._stop = settings, store, webhooks, stop
+    def __init__(
+        self, settings: ServiceSettings, store: Store, webhooks: Webhooks, results: Results, stop: threading.Event
+    ) -> None:
+        self._settings, self._store, self._webhooks, self._results = settings, store, webhooks, results
+        self._stop = stop
 
     def register(self) -> None:
         """Makes the workflow known to the job engine."""
@@ -78,7 +82,7 @@ class Deliverer:
             pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
     def _try(self, wanted: DeliveryRequest) -> bool:
-        job_id, folder = wanted["job_id"], self._store.folder("jobs", wanted["job_id"]) / "result"
+        job_id = wanted["job_id"]
         prefix, key = locate(place_of(wanted), self._settings.deliver_prefixes)
         objects = open_objects(prefix, self._settings)
         while (row := DBOS.get_workflow_status(job_id)) is not None and row.status in ("PENDING", "ENQUEUED"):
@@ -89,7 +93,7 @@ class Deliverer:
         for name, file in files.items():
             if not self._wanted(job_id):
                 return self._take_back(objects, key)
-            self._put(objects, key, name, folder / name, file["sha256"])
+            self._put(objects, key, name, self._results.file(job_id, name, file))
         if not self._wanted(job_id):
             return self._take_back(objects, key)
         request = request_of(row)
@@ -111,11 +115,11 @@ class Deliverer:
             log.warning("an unfinished delivery stays", reason=error.detail.text)
         return False
 
-    def _put(self, objects: ObjectStore, key: str, name: str, path: Path, sha256: str) -> None:
+    def _put(self, objects: ObjectStore, key: str, name: str, file: StoredFile) -> None:
         """Raises JobFailed for a file that is not what the job made, so that nobody waits for the store to mend it."""
         try:
-            if sha256_of(path) == sha256:
-                return objects.put(f"{key}{name}", path, sha256)
+            if sha256_of(file.path) == file.sha256:
+                return objects.put(f"{key}{name}", file.path, file.sha256)
         except FileNotFoundError:
             pass
         raise JobFailed("result-missing", compose("result-missing"))

@@ -41,6 +41,7 @@ from server.services import calibrations
 from server.services.deliveries import DELIVER, DELIVERIES_QUEUE, enqueue_delivery
 from server.services.failures import JobFailed
 from server.services.job_rows import DELIVERY, WORKFLOW
+from server.services.results import Results
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
@@ -83,7 +84,8 @@ class Worker:
         self._webhooks = Webhooks(self.engine, settings.webhook_origins)
         self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
-        self._deliverer = Deliverer(settings, self.store, self._webhooks, self._stop)
+        self.results = Results(self.store, settings)
+        self._deliverer = Deliverer(settings, self.store, self._webhooks, self.results, self._stop)
 
     def start(self) -> None:
         DBOS(config=engine_config(self.settings, self.id))
@@ -148,7 +150,7 @@ class Worker:
                     worker.count_failure(error.kind)
                     raise
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
-                    shutil.rmtree(worker.store.folder("jobs", job_id), ignore_errors=True)
+                    worker.results.discard(job_id)
                     raise
                 worker.publish_outcome(job_id, "succeeded", request.get("webhook"))
                 if "deliver_to" in request:
@@ -265,6 +267,7 @@ class Worker:
         for old in folder.glob("attempt-*"):
             shutil.rmtree(old, ignore_errors=True)
         files = described(target)
+        self.results.keep(job_id, files, lambda: self._states.runs(job_id))
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 

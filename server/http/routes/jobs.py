@@ -145,7 +145,7 @@ def restart_job(
 def deliver_job(service: ServiceOf, caller: Submitter, job_id: str, wanted: NewDelivery | None = None) -> JobOut:
     """Delivers the result of a job to an object store: for the first time, again after a failure, or elsewhere. 409
     while it is being delivered."""
-    return JobOut.model_validate(service.jobs.deliver(job_id, None if wanted is None else wanted.to))
+    return JobOut.model_validate(service.deliver(job_id, None if wanted is None else wanted.to))
 
 
 @router.delete("/jobs/{job_id}", status_code=204, responses=documented(404, 409))
@@ -192,7 +192,8 @@ def list_result(service: ServiceOf, caller: Reader, job_id: str) -> ResultList:
 @router.get("/jobs/{job_id}/result/all.zip", responses=ARCHIVE, response_class=StreamingResponse)
 def get_archive(service: ServiceOf, caller: Reader, request: Request, job_id: str) -> Response:
     """Returns all files of the result as one archive, which is packed while it is sent."""
-    return send_archive(request, service.store.folder("jobs", job_id) / "result", service.jobs.files(job_id))
+    files = service.jobs.files(job_id)
+    return send_archive(request, service.jobs.result_folder(job_id), files)
 
 
 @router.head("/jobs/{job_id}/result/{name:path}", include_in_schema=False)

@@ -17,7 +17,10 @@ from server.errors import Conflict, NotFound
 def service(tmp_path: Path) -> Any:
     """What is asked of a service: the state of a job, and where its files are."""
     (tmp_path / "jobs" / "j1" / "result").mkdir(parents=True)
-    jobs = SimpleNamespace(state=lambda job: "succeeded" if job == "j1" else "running")
+    jobs = SimpleNamespace(
+        state=lambda job: "succeeded" if job == "j1" else "running",
+        result_folder=lambda job: tmp_path / "jobs" / job / "result",
+    )
     return SimpleNamespace(jobs=jobs, store=SimpleNamespace(folder=lambda kind, name: tmp_path / kind / name))
 
 
