@@ -28,7 +28,13 @@ _drawing = threading.Lock()
 
 
 def result_folder(service: Service, job_id: str) -> Path:
-    """Returns the folder of a job's result. Raises Conflict where the job has none."""
+    """Returns the folder of a job's result, with all its files. Raises Conflict where the job has none."""
+    local = _local_folder(service, job_id)
+    return service.jobs.result_folder(job_id) if service.jobs.results.elsewhere else local
+
+
+def _local_folder(service: Service, job_id: str) -> Path:
+    """What was drawn lies beside it, whatever went from it to the store."""
     state = service.jobs.state(job_id)
     if state != "succeeded":
         raise Conflict("no-result", compose("job-without-result", state=state))
@@ -38,14 +44,13 @@ def result_folder(service: Service, job_id: str) -> Path:
 def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
     """Returns the file of a picture of a job's head, which is drawn at the first call. Raises Conflict where the job
     has no result, and NotFound or InputError where the result has no head."""
-    result = result_folder(service, job_id)
-    kept = result.parent / name
+    kept = _local_folder(service, job_id).parent / name
     if not kept.is_file():
         with _drawing:
             if not kept.is_file():
                 try:  # the folder of a job that is erased meanwhile is not made anew: the face would stay
-                    whole = service.jobs.result_folder(job_id)
-                    write_image(kept, DRAWN[name](whole), quality=QUALITY, parents=False)
+                    result = result_folder(service, job_id)
+                    write_image(kept, DRAWN[name](result), quality=QUALITY, parents=False)
                 except FileNotFoundError as error:
                     raise NotFound(compose("thing-job"), job_id) from error
     return kept

@@ -35,7 +35,7 @@ Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
 
 FIELDS = ("session", "label", "expression")
-OF_JOB = ("model", "name", "settings")
+OF_JOB = ("model", "name", "settings", "deliver_to")
 TAGS = "with commas between"
 
 
@@ -205,7 +205,7 @@ def delete_capture(
     status_code=202,
     tags=["jobs"],
     responses=documented(400, 404, 408, 409, 413, 415, 507),
-    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name"), tags=TAGS, settings="JSON object"),
+    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name", "deliver_to"), tags=TAGS, settings="JSON object"),
 )
 async def reconstruct_upload(
     service: ServiceOf,
@@ -219,7 +219,9 @@ async def reconstruct_upload(
     record, fields = await receive_capture(service, request, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]
-        wanted = ReconstructionRequest(fields.get("model") or None, _settings_of(fields.get("settings")), name)
+        place = fields.get("deliver_to") or None
+        settings = _settings_of(fields.get("settings"))
+        wanted = ReconstructionRequest(fields.get("model") or None, settings, name, deliver_to=place)
         submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=idempotency_key)
         job = await service.threads.disk(submit)
     except BaseException:

@@ -9,13 +9,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
 from tests.support.object_server import KEYS, Network, client_of, network_before
-from tests.support.services import RunningService, await_state, running_service, uploaded_capture, worker_pids
+from tests.support.services import (
+    RunningService,
+    await_state,
+    packed_capture,
+    running_service,
+    uploaded_capture,
+    worker_pids,
+)
 
 NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
 
@@ -231,6 +239,17 @@ def test_a_batch_delivers_each_of_its_results(client: httpx.Client, capture: str
     (job,) = client.get("/v1/jobs", params={"batch": batch["id"]}).json()["jobs"]
     awaited(client, job["id"], "delivered")
     assert {*delivered(bucket, job["id"], "heads/batch/")} == NAMES | {"delivery.json"}
+
+
+def test_an_upload_with_its_job_says_where_to(
+    client: httpx.Client, bucket: Any, tmp_path: Path, service: RunningService
+) -> None:
+    files = {"file": packed_capture(tmp_path, 3).read_bytes()}
+    away = client.post("/v1/reconstructions", files=files, data={"deliver_to": "s3://studio-out/"})
+    assert (away.status_code, away.json()["type"]) == (422, "urn:eigenhead:problem:url-refused")
+    made = client.post("/v1/reconstructions", files=files, data={"deliver_to": "s3://studio-out/heads/"}).json()
+    awaited(client, made["id"], "delivered")
+    assert "delivery.json" in delivered(bucket, made["id"])
 
 
 def test_a_place_that_is_not_allowed_is_refused(client: httpx.Client, capture: str) -> None:
