@@ -74,7 +74,7 @@ def age(folder: Path) -> None:
     """Makes files look unused for an hour."""
     for path in folder.rglob("*"):
         if path.is_file():
-            os.utime(path, (time.time() - 3600,) * 2)
+            os.utime(path, (time.time() - 3600, time.time() - 3600))
 
 
 def test_a_result_goes_from_the_data_folder_and_comes_back(
