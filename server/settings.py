@@ -12,6 +12,7 @@ from server.address import is_loopback
 
 PREFIX = "EIGENHEAD_"
 ORIGIN = re.compile(r"^https?://[^/?#\s@]+$")
+OBJECT_PREFIX = re.compile(r"^(s3://[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]|file:/)/(.*/)?$", re.DOTALL)
 RECONSTRUCT = ".tasks.reconstruct:reconstruct_capture"
 DATABASES = ("sqlite", "postgres", "postgresql", "postgresql+psycopg")
 DATABASES_TOLD = "wanted is postgresql://HOST/NAME or sqlite:////FILE, or nothing for SQLite in the data folder"
@@ -41,6 +42,30 @@ class ServiceSettings(BaseSettings):
         default=(), description="where callers may import captures from, such as https://store.example; https://*: any"
     )
     import_s: float = Field(default=600.0, gt=0, description="the longest that fetching an archive may take")
+    import_prefixes: tuple[str, ...] = Field(
+        default=(), description="where in object stores captures may lie, such as s3://studio/incoming/"
+    )
+    deliver_prefixes: tuple[str, ...] = Field(
+        default=(), description="where in object stores jobs may deliver results, such as s3://studio/heads/"
+    )
+    deliver_hours: float = Field(
+        default=72.0, gt=0, description="how long a delivery waits for a store that does not answer"
+    )
+    results_store: str | None = Field(
+        default=None,
+        pattern=OBJECT_PREFIX.pattern,
+        description="where results lie, such as s3://studio/results/; without it in the data folder alone",
+    )
+    results_bytes: int = Field(
+        default=64 << 30, ge=0, description="the most that large files of results in that store take in the data folder"
+    )
+    store_endpoint: str | None = Field(
+        default=None,
+        pattern=r"^https?://[^?#\s]+$",
+        description="address of the S3-compatible store; else Amazon's",
+    )
+    store_region: str | None = Field(default=None, description="region of the store; without it what AWS_REGION says")
+    store_timeout_s: float = Field(default=10.0, gt=0, description="how long an object store may be silent")
     webhook_origins: tuple[str, ...] = Field(
         default=(), description="where a job may name a webhook of its own; https://*: any public one"
     )
@@ -120,6 +145,15 @@ class ServiceSettings(BaseSettings):
             if not ORIGIN.match(origin):
                 raise ValueError(f"{origin!r} is no origin; give scheme://host or scheme://host:port, no path")
         return origins
+
+    @field_validator("import_prefixes", "deliver_prefixes")
+    @classmethod
+    def _object_prefixes(cls, prefixes: tuple[str, ...]) -> tuple[str, ...]:
+        for prefix in prefixes:
+            if not OBJECT_PREFIX.match(prefix):
+                wanted = "give s3://bucket/folder/ or file:///folder/, with the slash at the end"
+                raise ValueError(f"{prefix!r} is no place in an object store; {wanted}")
+        return prefixes
 
     @property
     def public_host(self) -> str | None:

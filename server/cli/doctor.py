@@ -34,6 +34,7 @@ NOW = {
     "sqlite": "((julianday('now') - 2440587.5) * 86400.0)",
     "postgresql": "extract(epoch from clock_timestamp())",
 }
+STORE_S = 3.0  # how long doctor waits for a store at most
 MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
@@ -73,6 +74,7 @@ def examine(settings: ServiceSettings) -> dict[str, Finding]:
         "results": _results,
         "variables": _variables,
         "rig": _rig,
+        "stores": _stores,
         "port": _port,
     }
     findings: dict[str, Finding] = {}
@@ -251,6 +253,23 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
     from rig.formats.rig_toml import read_rig_config
 
     return True, f"{settings.rig}, {len(read_rig_config(settings.rig).cameras)} cameras; see `eigenhead rig check`"
+
+
+def _stores(settings: ServiceSettings) -> tuple[bool, str]:
+    """Lists the first object of each place; what may be written there only a delivery shows."""
+    kept = () if settings.results_store is None else (settings.results_store,)
+    places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *kept])
+    if not places:
+        return True, "none; EIGENHEAD_IMPORT_PREFIXES and EIGENHEAD_DELIVER_PREFIXES name places"
+    from server.storage.object_places import open_objects
+
+    faults, hasty = [], settings.model_copy(update={"store_timeout_s": min(settings.store_timeout_s, STORE_S)})
+    for place in places:
+        try:
+            next(iter(open_objects(place, hasty).entries("")), None)
+        except EigenheadError as error:
+            faults.append(str(error))
+    return not faults, " ".join(faults) or f"{', '.join(places)}: answer"
 
 
 def _port(settings: ServiceSettings) -> tuple[bool, str]:

@@ -28,7 +28,15 @@ _drawing = threading.Lock()
 
 
 def result_folder(service: Service, job_id: str) -> Path:
-    """Returns the folder of a job's result. Raises NotFound, and Conflict if the job has not succeeded."""
+    """Returns the folder of a job's result, with all its files. Raises NotFound, and Conflict if the job has not
+    succeeded."""
+    local = _local_folder(service, job_id)
+    return service.jobs.result_folder(job_id) if service.jobs.results.elsewhere else local
+
+
+def _local_folder(service: Service, job_id: str) -> Path:
+    """Returns where a job's result lies in the data folder. What was drawn of it lies beside that folder, even after
+    its files went to the store. Raises as ``result_folder``."""
     state = service.jobs.state(job_id)
     if state != "succeeded":
         raise Conflict("no-result", compose("job-without-result", state=state))
@@ -38,12 +46,12 @@ def result_folder(service: Service, job_id: str) -> Path:
 def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
     """Returns the file of a picture of a job's head, which the first call draws. Raises NotFound if the job or its head
     is gone, Conflict if the job has not succeeded, and InputError if the head cannot be read."""
-    result = result_folder(service, job_id)
-    kept = result.parent / name
+    kept = _local_folder(service, job_id).parent / name
     if not kept.is_file():
         with _drawing:
             if not kept.is_file():
                 try:  # the folder of a job that is erased meanwhile is not made anew: the face would stay
+                    result = result_folder(service, job_id)
                     write_image(kept, DRAWN[name](result), quality=QUALITY, parents=False)
                 except FileNotFoundError as error:
                     raise NotFound(compose("thing-job"), job_id) from error

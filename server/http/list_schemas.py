@@ -7,9 +7,11 @@ from pydantic import ConfigDict, Field
 
 from server.http.message_schemas import MessageOut, TextOf
 from server.http.schemas import (
+    DELIVER_TO,
     EXAMPLE_ID,
     Answer,
     CaptureOut,
+    DeliverTo,
     Id,
     JobOut,
     JobSettings,
@@ -125,3 +127,11 @@ class JobBulk(Received):
 
     action: Literal["cancel", "restart", "remove"]
     ids: Ids
+
+
+class NewDelivery(Received):
+    """Requests that a job's result is delivered to an object store."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"to": "s3://studio/heads/"}]})
+
+    to: DeliverTo | None = Field(None, description=f"{DELIVER_TO}; left out, the one that the job was submitted with")

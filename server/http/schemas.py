@@ -66,7 +66,10 @@ class NewImport(Received):
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://store.example/anna.tar.gz"}]})
 
-    url: str = Field(max_length=2000, description="of an archive of a capture, at a server that the operator allowed")
+    url: str = Field(
+        max_length=2000,
+        description="of an archive of a capture, at a server or in a store (s3://) that the operator allowed",
+    )
     session: Id | None = None
     label: Text = ""
     expression: Text = ""
@@ -124,6 +127,10 @@ class JobWebhook(Received):
     secret: Secret | None = Field(None, description="signs the messages (standardwebhooks.com)")
 
 
+DeliverTo = Annotated[str, Field(pattern="^(s3|file)://[^\\x00-\\x1f\\x7f]*$", max_length=1000)]
+DELIVER_TO = "where the result is delivered to, in a folder of the job's id; a place that the operator allowed"
+
+
 class NewJob(Received):
     """Requests a reconstruction of a capture."""
 
@@ -142,6 +149,7 @@ class NewJob(Received):
     capture_id: Id
     name: Text = Field("", description="for people; need not be unique")
     webhook: JobWebhook | None = None
+    deliver_to: DeliverTo | None = Field(None, description=DELIVER_TO, examples=["s3://studio/heads/"])
     model: str | None = Field(None, max_length=200)
     settings: JobSettings | None = Field(None, description="of the pipeline; what is not given has its default")
     queue: str | None = Field(None, max_length=32)
@@ -253,6 +261,14 @@ class ResultList(Answer):
     files: list[ResultFile]
 
 
+class DeliveryOut(Answer):
+    """Says where a job's result is delivered to."""
+
+    to: str = Field(description="where the files lie once they are delivered; delivery.json is the last of them")
+    state: Literal["waiting", "delivering", "delivered", "failed", "cancelled"]
+    error: JobError | None
+
+
 class JobOut(Answer):
     """Describes a job: its request, state and progress and, once it has succeeded, the files of its result. ``eta_s``
     is the estimated remaining time in seconds."""
@@ -280,3 +296,4 @@ class JobOut(Answer):
     started: Moment | None
     finished: Moment | None
     files: dict[str, FileOut]
+    delivery: DeliveryOut | None = None

@@ -21,6 +21,7 @@ from rig.digest import document_sha256
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, compose
 from server.errors import Conflict, DiskFull, NotFound, TooMany
+from server.services.deliveries import destination
 from server.services.job_rows import STATES, STATUSES
 from server.services.jobs import Jobs
 from server.services.records import Batch, Found, Job, moment_of
@@ -70,7 +71,9 @@ class BatchRequest:
         chosen = self.selection
         captures = None if chosen.captures is None else list(chosen.captures)
         wanted = [captures, chosen.session, chosen.prefix, self.work.model, self.work.settings]
-        return document_sha256({"wanted": json.dumps([*wanted, self.label, self.queue, self.priority], sort_keys=True)})
+        wanted += [self.label, self.queue, self.priority]
+        wanted += [] if self.work.deliver_to is None else [self.work.deliver_to]  # digests of earlier versions lack it
+        return document_sha256({"wanted": json.dumps(wanted, sort_keys=True)})
 
 
 class Batches:
@@ -99,6 +102,7 @@ class Batches:
         wanted.work.check()
         check_texts({"label": wanted.label}, "request")
         self._jobs.check_queue(wanted.queue)
+        place = None if wanted.work.deliver_to is None else destination(wanted.work.deliver_to, self._settings)
         identity = new_id() if idempotency_key is None else repeatable_id(key, f"batch {idempotency_key}")
         digest = wanted.digest()
         if idempotency_key is None or self._index.get(identity) is None:
@@ -117,6 +121,7 @@ class Batches:
                 priority=wanted.priority,
                 model=wanted.work.model,
                 settings=wanted.work.settings or {},
+                deliver_to=place,
             )
             self._index.add(row, captures)
         first = self._known(identity)
@@ -276,6 +281,8 @@ class Batches:
         request: JobRequest = {"capture_id": capture.id, "model": row.model, "settings": row.settings}
         if row.label:
             request["name"] = row.label
+        if row.deliver_to is not None:
+            request["deliver_to"] = row.deliver_to
         return self._jobs.enqueue_within(connection, request, capture.session, row)
 
     def _cancel_jobs(self, jobs: Sequence[str]) -> None:
@@ -320,6 +327,7 @@ class Batches:
             priority=row.priority,
             model=row.model,
             settings=row.settings,
+            deliver_to=row.deliver_to,
             total=sum(counts.values()),
             counts=counts,
             eta_s=eta_s,

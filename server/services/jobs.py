@@ -19,6 +19,7 @@ from rig.messages.message import Message, compose
 from server.errors import Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
+from server.services.deliveries import Deliveries, delivery_of, destination
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
 from server.services.job_rows import (
@@ -32,7 +33,8 @@ from server.services.job_rows import (
     moment,
     request_of,
 )
-from server.services.records import Found, Job
+from server.services.records import Delivery, Found, Job
+from server.services.results import Results
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
@@ -40,7 +42,7 @@ from server.storage.database import alive_workers, workers
 from server.storage.events import EventLog, JobEvent
 from server.storage.job_index import JobIndex, JobQuery
 from server.storage.library import Library
-from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
+from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest
 from server.storage.store import Store, StoredFile, is_id, new_id, repeatable_id
 
 WORKER_START_S = 60.0  # a worker loads for 5 s on idle cores, for 40 s where all cores are busy
@@ -62,6 +64,7 @@ class Jobs:
         self.client = DBOSClient(
             system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
         )
+        self.deliveries, self.results = Deliveries(self.client), Results(store, settings)
         self.index.complete(self._requests)
         self._began = time.monotonic()
 
@@ -83,24 +86,23 @@ class Jobs:
         returns the job of the first one.
 
         Raises NotFound for an unknown capture; InputError for an unknown model, wrong settings or queue; InvalidInput
-        for a webhook that may not be called; Conflict for a capture of the calibration board and for an idempotency key
-        that was used for another request; DiskFull; TooMany if the API key has too many jobs.
+        for a webhook that may not be called and for a place where results may not be delivered; Conflict for a capture
+        of the calibration board and for an idempotency key that was used for another request; DiskFull; TooMany if the
+        API key has too many jobs.
         """
         wanted.check()
         capture = self._store.capture(capture_id)
         refuse_board(capture)
         self.check_queue(queue)
         self._store.reserve(0, self._settings.free_bytes)
-        request: JobRequest = {
-            "capture_id": capture_id,
-            "model": wanted.model,
-            "settings": wanted.settings or {},
-        }
+        request: JobRequest = {"capture_id": capture_id, "model": wanted.model, "settings": wanted.settings or {}}
         if wanted.name:
             request["name"] = wanted.name
         if wanted.webhook is not None:
             target(wanted.webhook["url"], self._settings.webhook_origins)
             request["webhook"] = wanted.webhook
+        if wanted.deliver_to is not None:
+            request["deliver_to"] = destination(wanted.deliver_to, self._settings)
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
     def check_queue(self, queue: str | None) -> None:
@@ -162,9 +164,9 @@ class Jobs:
         """Returns a job with its present state. Raises NotFound."""
         return self._jobs([self._known(job_id)])[0]
 
-    def webhook(self, job_id: str) -> JobWebhook | None:
-        """Returns the webhook that a job was submitted with, if any. Raises NotFound."""
-        return (request_of(self._known(job_id)) or {}).get("webhook")
+    def request(self, job_id: str) -> JobRequest | None:
+        """Returns what a job was submitted with, or None if that cannot be read. Raises NotFound."""
+        return request_of(self._known(job_id))
 
     def state(self, job_id: str) -> str:
         """Returns the state of a job: "queued", "running", "succeeded", "failed" or "cancelled". Raises NotFound."""
@@ -254,6 +256,8 @@ class Jobs:
 
     def without_result(self) -> list[str]:
         """Lists the ids of succeeded jobs whose result is missing from the data folder, newest first."""
+        if self.results.elsewhere:
+            return []  # what the data folder lacks is fetched
         there = set(self._store.ids("jobs"))
         done = self.index.newest_first(STATUSES["succeeded"])
         return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
@@ -267,7 +271,21 @@ class Jobs:
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
-        return StoredFile(self._result(job_id) / name, file["sha256"])
+        stored = self.results.file(job_id, name, file)
+        self._unless_removed(job_id)
+        return stored
+
+    def result_folder(self, job_id: str) -> Path:
+        """Returns the folder with all files of a job's result. Raises NotFound and Conflict."""
+        folder = self.results.folder(job_id, self.files(job_id))
+        self._unless_removed(job_id)
+        return folder
+
+    def _unless_removed(self, job_id: str) -> None:
+        """Raises NotFound, and removes what was fetched, where the job was erased meanwhile."""
+        if self.results.elsewhere and self._status(job_id, load=False) is None:
+            self.results.erase(job_id)
+            raise NotFound(compose("thing-job"), job_id)
 
     def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> Job:
         """Queues a new job for the capture of an earlier job, and notes the earlier job's id in it. Model and settings
@@ -291,7 +309,8 @@ class Jobs:
         can be repeated. Raises NotFound, and Conflict for a queued or running job."""
         if self.state(job_id) not in FINISHED:
             raise Conflict("job-active", compose("job-active"))
-        self._store.remove(self._store.folder("jobs", job_id))
+        self.deliveries.forget(job_id)
+        self.results.erase(job_id)
         self.events.remove([job_id])
         self.client.delete_workflow(job_id)
         self.index.remove(job_id)
@@ -303,7 +322,8 @@ class Jobs:
     def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
         latest = self.events.latest([row.workflow_id for row in rows])
         places = self.index.places() if any(STATES[row.status] == "queued" for row in rows) else {}
-        return [self._job(row, latest.get(row.workflow_id), places) for row in rows]
+        begun = self.deliveries.of([row.workflow_id for row in rows if STATES[row.status] == "succeeded"])
+        return [self._job(row, latest.get(row.workflow_id), places, begun) for row in rows]
 
     def _check_count(self, key: str) -> None:
         active = len(self.active(key=key))
@@ -313,7 +333,7 @@ class Jobs:
 
     def _notice(self, job_id: str, state: str, queue: str | None) -> Message | None:
         """What keeps a queued job from beginning, or that the files of one that succeeded are gone."""
-        if state == "succeeded" and not self._result(job_id).is_dir():
+        if state == "succeeded" and not self.results.elsewhere and not self._result(job_id).is_dir():
             return compose("result-missing")
         return self.queue_notice(queue) if state == "queued" else None
 
@@ -343,7 +363,13 @@ class Jobs:
             raise NotFound(compose("thing-job"), job_id)
         return row
 
-    def _job(self, row: WorkflowStatus, event: JobEvent | None, places: Mapping[str, int]) -> Job:
+    def _job(
+        self,
+        row: WorkflowStatus,
+        event: JobEvent | None,
+        places: Mapping[str, int],
+        begun: Mapping[str, Delivery],
+    ) -> Job:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
         request = request_of(row)
@@ -369,4 +395,5 @@ class Jobs:
             started=moment(row.dequeued_at),
             finished=moment(row.completed_at) if state in FINISHED else None,
             files=dict(row.output or {}) if state == "succeeded" else {},
+            delivery=delivery_of(row.workflow_id, state, request, begun),
         )

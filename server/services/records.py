@@ -32,6 +32,16 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
+class Delivery:
+    """States where a job's result is delivered to, and how far that is: waiting, delivering, delivered, failed or
+    cancelled."""
+
+    to: str
+    state: str
+    error: Failure | None
+
+
+@dataclass(frozen=True, slots=True)
 class Job:
     """Holds the state of a job at one moment.
 
@@ -60,6 +70,7 @@ class Job:
     started: str | None
     finished: str | None
     files: dict[str, FileEntry]
+    delivery: Delivery | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +90,7 @@ class Batch:
     priority: int
     model: str | None
     settings: Mapping[str, object]
+    deliver_to: str | None
     total: int
     counts: Mapping[str, int]
     eta_s: float | None

@@ -14,6 +14,7 @@ import structlog
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 from server.errors import NotFound
+from server.services.deliveries import UNDER_WAY
 from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
 from server.storage.job_index import JobQuery
@@ -45,6 +46,7 @@ def sweep(service: Service) -> dict[str, int]:
     gone["jobs"] = _jobs(service)
     gone["captures"] = _captures(service)
     gone["caches"] = _caches(service)
+    gone["results"] = service.jobs.results.bound(service.settings.results_bytes, service.jobs.files)
     gone["orphans"] = _orphans(service)
     gone["deliveries"] = _deliveries(service)
     _find_missing(service)
@@ -123,6 +125,8 @@ def _jobs(service: Service) -> int:
         full = s.make_room and service.store.free_bytes() < s.free_bytes
         if not (old or many or full):
             break
+        if job.delivery is not None and job.delivery.state in UNDER_WAY:
+            continue
         with suppress(EigenheadError):
             service.jobs.delete(job.id)
             removed += 1

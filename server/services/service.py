@@ -5,11 +5,14 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from rig.messages.message import Message
+from rig.errors import InputError
+from rig.messages.message import Message, compose
+from server.errors import Conflict
 from server.metrics import Metrics
 from server.services.batches import Batches
 from server.services.calibrations import Calibrations
 from server.services.captures import Captures
+from server.services.deliveries import UNDER_WAY, destination, enqueue_delivery
 from server.services.jobs import Jobs, migrate
 from server.services.keys import Keys
 from server.services.records import Calibration, Job, RigState
@@ -101,8 +104,25 @@ class Service:
         NotFound."""
         job, did = self.jobs.cancel(job_id)
         if did:
-            self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue, job_webhook=self.jobs.webhook(job_id))
+            webhook = (self.jobs.request(job_id) or {}).get("webhook")
+            self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue, job_webhook=webhook)
         return job
+
+    def deliver(self, job_id: str, to: str | None = None) -> Job:
+        """Delivers the result of a job to a place in an object store, None: the one that it was submitted with. Raises
+        NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a job without
+        result and while it is being delivered."""
+        self.jobs.files(job_id)
+        request = self.jobs.request(job_id) or {}
+        if (place := to or request.get("deliver_to")) is None:
+            raise InputError("to", [compose("delivery-place-missing")])
+        place = destination(place, self.settings)
+        begun = self.jobs.deliveries.of([job_id]).get(job_id)
+        if begun is not None and begun.state in UNDER_WAY:
+            raise Conflict("delivery-active", compose("delivery-active"))
+        self.jobs.deliveries.forget(job_id)
+        enqueue_delivery(self.jobs.client.enqueue, job_id, place, self.settings, request.get("webhook"))
+        return self.jobs.get(job_id)
 
 
 def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:

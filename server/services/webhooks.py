@@ -62,11 +62,17 @@ class Webhooks:
                 raise NotFound(compose("thing-webhook"), identity)
 
     def announce(
-        self, job_id: str, state: str, enqueue: Callable[..., Any], job_webhook: JobWebhook | None = None
+        self,
+        job_id: str,
+        state: str,
+        enqueue: Callable[..., Any],
+        job_webhook: JobWebhook | None = None,
+        delivered_to: str | None = None,
     ) -> None:
         """Queues one message for each webhook about the state of a job, and one for the job's own webhook if it has
         one. Each message has an id made of webhook, job and state, so that repeating the call changes nothing.
-        ``enqueue`` is the job engine's function."""
+        ``enqueue`` is the job engine's function. ``delivered_to``: where the result lies, if it was
+        delivered."""
         for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
             identity = f"hook-{hook_id}-{job_id}-{state}"
             message: WebhookMessage = {
@@ -75,6 +81,8 @@ class Webhooks:
                 "job_id": job_id,
                 "id": identity,
             }
+            if delivered_to is not None:
+                message["delivered_to"] = delivered_to
             if job_webhook is not None and hook_id == OWN:
                 message["own"] = job_webhook
             enqueue(_delivery(identity), message)
@@ -132,7 +140,7 @@ def _delivery(identity: str) -> EnqueueOptions:
 
 def _signed(message: WebhookMessage, secret: str | None) -> tuple[bytes, dict[str, str]]:
     """The body and headers of a message; without a secret it is not signed."""
-    data = {name: value for name, value in message.items() if name in ("job_id", "batch_id")}
+    data = {name: value for name, value in message.items() if name in ("job_id", "batch_id", "delivered_to")}
     body = json.dumps({"type": message["type"], "data": data}).encode()
     signed = {} if secret is None else signed_headers(message["id"], int(time.time()), body, secret)
     return body, signed | {"content-type": "application/json"}

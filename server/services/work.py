@@ -14,12 +14,14 @@ from server.storage.records import CaptureRecord, JobWebhook
 @dataclass(frozen=True, slots=True)
 class ReconstructionRequest:
     """Holds what a job is to do: the model's name and the settings of the pipeline (None: the defaults), the job's
-    name, and a webhook that is called at its end besides those of the service."""
+    name, a webhook that is called at its end besides those of the service, and a place in an object store where its
+    result is delivered to."""
 
     model: str | None = None
     settings: Mapping[str, object] | None = None
     name: str = ""
     webhook: JobWebhook | None = None
+    deliver_to: str | None = None
 
     def check(self) -> None:
         """Raises InputError naming an invalid job name, an unknown model, every wrong setting and a template that the

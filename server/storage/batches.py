@@ -40,6 +40,7 @@ class BatchRow:
     priority: int
     model: str | None
     settings: Mapping[str, object]
+    deliver_to: str | None = None
     wish: Wish = "running"
     finished: int | None = None
     rounds: int = 0

@@ -98,6 +98,7 @@ batches = sa.Table(
     sa.Column("priority", sa.Integer, nullable=False),
     sa.Column("model", sa.Text, nullable=True),
     sa.Column("settings", sa.Text, nullable=False),  # JSON
+    sa.Column("deliver_to", sa.Text, nullable=True),
 )
 
 batch_items = sa.Table(  # a capture of a batch; its job, once it has one, is the engine's row
@@ -192,10 +193,10 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
 
 def _add_columns(engine: sa.Engine) -> None:
     """Gives tables of an earlier version the columns that they lack; all of those may be empty."""
-    known = {column["name"] for column in sa.inspect(engine).get_columns(job_index.name)}
-    if job_index.c.words.name not in known:
-        with engine.begin() as connection:
-            connection.execute(sa.text(f"ALTER TABLE {job_index.name} ADD COLUMN words TEXT"))
+    for table, name in ((job_index, "words"), (batches, "deliver_to")):
+        if name not in {column["name"] for column in sa.inspect(engine).get_columns(table.name)}:
+            with engine.begin() as connection:
+                connection.execute(sa.text(f"ALTER TABLE {table.name} ADD COLUMN {name} TEXT"))
 
 
 def scrub(engine: sa.Engine) -> None:

@@ -215,6 +215,17 @@ class JobRequest(TypedDict):
     restart_of: NotRequired[str]
     name: NotRequired[str]
     webhook: NotRequired[JobWebhook]
+    deliver_to: NotRequired[str]
+
+
+class DeliveryRequest(TypedDict):
+    """Holds where the result of a job is to be delivered, as the job engine stores it. ``to`` ends with a slash;
+    ``until``: when it is given up (s since 1970); ``webhook``: the job's own."""
+
+    job_id: str
+    to: str
+    until: float
+    webhook: NotRequired[JobWebhook]
 
 
 class FileEntry(TypedDict):
@@ -248,6 +259,7 @@ class WebhookMessage(TypedDict):
     type: str
     job_id: NotRequired[str]
     batch_id: NotRequired[str]
+    delivered_to: NotRequired[str]
     id: str
 
 

@@ -10,8 +10,6 @@ silent for ``silent_s``) puts its jobs back into their queue. The engine changes
 worker, so several workers may do this at once.
 """
 
-import hashlib
-import json
 import os
 import platform
 import secrets
@@ -23,7 +21,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import version
-from pathlib import Path
 
 import sqlalchemy as sa
 import structlog
@@ -33,27 +30,37 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import settings_from_document
 from rig.errors import Cancelled, InputError
-from rig.messages.message import MessageDocument, compose
+from rig.messages.message import compose
 from server.errors import Refused, unusable_input
 from server.problem_types import type_of_failure
 from server.processes import process_identity
 from server.services import calibrations
+from server.services.deliveries import DELIVER, DELIVERIES_QUEUE, enqueue_delivery
 from server.services.failures import JobFailed
 from server.services.job_rows import DELIVERY, WORKFLOW
+from server.services.results import Results
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
 from server.storage.failure_counts import note_failure
-from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, JobWebhook, WebhookMessage
+from server.storage.records import (
+    CalibrationOutcome,
+    FileEntry,
+    JobRequest,
+    JobWebhook,
+    WebhookMessage,
+)
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkFailed, function_at
 from server.tasks.progress import JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
+from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
 from server.worker.engine import engine_config, take_over
 from server.worker.heartbeat import dead_workers
+from server.worker.result_files import described, warnings_of
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
 
@@ -76,13 +83,16 @@ class Worker:
         self._webhooks = Webhooks(self.engine, settings.webhook_origins)
         self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
+        self.results = Results(self.store, settings)
+        self._deliverer = Deliverer(settings, self.store, self._webhooks, self.results, self._stop)
 
     def start(self) -> None:
         """Writes the first heartbeat, starts the job engine and begins to take jobs. Returns at once; the jobs run in
         threads."""
         DBOS(config=engine_config(self.settings, self.id))
         self._register()
-        DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE])
+        self._deliverer.register()
+        DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE, DELIVERIES_QUEUE])
         self._beat()  # before the first job: a worker without a heartbeat row would have nobody to notice its death
         DBOS.launch()
         limit = self.settings.concurrency
@@ -93,6 +103,7 @@ class Worker:
             on_conflict="always_update",
         )
         DBOS.register_queue(WEBHOOKS_QUEUE, worker_concurrency=8, on_conflict="always_update")
+        DBOS.register_queue(DELIVERIES_QUEUE, worker_concurrency=DELIVERIES_AT_ONCE, on_conflict="always_update")
         threading.Thread(target=self._keep_alive, name="heartbeat", daemon=True).start()
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
@@ -141,9 +152,12 @@ class Worker:
                     worker.count_failure(error.kind)
                     raise
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
-                    shutil.rmtree(worker.store.folder("jobs", job_id), ignore_errors=True)
+                    worker.results.discard(job_id)
                     raise
                 worker.publish_outcome(job_id, "succeeded", request.get("webhook"))
+                if "deliver_to" in request:
+                    place, hook = request["deliver_to"], request.get("webhook")
+                    enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, worker.settings, hook)
                 return files
 
         @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)
@@ -265,6 +279,7 @@ class Worker:
         for old in folder.glob("attempt-*"):
             shutil.rmtree(old, ignore_errors=True)
         files = described(target)
+        self.results.keep(job_id, files, lambda: self._states.runs(job_id))
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 
@@ -337,16 +352,8 @@ class Worker:
             return set(connection.scalars(sa.select(workers.c.id)))
 
     def _running(self) -> list[WorkflowStatus]:
-        names = [WORKFLOW, DELIVERY, calibrations.WORKFLOW]
+        names = [WORKFLOW, DELIVERY, DELIVER, calibrations.WORKFLOW]
         return DBOS.list_workflows(name=names, status="PENDING", load_input=False, load_output=False)
-
-
-def warnings_of(report: Path) -> list[MessageDocument]:
-    """Returns the warnings in a report.json; none if it is missing or holds none."""
-    try:
-        return json.loads(report.read_bytes())["warnings"]
-    except (OSError, ValueError, KeyError, TypeError):  # no result, or another kind of work
-        return []
 
 
 class _StateWatch:
@@ -367,16 +374,6 @@ class _StateWatch:
             log.warning("state of the job unknown", error=str(error)[:200])
             return True
         return row is not None and row.status in ("PENDING", "ENQUEUED")
-
-
-def described(folder: Path) -> dict[str, FileEntry]:
-    """Returns size and SHA-256 of every file below ``folder``, by its relative name."""
-    files: dict[str, FileEntry] = {}
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": digest}
-    return files
 
 
 def run_worker(settings: ServiceSettings, *, until_eof: bool = False) -> None:

@@ -10,7 +10,18 @@ from pydantic import ConfigDict, Field
 from server.http.auth import ServiceOf, require
 from server.http.list_schemas import Cursor, Limit, Listed, Sought
 from server.http.message_schemas import MessageOut, TextOf
-from server.http.schemas import EXAMPLE_ID, Answer, Id, Idempotency, JobSettings, Moment, Received, Text
+from server.http.schemas import (
+    DELIVER_TO,
+    EXAMPLE_ID,
+    Answer,
+    DeliverTo,
+    Id,
+    Idempotency,
+    JobSettings,
+    Moment,
+    Received,
+    Text,
+)
 from server.services.batches import PRIORITY, BatchRequest, Selection
 from server.services.keys import Caller
 from server.services.work import ReconstructionRequest
@@ -46,6 +57,7 @@ class NewBatch(Received):
     label: Text = Field("", description="for people; each of its jobs has it as its name")
     model: str | None = Field(None, max_length=200)
     settings: JobSettings | None = Field(None, description="of the pipeline; what is not given has its default")
+    deliver_to: DeliverTo | None = Field(None, description=DELIVER_TO)
     queue: str | None = Field(None, max_length=32)
     priority: int = Field(PRIORITY, ge=1, le=1000, description="of its jobs; lower goes first, and a job has 100")
 
@@ -74,6 +86,7 @@ class BatchOut(Answer):
     priority: int
     model: str | None
     settings: JobSettings
+    deliver_to: str | None
     total: int = Field(description="captures")
     counts: BatchCounts
     eta_s: float | None = Field(description="by the mean of its jobs so far; null before one succeeded")
@@ -95,7 +108,7 @@ def submit_batch(
     returns the first batch."""
     request = BatchRequest(
         Selection(wanted.captures, wanted.session, wanted.prefix),
-        ReconstructionRequest(wanted.model, wanted.settings),
+        ReconstructionRequest(wanted.model, wanted.settings, deliver_to=wanted.deliver_to),
         wanted.label,
         wanted.queue,
         wanted.priority,

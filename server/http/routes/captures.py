@@ -17,11 +17,13 @@ from server.http.rig_schemas import CaptureChecks, HoldingsOut
 from server.http.schemas import CaptureEdit, CaptureOut, Idempotency, JobOut, NewCapture, NewFeatures, NewImport
 from server.services.bulk import each
 from server.services.captures import CaptureMetadata
+from server.services.imports import fetch_stored_capture
 from server.services.keys import Caller
 from server.services.tags import checked_tags
 from server.services.texts import PLAIN, TEXT_MOST
 from server.services.work import ReconstructionRequest
 from server.storage.library import CaptureOrder, CaptureQuery
+from server.storage.object_places import is_object_url
 from server.storage.records import CaptureRecord
 from server.wire.fetch import fetch_archive
 from server.wire.multipart import ABOUT, ARCHIVE, described_form, receive_capture
@@ -33,7 +35,7 @@ Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
 
 FIELDS = ("session", "label", "expression")
-OF_JOB = ("model", "name", "settings")
+OF_JOB = ("model", "name", "settings", "deliver_to")
 TAGS = "with commas between"
 
 
@@ -62,14 +64,19 @@ async def upload_capture(service: ServiceOf, caller: Taker, request: Request, re
 
 @router.post("/captures/imports", status_code=201, responses=documented(400, 404, 413, 415, 507))
 async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, response: Response) -> CaptureOut:
-    """Downloads an archive of a capture folder from a server that the operator allowed (``EIGENHEAD_IMPORT_ORIGINS``;
-    403 if none is). 422 names every fault in the archive."""
-    if not service.settings.import_origins:
-        detail = compose("imports-not-allowed")
-        raise Forbidden("imports-off", detail)
+    """Downloads a capture folder as an archive from a server that the operator allowed (``EIGENHEAD_IMPORT_ORIGINS``;
+    403 if none is), or takes it from an object store (``EIGENHEAD_IMPORT_PREFIXES``): an archive, or with a slash
+    at the end of ``url`` all files below it. 422 names every fault in it."""
+    stored = is_object_url(wanted.url)
+    if not (service.settings.import_prefixes if stored else service.settings.import_origins):
+        raise Forbidden("imports-off", compose("stored-imports-not-allowed" if stored else "imports-not-allowed"))
     about = CaptureMetadata(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     with service.store.incoming() as folder:
-        archive = await fetch_archive(service, wanted.url, folder)
+        if stored:
+            fetch = partial(fetch_stored_capture, wanted.url, folder, service.store, service.settings)
+            archive = await service.threads.disk(fetch)
+        else:
+            archive = await fetch_archive(service, wanted.url, folder)
         record = await service.threads.check(service.captures.accept, archive, folder, about)
     return _created(record, response)
 
@@ -203,7 +210,7 @@ def delete_capture(
     status_code=202,
     tags=["jobs"],
     responses=documented(400, 404, 408, 409, 413, 415, 507),
-    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name"), tags=TAGS, settings="JSON object"),
+    openapi_extra=described_form(ARCHIVE, (*FIELDS, "model", "name", "deliver_to"), tags=TAGS, settings="JSON object"),
 )
 async def reconstruct_upload(
     service: ServiceOf,
@@ -217,7 +224,9 @@ async def reconstruct_upload(
     record, fields = await receive_capture(service, request, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]
-        wanted = ReconstructionRequest(fields.get("model") or None, _settings_of(fields.get("settings")), name)
+        place = fields.get("deliver_to") or None
+        settings = _settings_of(fields.get("settings"))
+        wanted = ReconstructionRequest(fields.get("model") or None, settings, name, deliver_to=place)
         submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=idempotency_key)
         job = await service.threads.disk(submit)
     except BaseException:

@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse, PlainTextResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Key, Limit, Sought
+from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Key, Limit, NewDelivery, Sought
 from server.http.schemas import Idempotency, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
 from server.services.bulk import each
 from server.services.job_rows import FINISHED, STATUSES
@@ -35,7 +35,7 @@ def submit_job(
     """Queues a reconstruction. The same Idempotency-Key with the same request returns the first job."""
     job = service.jobs.submit(
         wanted.capture_id,
-        ReconstructionRequest(wanted.model, wanted.settings, wanted.name, _webhook(wanted)),
+        ReconstructionRequest(wanted.model, wanted.settings, wanted.name, _webhook(wanted), wanted.deliver_to),
         key=caller.key,
         idempotency_key=idempotency_key,
         queue=wanted.queue,
@@ -141,6 +141,13 @@ def restart_job(
     return _accepted(service.jobs.restart(job_id, work, key=caller.key), response)
 
 
+@router.post("/jobs/{job_id}/delivery", status_code=202, responses=documented(400, 403, 404, 409, 413, 415))
+def deliver_job(service: ServiceOf, caller: Submitter, job_id: str, wanted: NewDelivery | None = None) -> JobOut:
+    """Delivers the result of a job to an object store: for the first time, again after a failure, or elsewhere. 409
+    while it is being delivered."""
+    return JobOut.model_validate(service.deliver(job_id, None if wanted is None else wanted.to))
+
+
 @router.delete("/jobs/{job_id}", status_code=204, responses=documented(404, 409))
 def delete_job(service: ServiceOf, caller: Submitter, job_id: str) -> None:
     """Removes a finished job with its result."""
@@ -185,7 +192,8 @@ def list_result(service: ServiceOf, caller: Reader, job_id: str) -> ResultList:
 @router.get("/jobs/{job_id}/result/all.zip", responses=ARCHIVE, response_class=StreamingResponse)
 def get_archive(service: ServiceOf, caller: Reader, request: Request, job_id: str) -> Response:
     """Returns all files of the result as one archive, which is packed while it is sent."""
-    return send_archive(request, service.store.folder("jobs", job_id) / "result", service.jobs.files(job_id))
+    files = service.jobs.files(job_id)
+    return send_archive(request, service.jobs.result_folder(job_id), files)
 
 
 @router.head("/jobs/{job_id}/result/{name:path}", include_in_schema=False)

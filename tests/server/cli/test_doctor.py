@@ -13,6 +13,7 @@ from server.services.jobs import migrate
 from server.services.keys import Keys
 from server.settings import ServiceSettings
 from server.storage.database import open_database
+from tests.support.object_server import Network, client_of
 
 
 @pytest.fixture
@@ -110,3 +111,18 @@ def test_a_result_that_is_gone_is_told(examine: Callable[..., dict], tmp_path: P
     found = examine(data=tmp_path)["results"]
     assert not found["ok"]
     assert f"of 2 jobs 1 are gone ({gone})" in found["detail"]
+
+
+def test_stores_that_answer_and_those_that_do_not_are_named(
+    examine: Callable[..., dict], tmp_path: Path, network: Network, object_server: str
+) -> None:
+    assert examine(data=tmp_path)["stores"]["ok"]
+    client_of(object_server).create_bucket(Bucket="examined")
+    there = {"store_endpoint": network.url, "store_timeout_s": 0.3, "import_prefixes": ("s3://examined/in/",)}
+    assert examine(data=tmp_path, **there)["stores"] == {"ok": True, "detail": "s3://examined/in/: answer"}
+    found = examine(data=tmp_path, **there, deliver_prefixes=("s3://nobody/", f"file://{tmp_path}/nas/"))["stores"]
+    assert not found["ok"]
+    assert "NoSuchBucket" in found["detail"]
+    assert "is it mounted?" in found["detail"]
+    network.fail("503", 1000)
+    assert "503" in examine(data=tmp_path, **there)["stores"]["detail"]

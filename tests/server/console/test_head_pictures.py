@@ -17,7 +17,11 @@ from server.errors import Conflict, NotFound
 def service(tmp_path: Path) -> Any:
     """What is asked of a service: the state of a job, and where its files are."""
     (tmp_path / "jobs" / "j1" / "result").mkdir(parents=True)
-    jobs = SimpleNamespace(state=lambda job: "succeeded" if job == "j1" else "running")
+    jobs = SimpleNamespace(
+        state=lambda job: "succeeded" if job == "j1" else "running",
+        results=SimpleNamespace(elsewhere=False),
+        result_folder=lambda job: tmp_path / "fetched",
+    )
     return SimpleNamespace(jobs=jobs, store=SimpleNamespace(folder=lambda kind, name: tmp_path / kind / name))
 
 
@@ -34,6 +38,19 @@ def test_a_picture_is_drawn_once(service: Any, tmp_path: Path, monkeypatch: pyte
     assert kept == tmp_path / "jobs" / "j1" / "first-view.jpg"
     assert kept.read_bytes()[:2] == b"\xff\xd8"
     assert drawn == [tmp_path / "jobs" / "j1" / "result"]
+
+
+def test_a_result_in_a_store_is_fetched_to_be_drawn_and_not_to_be_shown(
+    service: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Path] = []
+    monkeypatch.setitem(
+        head_pictures.DRAWN, "portrait.jpg", lambda result: (drawn.append(result), np.zeros((8, 8, 3), np.uint8))[1]
+    )
+    service.jobs.results.elsewhere = True
+    for _ in range(2):
+        assert head_picture(service, "j1", "portrait.jpg") == tmp_path / "jobs" / "j1" / "portrait.jpg"
+    assert drawn == [tmp_path / "fetched"]
 
 
 def test_a_job_that_is_erased_while_its_head_is_drawn_stays_erased(

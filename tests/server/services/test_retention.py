@@ -80,3 +80,22 @@ def test_a_result_that_somebody_removed_is_told_before_it_is_fetched(tmp_path: P
             time.sleep(0.1)
         again = client.post(f"/v1/jobs/{job}/restart").json()["id"]
         assert await_state(client, again, ("succeeded",))["files"] == files
+
+
+@pytest.mark.slow
+def test_a_result_that_waits_to_be_delivered_stays(tmp_path: Path, capture_file: bytes) -> None:
+    nas = tmp_path / "nas"  # not mounted yet
+    with (
+        running_service(
+            tmp_path / "data", keep_jobs="0", sweep_s="0.3", deliver_prefixes=f'["file://{nas}/"]'
+        ) as service,
+        httpx.Client(base_url=service.url, timeout=30) as client,
+    ):
+        wanted = {"capture_id": upload(service, capture_file), "deliver_to": f"file://{nas}/"}
+        job = client.post("/v1/jobs", json=wanted).json()["id"]
+        await_state(client, job, ("succeeded",))
+        time.sleep(2.0)
+        assert client.get(f"/v1/jobs/{job}").json()["delivery"]["state"] == "delivering"
+        nas.mkdir()
+        await_gone(client, f"/v1/jobs/{job}")
+        assert (nas / job / "delivery.json").is_file()

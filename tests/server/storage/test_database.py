@@ -3,8 +3,11 @@
 import os
 from pathlib import Path
 
+import sqlalchemy as sa
+
 from server.services.keys import Keys
 from server.settings import ServiceSettings
+from server.storage.batches import BatchIndex, BatchRow
 from server.storage.database import open_database
 
 NOBODY = 65534
@@ -20,3 +23,16 @@ def test_a_key_that_root_makes_leaves_the_database_to_the_data_folders_owner(tmp
     Keys(engine).add("admin", ("admin",))
     assert {path.stat().st_uid for path in data.iterdir()} == {data.stat().st_uid}
     engine.dispose()
+
+
+def test_tables_of_an_earlier_version_get_their_columns(tmp_path: Path) -> None:
+    settings = ServiceSettings(data=tmp_path)
+    engine = open_database(settings)
+    with engine.begin() as connection:
+        connection.execute(sa.text("ALTER TABLE eigenhead_batches DROP COLUMN deliver_to"))
+    engine.dispose()
+    again = open_database(settings)
+    row = BatchRow("b", 1, "", "local", "", "cpu", 500, None, {}, deliver_to="s3://studio/heads/")
+    assert BatchIndex(again).add(row, ["c"])
+    assert BatchIndex(again).get("b") == row
+    again.dispose()

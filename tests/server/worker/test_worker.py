@@ -18,7 +18,8 @@ from server.storage.database import workers
 from server.storage.records import CaptureRecord, JobRequest
 from server.storage.store import Store, new_id
 from server.tasks.child import WorkFailed
-from server.worker.worker import Worker, described, warnings_of
+from server.worker.result_files import described, warnings_of
+from server.worker.worker import Worker
 from tests.support.services import small_capture
 
 JOB = "0123456789ab" + 16 * "c"

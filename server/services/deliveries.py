@@ -1,0 +1,97 @@
+"""Delivering results to object stores: where a job may deliver, and what the job engine keeps of a delivery.
+
+A delivery is a workflow of the job engine, so that it survives what a job survives, and waits for a store that is away.
+A result lies in a folder of its job's id; the manifest, ``delivery.json``, comes last: once it is there, all is.
+"""
+
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+from dbos import DBOSClient, EnqueueOptions, WorkflowStatus
+
+from rig.messages.message import compose
+from server.errors import Forbidden
+from server.services.failures import failure
+from server.services.job_rows import APPLICATION_VERSION, STATES
+from server.services.records import Delivery
+from server.settings import ServiceSettings
+from server.storage.object_places import locate
+from server.storage.records import DeliveryRequest, JobRequest, JobWebhook
+
+DELIVERIES_QUEUE = "deliveries"
+DELIVER = "deliver-result"
+MANIFEST = "delivery.json"
+MANIFEST_FORMAT = "eigenhead-delivery/1"
+HOUR_S = 3600.0
+STATE_OF = {"queued": "waiting", "running": "delivering", "succeeded": "delivered"}
+UNDER_WAY = ("waiting", "delivering")
+
+
+def destination(url: str, settings: ServiceSettings) -> str:
+    """Returns a place that a caller names, with a slash at its end. Raises Forbidden where the service delivers
+    nowhere, and InvalidInput ("url-refused")."""
+    if not settings.deliver_prefixes:
+        raise Forbidden("deliveries-off", compose("deliveries-off"))
+    place = url if url.endswith("/") else f"{url}/"
+    locate(place, settings.deliver_prefixes)
+    return place
+
+
+def enqueue_delivery(
+    enqueue: Callable[..., Any], job_id: str, to: str, settings: ServiceSettings, webhook: JobWebhook | None
+) -> None:
+    """Queues the delivery of a job's result. Repeating the call changes nothing."""
+    wanted: DeliveryRequest = {"job_id": job_id, "to": to, "until": time.time() + settings.deliver_hours * HOUR_S}
+    if webhook is not None:
+        wanted["webhook"] = webhook
+    options: EnqueueOptions = {
+        "workflow_name": DELIVER,
+        "queue_name": DELIVERIES_QUEUE,
+        "workflow_id": delivery_id(job_id),
+        "app_version": APPLICATION_VERSION,
+    }
+    enqueue(options, wanted)
+
+
+def delivery_id(job_id: str) -> str:
+    """Returns the id of the workflow that delivers a job's result."""
+    return f"deliver-{job_id}"
+
+
+def place_of(wanted: DeliveryRequest) -> str:
+    """Returns where a job's result lies once it is delivered."""
+    return f"{wanted['to']}{wanted['job_id']}/"
+
+
+@dataclass(frozen=True, slots=True)
+class Deliveries:
+    """Reads and removes what the job engine keeps of deliveries. Methods block on the database."""
+
+    client: DBOSClient
+
+    def of(self, jobs: Collection[str]) -> dict[str, Delivery]:
+        """Returns the deliveries that were begun, by job."""
+        ids = [delivery_id(job_id) for job_id in jobs]
+        rows = self.client.list_workflows(name=DELIVER, workflow_ids=ids, load_output=True) if ids else []
+        found = [(cast(DeliveryRequest, row.input["args"][0]), row) for row in rows if row.input]
+        return {wanted["job_id"]: _delivery(wanted, row) for wanted, row in found}
+
+    def forget(self, job_id: str) -> None:
+        """Ends the delivery of a job, if any, and removes its row; what was delivered stays where it is."""
+        self.client.cancel_workflow(delivery_id(job_id))
+        self.client.delete_workflow(delivery_id(job_id))
+
+
+def delivery_of(job_id: str, state: str, request: JobRequest | None, begun: Mapping[str, Delivery]) -> Delivery | None:
+    """Returns the delivery of a job in this state: the one that was begun, else the one that it asks for."""
+    if job_id in begun or request is None or "deliver_to" not in request:
+        return begun.get(job_id)
+    place = f"{request['deliver_to']}{job_id}/"
+    return Delivery(place, "cancelled" if state in ("failed", "cancelled") else "waiting", None)
+
+
+def _delivery(wanted: DeliveryRequest, row: WorkflowStatus) -> Delivery:
+    state = STATES[row.status]
+    return Delivery(place_of(wanted), STATE_OF.get(state, state), failure(row) if state == "failed" else None)

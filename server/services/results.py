@@ -1,0 +1,145 @@
+"""Results of jobs in an object store, and what of them lies in the data folder.
+
+Where a store is configured, a job has succeeded only once its result is there, too, and the data folder is a cache: its
+large files go, those unused longest first, and come back when somebody asks for them. Small ones (reports, pictures of
+tables and sheets) stay. Without a store everything lies in the data folder, as it was made.
+"""
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import structlog
+
+from rig.errors import Cancelled, EigenheadError
+from rig.messages.message import compose
+from server.errors import Conflict, Refused
+from server.settings import ServiceSettings
+from server.storage.object_places import open_objects
+from server.storage.objects import ObjectMissing, StoreDenied, StoreUnavailable
+from server.storage.records import FileEntry
+from server.storage.store import Store, StoredFile
+
+LARGE_BYTES = 1 << 20
+UNUSED_S = 900.0  # a file that is being sent is not that old
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True)
+class _LargeFile:
+    used: float
+    bytes: int
+    job_id: str
+    path: Path
+
+
+class Results:
+    """Keeps the results of jobs. Methods block."""
+
+    def __init__(self, store: Store, settings: ServiceSettings) -> None:
+        place = settings.results_store
+        self._store, self._spare = store, settings.free_bytes
+        self._objects = None if place is None else open_objects(place, settings)
+
+    @property
+    def elsewhere(self) -> bool:
+        """Tells whether results lie in a store, whatever lies in the data folder."""
+        return self._objects is not None
+
+    def keep(self, job_id: str, files: Mapping[str, FileEntry], wanted: Callable[[], bool]) -> None:
+        """Stores a result, and waits for a store that is away. Raises Cancelled once the job is not ``wanted``."""
+        if self._objects is None:
+            return
+        pause_s = FIRST_PAUSE_S
+        for name, file in files.items():
+            while True:
+                if not wanted():
+                    raise Cancelled
+                try:
+                    self._objects.put(f"{job_id}/{name}", self._path(job_id, name), file["sha256"])
+                    break
+                except (StoreUnavailable, StoreDenied) as error:  # the head is made: it waits for its operator, too
+                    log.warning("a result waits for the store", reason=error.detail.text)
+                time.sleep(pause_s)
+                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+    def file(self, job_id: str, name: str, entry: FileEntry) -> StoredFile:
+        """Returns a file of a result, which is fetched where the data folder lacks it. Raises Unavailable where the
+        store does not give it, Conflict where it is not there, and DiskFull."""
+        path = self._path(job_id, name)
+        try:
+            if time.time() - path.stat().st_mtime > UNUSED_S:
+                os.utime(path)  # it is used
+        except FileNotFoundError:
+            if self._objects is not None:
+                self._fetch(job_id, name, entry, path)
+        return StoredFile(path, entry["sha256"])
+
+    def folder(self, job_id: str, files: Mapping[str, FileEntry]) -> Path:
+        """Returns the folder of a result with all its files. Raises what ``file`` raises."""
+        for name, entry in files.items():
+            self.file(job_id, name, entry)
+        return self._store.folder("jobs", job_id) / "result"
+
+    def erase(self, job_id: str) -> None:
+        """Removes a result, in the store with every version. Raises Unavailable where the store does not do it."""
+        if self._objects is not None:
+            self._objects.erase(f"{job_id}/")
+        self._store.remove(self._store.folder("jobs", job_id))
+
+    def discard(self, job_id: str) -> None:
+        """Removes what a cancelled job has made; a store that is away keeps it until the job is removed."""
+        if self._objects is not None:
+            with suppress(Refused):
+                self._objects.erase(f"{job_id}/")
+        shutil.rmtree(self._store.folder("jobs", job_id), ignore_errors=True)
+
+    def bound(self, most: int, files_of: Callable[[str], Mapping[str, FileEntry]]) -> int:
+        """Removes large files from the data folder that were not used for long, until all of them take ``most`` bytes.
+        Each is compared with its object before, and stored where it lacks one. Returns how many went."""
+        if self._objects is None:
+            return 0
+        found, removed = sorted(self._large(), key=lambda file: file.used), 0
+        total = sum(file.bytes for file in found)
+        for file in found:
+            if total <= most or time.time() - file.used < UNUSED_S:
+                break
+            name = file.path.relative_to(self._store.folder("jobs", file.job_id) / "result").as_posix()
+            try:
+                entry = files_of(file.job_id)[name]
+                self._objects.put(f"{file.job_id}/{name}", file.path, entry["sha256"])
+            except (EigenheadError, LookupError, OSError) as error:  # it runs, is being removed, or the store is away
+                log.info("a result stays in the data folder", job_id=file.job_id, reason=str(error)[:200])
+                continue
+            file.path.unlink(missing_ok=True)
+            total, removed = total - file.bytes, removed + 1
+        return removed
+
+    def _path(self, job_id: str, name: str) -> Path:
+        return self._store.folder("jobs", job_id) / "result" / name
+
+    def _fetch(self, job_id: str, name: str, entry: FileEntry, path: Path) -> None:
+        assert self._objects is not None
+        with self._store.incoming() as folder:
+            part = folder / "file"
+            try:
+                admit = lambda size: self._store.reserve(size, self._spare)  # noqa: E731
+                self._objects.fetch(f"{job_id}/{name}", part, entry["sha256"], admit)
+            except ObjectMissing as error:
+                raise Conflict("result-missing", compose("result-missing")) from error
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.replace(path)
+
+    def _large(self) -> Iterator[_LargeFile]:
+        for job_id in self._store.ids("jobs"):
+            for path in (self._store.folder("jobs", job_id) / "result").rglob("*"):
+                with suppress(FileNotFoundError):
+                    said = path.stat()
+                    if path.is_file() and said.st_size >= LARGE_BYTES:
+                        yield _LargeFile(said.st_mtime, said.st_size, job_id, path)

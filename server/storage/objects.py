@@ -1,0 +1,175 @@
+"""Objects: complete files under keys, in a folder or in an S3-compatible bucket.
+
+An object is visible only when it is whole, and what is read is compared with its checksum. A key is a relative path
+with slashes. ``ObjectStore`` has two implementations: ``FolderObjects`` here, ``S3Objects`` in
+``server.storage.s3_objects``.
+"""
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from rig.messages.message import Message, compose
+from server.errors import InvalidInput, Unavailable
+
+AGAIN_S = 10  # until a client asks again for what a store did not do
+BLOCK_BYTES = 1 << 20
+
+
+class StoreUnavailable(Unavailable):
+    """Reports a store that does not answer, or gives damaged bytes; it may be well again later."""
+
+    def __init__(self, place: str, reason: Message | str) -> None:
+        detail = compose("store-unavailable", place=place, reason=_short(reason))
+        super().__init__("store-unavailable", detail, retry_after_s=AGAIN_S)
+
+
+class StoreDenied(InvalidInput):
+    """Reports a store that refuses what is asked, and will again until its operator changes something."""
+
+    def __init__(self, place: str, reason: Message | str) -> None:
+        super().__init__("store-denied", compose("store-denied", place=place, reason=_short(reason)))
+
+
+class ObjectMissing(InvalidInput):
+    """Reports that there is no object under a key."""
+
+    def __init__(self, place: str) -> None:
+        super().__init__("object-missing", compose("object-missing", place=place))
+
+
+Admission = Callable[[int], None]  # is called with the size of an object before its bytes are written; may raise
+
+
+def any_size(size: int) -> None:
+    """Admits every object."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredObject:
+    """Holds the key of an object and its size."""
+
+    key: str
+    bytes: int
+
+
+class ObjectStore(Protocol):
+    """Keeps objects below one place. Methods block, and may be called by several threads and processes at once.
+
+    Each raises StoreUnavailable where the store does not do its part, and StoreDenied where it will not.
+    """
+
+    def put(self, key: str, path: Path, sha256: str) -> None:
+        """Stores a file whose content has this SHA-256, in place of an object of the same key. Returns once the object,
+        read back, has it, too; an equal object is left as it is."""
+        ...
+
+    def fetch(self, key: str, path: Path, sha256: str | None = None, admit: Admission = any_size) -> str:
+        """Writes an object to the file ``path`` and returns its SHA-256, which is ``sha256`` where that is given.
+        Raises ObjectMissing, and what ``admit`` raises."""
+        ...
+
+    def entries(self, prefix: str) -> Iterator[StoredObject]:
+        """Yields the objects whose keys begin with ``prefix``, which ends with a slash or is empty."""
+        ...
+
+    def erase(self, prefix: str) -> int:
+        """Removes all objects whose keys begin with ``prefix``, with every version of them and what unfinished uploads
+        left. Returns how many were removed."""
+        ...
+
+
+def _short(reason: Message | str) -> Message | str:
+    return reason if isinstance(reason, Message) else reason[:300]
+
+
+class FolderObjects:
+    """Keeps objects in a folder, perhaps of another machine. The folder must be there: one that is not mounted is not
+    made anew in its mount point."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def put(self, key: str, path: Path, sha256: str) -> None:
+        """Stores a file, as in ``ObjectStore``."""
+        with self._asking(key) as target:
+            if target.is_file() and sha256_of(target) == sha256:
+                return
+            target.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+            part = Path(name)
+            try:
+                with os.fdopen(handle, "wb") as stream, path.open("rb") as source:
+                    shutil.copyfileobj(source, stream, BLOCK_BYTES)
+                    stream.flush()
+                    os.fsync(stream.fileno())
+                if sha256_of(part) != sha256:
+                    raise StoreUnavailable(self._place(key), compose("store-checksum"))
+                part.chmod(0o644)
+                part.replace(target)
+            finally:
+                part.unlink(missing_ok=True)
+            folder = os.open(target.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+
+    def fetch(self, key: str, path: Path, sha256: str | None = None, admit: Admission = any_size) -> str:
+        """Writes an object to a file, as in ``ObjectStore``."""
+        with self._asking(key) as source:
+            if not source.is_file():
+                raise ObjectMissing(self._place(key))
+            admit(source.stat().st_size)
+            shutil.copyfile(source, path)
+        digest = sha256_of(path)
+        if sha256 not in (None, digest):
+            path.unlink()
+            raise StoreUnavailable(self._place(key), compose("store-checksum"))
+        return digest
+
+    def entries(self, prefix: str) -> Iterator[StoredObject]:
+        """Yields the objects below a key, as in ``ObjectStore``."""
+        with self._asking(prefix) as folder:
+            for path in sorted(folder.rglob("*")):
+                if path.is_file() and not path.is_symlink() and not path.name.endswith(".part"):
+                    yield StoredObject(path.relative_to(self._root).as_posix(), path.stat().st_size)
+
+    def erase(self, prefix: str) -> int:
+        """Removes all objects below a key and returns how many, as in ``ObjectStore``."""
+        with self._asking(prefix) as folder:
+            removed = sum(path.is_file() for path in folder.rglob("*"))
+            if folder == self._root:
+                raise StoreDenied(self._place(prefix), compose("store-whole"))
+            shutil.rmtree(folder, ignore_errors=not folder.exists())
+        return removed
+
+    def _place(self, key: str) -> str:
+        return f"file://{self._root}/{key}"
+
+    @contextmanager
+    def _asking(self, key: str) -> Iterator[Path]:
+        """Yields the path of a key; links inside the folder do not lead out of it."""
+        path = self._root / key
+        try:
+            if not self._root.is_dir():
+                raise StoreUnavailable(self._place(key), compose("store-not-mounted"))
+            if not path.resolve().is_relative_to(self._root.resolve()):
+                raise StoreDenied(self._place(key), compose("store-link"))
+            yield path
+        except PermissionError as error:
+            raise StoreDenied(self._place(key), str(error.strerror)) from error
+        except OSError as error:
+            raise StoreUnavailable(self._place(key), str(error.strerror or error)) from error
+
+
+def sha256_of(path: Path) -> str:
+    """Returns the SHA-256 of a file's content."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

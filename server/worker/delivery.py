@@ -1,0 +1,129 @@
+"""Delivers the result of a job to an object store, file by file, and its manifest last."""
+
+import json
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Literal, cast
+
+import structlog
+from dbos import DBOS
+
+from rig.messages.message import compose
+from server.errors import Refused
+from server.services.deliveries import DELIVER, MANIFEST, MANIFEST_FORMAT, delivery_id, place_of
+from server.services.failures import JobFailed
+from server.services.job_rows import request_of
+from server.services.results import Results
+from server.services.webhooks import Webhooks
+from server.settings import ServiceSettings
+from server.storage.object_places import locate, open_objects
+from server.storage.objects import ObjectStore, StoreDenied, StoreUnavailable, sha256_of
+from server.storage.records import DeliveryRequest, FileEntry
+from server.storage.store import Store, StoredFile
+
+DELIVERIES_AT_ONCE = 4  # of one worker; they wait for the store, not for cores
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # between two tries where the store is away
+
+log = structlog.get_logger()
+
+
+class Deliverer:
+    """Delivers results for one worker."""
+
+    def __init__(
+        self, settings: ServiceSettings, store: Store, webhooks: Webhooks, results: Results, stop: threading.Event
+    ) -> None:
+        self._settings, self._store, self._webhooks, self._results = settings, store, webhooks, results
+        self._stop = stop
+
+    def register(self) -> None:
+        """Makes the workflow known to the job engine."""
+        deliverer = self
+
+        @DBOS.step(name="send")
+        def send(wanted: DeliveryRequest) -> bool:
+            return deliverer.deliver(wanted)
+
+        @DBOS.workflow(name=DELIVER, max_recovery_attempts=self._settings.attempts)
+        def deliver_result(wanted: DeliveryRequest) -> None:
+            with structlog.contextvars.bound_contextvars(job=wanted["job_id"]):
+                try:
+                    if send(wanted):
+                        deliverer.announce(wanted, "delivered")
+                except JobFailed as error:
+                    log.warning("delivery failed", kind=error.kind, detail=error.detail.text)
+                    deliverer.announce(wanted, "undelivered")
+                    raise
+
+        del deliver_result  # known to the engine by name
+
+    def announce(self, wanted: DeliveryRequest, state: str) -> None:
+        """Announces to the webhooks of the service and of the job whether its result was delivered."""
+        hook, place = wanted.get("webhook"), place_of(wanted) if state == "delivered" else None
+        self._webhooks.announce(wanted["job_id"], state, DBOS.enqueue_workflow_with_options, hook, place)
+
+    def deliver(self, wanted: DeliveryRequest) -> bool:
+        """Delivers a job's result, and waits for a store that is away. Returns False where the job or its delivery was
+        removed meanwhile. Raises JobFailed where it cannot be delivered, and once ``until`` is over."""
+        pause_s = FIRST_PAUSE_S
+        while True:
+            try:
+                return self._try(wanted)
+            except StoreUnavailable as error:
+                if time.time() > wanted["until"]:
+                    detail = compose("delivery-given-up", reason=error.detail)
+                    raise JobFailed("delivery-failed", detail) from error
+                log.warning("delivery waits for the store", reason=error.detail.text)
+            except Refused as error:
+                raise JobFailed(error.kind, error.detail, error.errors) from error
+            self._stop.wait(pause_s)
+            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+    def _try(self, wanted: DeliveryRequest) -> bool:
+        job_id = wanted["job_id"]
+        prefix, key = locate(place_of(wanted), self._settings.deliver_prefixes)
+        objects = open_objects(prefix, self._settings)
+        while (row := DBOS.get_workflow_status(job_id)) is not None and row.status in ("PENDING", "ENQUEUED"):
+            time.sleep(self._settings.poll_s)  # the job is about to be noted as done
+        if row is None or row.status != "SUCCESS":
+            return self._take_back(objects, key)
+        files = cast(dict[str, FileEntry], row.output)
+        for name, file in files.items():
+            if not self._wanted(job_id):
+                return self._take_back(objects, key)
+            self._put(objects, key, name, self._results.file(job_id, name, file))
+        if not self._wanted(job_id):
+            return self._take_back(objects, key)
+        request = request_of(row)
+        document = {"format": MANIFEST_FORMAT, "job_id": job_id, "capture_id": request and request["capture_id"]}
+        with tempfile.TemporaryDirectory(dir=self._store.data / "incoming") as scratch:
+            manifest = Path(scratch) / MANIFEST
+            manifest.write_text(json.dumps(document | {"files": files}, indent=1), encoding="utf-8")
+            objects.put(f"{key}{MANIFEST}", manifest, sha256_of(manifest))
+        log.info("delivered", place=place_of(wanted), files=len(files))
+        return True
+
+    def _take_back(self, objects: ObjectStore, key: str) -> Literal[False]:
+        """Removes what was sent of a result that is gone: nobody was told of it, and it shows a face. An earlier
+        delivery that came to its end stays."""
+        try:
+            if all(entry.key != f"{key}{MANIFEST}" for entry in objects.entries(key)):
+                objects.erase(key)
+        except StoreDenied as error:
+            log.warning("an unfinished delivery stays", reason=error.detail.text)
+        return False
+
+    def _put(self, objects: ObjectStore, key: str, name: str, file: StoredFile) -> None:
+        """Raises JobFailed for a file that is not what the job made, so that nobody waits for the store to mend it."""
+        try:
+            if sha256_of(file.path) == file.sha256:
+                return objects.put(f"{key}{name}", file.path, file.sha256)
+        except FileNotFoundError:
+            pass
+        raise JobFailed("result-missing", compose("result-missing"))
+
+    def _wanted(self, job_id: str) -> bool:
+        row = DBOS.get_workflow_status(delivery_id(job_id))
+        return row is not None and row.status == "PENDING"

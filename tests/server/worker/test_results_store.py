@@ -1,0 +1,142 @@
+"""Results in an object store: a job has succeeded once its result is there; the data folder is a bounded cache; what is
+erased is gone with every version; a store that is away holds jobs up and makes no other 5xx than 503."""
+
+import hashlib
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.support.object_server import KEYS, Network, client_of, network_before
+from tests.support.services import RunningService, await_state, running_service, uploaded_capture
+
+NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
+
+
+@pytest.fixture(scope="module")
+def bucket(object_server: str) -> Any:
+    client = client_of(object_server)
+    client.create_bucket(Bucket="results")
+    client.put_bucket_versioning(Bucket="results", VersioningConfiguration={"Status": "Enabled"})
+    client.put_object(Bucket="results", Key="first", Body=b"makes the server take up its disk")
+    return client
+
+
+@pytest.fixture(scope="module")
+def way(bucket: Any, object_server: str) -> Iterator[Network]:
+    with network_before(object_server) as network:
+        yield network
+
+
+@pytest.fixture(scope="module")
+def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
+    environment = pytest.MonkeyPatch()
+    for name, value in (KEYS | {"EIGENHEAD_TINY_S": "0.02", "EIGENHEAD_TINY_BYTES": str(1 << 20)}).items():
+        environment.setenv(name, value)
+    with running_service(
+        tmp_path_factory.mktemp("service") / "data",
+        results_store="s3://results/of/",
+        results_bytes="0",
+        sweep_s="0.3",
+        store_endpoint=way.url,
+        store_timeout_s="1",
+    ) as service:
+        yield service
+    environment.undo()
+
+
+@pytest.fixture(scope="module")
+def capture(service: RunningService) -> str:
+    return uploaded_capture(service, service.data.parent)
+
+
+@pytest.fixture
+def client(service: RunningService, way: Network) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=service.url, timeout=60) as client:
+        yield client
+    way.heal()
+
+
+def submitted(client: httpx.Client, capture: str) -> str:
+    return client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+
+
+def listed(bucket: Any, job: str) -> set[str]:
+    found = bucket.list_objects_v2(Bucket="results", Prefix=f"of/{job}/").get("Contents", ())
+    return {entry["Key"].removeprefix(f"of/{job}/") for entry in found}
+
+
+def age(folder: Path) -> None:
+    """Makes files look unused for an hour."""
+    for path in folder.rglob("*"):
+        if path.is_file():
+            os.utime(path, (time.time() - 3600, time.time() - 3600))
+
+
+def test_a_result_goes_from_the_data_folder_and_comes_back(
+    client: httpx.Client, capture: str, bucket: Any, service: RunningService, way: Network
+) -> None:
+    job = submitted(client, capture)
+    files = await_state(client, job, ("succeeded",))["files"]
+    assert {*files} == NAMES == listed(bucket, job)
+    folder = service.data / "jobs" / job / "result"
+    age(folder)
+    deadline = time.monotonic() + 30
+    while any(path.is_file() for path in folder.rglob("*")):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert client.get(f"/v1/jobs/{job}").json()["notice"] is None
+    for fault in ("503", "torn"):
+        way.fail(fault, 1000, "GET")
+        answer = client.get(f"/v1/jobs/{job}/result/head.ply")
+        assert (answer.status_code, answer.headers["retry-after"]) == (503, "10"), answer.text
+        way.heal()
+    for name in NAMES:
+        data = client.get(f"/v1/jobs/{job}/result/{name}").content
+        assert hashlib.sha256(data).hexdigest() == files[name]["sha256"]
+    assert client.get(f"/v1/jobs/{job}/result/all.zip").status_code == 200
+
+
+def test_a_job_waits_for_the_store_and_goes_on(client: httpx.Client, capture: str, bucket: Any, way: Network) -> None:
+    way.fail("503", 10_000, "PUT")
+    job = submitted(client, capture)
+    deadline = time.monotonic() + 60
+    while not any(job in path for method, path in way.seen if method == "PUT"):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert client.get(f"/v1/jobs/{job}").json()["state"] == "running"
+    way.heal()
+    await_state(client, job, ("succeeded",), 60)
+    assert listed(bucket, job) == NAMES
+    way.fail("503", 10_000, "PUT")
+    other = submitted(client, capture)
+    while not any(other in path for method, path in way.seen if method == "PUT"):
+        time.sleep(0.05)
+    assert client.post(f"/v1/jobs/{other}/cancel").status_code == 200
+    way.heal()
+    deadline = time.monotonic() + 30
+    while (service_folder := listed(bucket, other)) or client.get(f"/v1/jobs/{other}").json()["state"] != "cancelled":
+        assert time.monotonic() < deadline, service_folder
+        time.sleep(0.1)
+
+
+def test_what_is_erased_is_gone_from_the_store_with_every_version(
+    client: httpx.Client, capture: str, bucket: Any, service: RunningService, way: Network
+) -> None:
+    job = submitted(client, capture)
+    await_state(client, job, ("succeeded",))
+    bucket.put_object(Bucket="results", Key=f"of/{job}/head.ply", Body=b"another version")
+    way.fail("503", 10_000)
+    refused = client.delete(f"/v1/captures/{capture}", params={"erase": True})
+    assert (refused.status_code, refused.headers["retry-after"]) == (503, "10")
+    way.heal()
+    assert client.delete(f"/v1/captures/{capture}", params={"erase": True}).status_code == 204
+    left = bucket.list_object_versions(Bucket="results", Prefix="of/")
+    assert "Versions" not in left
+    assert "DeleteMarkers" not in left
+    assert client.get(f"/v1/jobs/{job}").status_code == 404
+    assert not (service.data / "jobs" / job).exists()
