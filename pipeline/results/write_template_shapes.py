@@ -6,6 +6,7 @@ their own (``extras.rows`` of a node says which vertices it has).
 
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -59,8 +60,8 @@ def animated_glb(
     animated: AnimatedMesh,
     triangles: Int[np.ndarray, "g 3"],
     colours: UInt8[np.ndarray, "t 3"],
-    weights: dict[str, float],
-    extras: dict[str, object],
+    weights: Mapping[str, float],
+    extras: Mapping[str, object],
 ) -> bytes:
     """Encodes an animated mesh: morph targets by name, nodes at its pivots, eyeballs as parts of their own."""
     turning = np.zeros(len(animated.neutral), bool)

@@ -28,6 +28,7 @@ BLEND_STEP = 0.25  # of the way to moving together, a round
 MAX_ROUNDS = 60
 ZONE_RINGS = 6  # of triangles about what crosses that are looked at in a round; all are at the end
 MAX_ZONES = 5  # that a change makes wider
+FEW = 0.35  # share of the triangles from which looking at all of them takes less time
 SOFT_RINGS = 3  # over which a change fades
 RELAXING = 4  # halvings of the search for the least change that is enough
 
@@ -51,7 +52,7 @@ def rest_surface(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3
     beside = sparse.csr_array(((ones + ones.T) > 0).astype(float))
     spoilt = np.zeros(count, bool)
     spoilt[faces[crossing_faces(vertices, faces)]] = True
-    excluded = spoilt[faces].any(axis=1)
+    excluded = np.asarray(spoilt[faces].any(axis=1))
     return RestSurface(vertices, faces, beside, excluded)
 
 
@@ -161,7 +162,8 @@ def _crossing(
     """Tells which triangles cross at a weight; only pairs with an active one are looked at."""
     if not active.any():
         return active
-    return crossing_faces(rest.vertices + weight * displacement, rest.faces, active) & ~rest.excluded
+    few = active if active.mean() < FEW else None
+    return crossing_faces(rest.vertices + weight * displacement, rest.faces, few) & ~rest.excluded
 
 
 def _crossing_within(

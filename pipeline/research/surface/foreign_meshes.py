@@ -52,6 +52,13 @@ def dual(faces: Int[np.ndarray, "f 3"], count: int) -> ForeignMesh:
     return ForeignMesh(sparse.csr_array(thirds, shape=(len(used), count)), np.split(corners, ends))
 
 
+def over(mesh: ForeignMesh, rows: Int[np.ndarray, " r"], count: int) -> ForeignMesh:
+    """Returns a mesh on some rows of a model as a mesh on all its ``count`` vertices."""
+    places = (np.arange(len(rows)), rows)
+    rows_of_model = sparse.csr_array((np.ones(len(rows)), places), shape=(len(rows), count))
+    return ForeignMesh(sparse.csr_array(mesh.operator @ rows_of_model), mesh.polygons)
+
+
 def _ring(after: dict[int, tuple[int, int]]) -> list[int]:
     """Returns the triangles about a vertex in their order; none on a border."""
     first = here = next(iter(after))
