@@ -66,18 +66,21 @@ def crossings(
 
 def kept_apart(rest: RestSurface, displacement: Float[np.ndarray, "t 3"], *, closing: bool) -> Float[np.ndarray, "t 3"]:
     """Returns the displacement (mm, weight 1) changed so little that no triangles cross at ``WEIGHTS`` that do not at
-    rest. ``closing``: lids, which stop where they meet; everything else moves together."""
+    rest; where that cannot be, so that the fewest do. ``closing``: lids, which stop where they meet; everything else
+    moves together."""
     spot = _spot(rest, displacement, WEIGHTS[1::2])
-    out, zone = displacement, np.zeros(len(rest.vertices), bool)
+    best, fewest, zone = displacement, np.count_nonzero(spot), np.zeros(len(rest.vertices), bool)
     for _ in range(MAX_ZONES):
-        if not spot.any():
+        if not fewest:
             break
         zone = _grown(rest, zone | spot, ZONE_RINGS)
         rows = np.flatnonzero(zone[rest.faces].any(axis=1))
         out = _stopped(rest, displacement, rows) if closing else displacement
         out = _relaxed(rest, displacement, _together(rest, out, rows), rows)
         spot = _spot(rest, out, WEIGHTS)
-    return out
+        if np.count_nonzero(spot) < fewest:
+            best, fewest = out, np.count_nonzero(spot)
+    return best
 
 
 def _moved(rest: RestSurface, displacement: Float[np.ndarray, "t 3"]) -> Bool[np.ndarray, " f"]:
@@ -108,10 +111,13 @@ def _together(
 ) -> Float[np.ndarray, "t 3"]:
     """Returns the displacement blended with its mean over space, ever wider, until no triangles of a zone cross."""
     out, rounds = displacement, 0
+    best, fewest = displacement, np.inf
     for radius_mm in RADII_MM:
         base, times = out, np.zeros(len(out), int)
         while rounds < MAX_ROUNDS:
             spot = _spot(rest, out, WEIGHTS, zone)
+            if np.count_nonzero(spot) < fewest:
+                best, fewest = out, np.count_nonzero(spot)
             if not spot.any():
                 return out
             if times[spot].min() * BLEND_STEP >= 1.0:
@@ -123,7 +129,7 @@ def _together(
             mean = _mean_in_space(rest.vertices, rows, radius_mm) @ base
             out = base.copy()
             out[rows] = mean + retained[rows, None] * (base[rows] - mean)
-    return out
+    return best
 
 
 def _relaxed(

@@ -1,7 +1,8 @@
 """Apple's shapes carried to foreign meshes (``pipeline.templates.animated``), beside how these meshes truly move.
 
 The meshes are made of a model's own surface (``foreign_meshes``), so that the true motion of every vertex is the
-model's. Two of them have the shape of another person when they are registered; shapes are carried on the mean head.
+model's. They are the mean head when they are registered, those ``of_another`` a random head; shapes are carried on the
+mean head.
 An error is the root mean square over a mesh's vertices, divided by that of the true motion.
 """
 
@@ -69,11 +70,20 @@ def _cases(default: HeadModel, facekit: HeadModel) -> dict[str, tuple[HeadModel,
     faces = full.faces[:OPEN_TRIANGLES]
     mean = facekit.vertices(np.zeros(0))
     count, of_default = full.count, default.levels["full"].count
+
+    def dual_mesh() -> ForeignMesh:
+        return over(dual(coarse.faces, coarse.count), coarse.rows, of_default)
+
+    def split_mesh() -> ForeignMesh:
+        return split_decimation(mean, faces, TRIANGLES)
+
     return {
         "facekit": (facekit, lambda: shuffled(faces, np.arange(count), count, SEED), False),
         "makehuman": (default, lambda: shuffled(coarse.faces, coarse.rows, of_default, SEED), False),
-        "dual": (default, lambda: over(dual(coarse.faces, coarse.count), coarse.rows, of_default), True),
-        "split": (facekit, lambda: split_decimation(mean, faces, TRIANGLES), True),
+        "dual": (default, dual_mesh, False),
+        "split": (facekit, split_mesh, False),
+        "dual_of_another": (default, dual_mesh, True),
+        "split_of_another": (facekit, split_mesh, True),
     }
 
 
