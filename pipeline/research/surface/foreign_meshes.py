@@ -52,13 +52,6 @@ def dual(faces: Int[np.ndarray, "f 3"], count: int) -> ForeignMesh:
     return ForeignMesh(sparse.csr_array(thirds, shape=(len(used), count)), np.split(corners, ends))
 
 
-def over(mesh: ForeignMesh, rows: Int[np.ndarray, " r"], count: int) -> ForeignMesh:
-    """Returns a mesh on some rows of a model as a mesh on all its ``count`` vertices."""
-    places = (np.arange(len(rows)), rows)
-    rows_of_model = sparse.csr_array((np.ones(len(rows)), places), shape=(len(rows), count))
-    return ForeignMesh(sparse.csr_array(mesh.operator @ rows_of_model), mesh.polygons)
-
-
 def _ring(after: dict[int, tuple[int, int]]) -> list[int]:
     """Returns the triangles about a vertex in their order; none on a border."""
     first = here = next(iter(after))
@@ -71,18 +64,20 @@ def _ring(after: dict[int, tuple[int, int]]) -> list[int]:
     return []
 
 
-def split_decimation(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], triangles: int) -> ForeignMesh:
-    """Returns the surface decimated to a number of triangles, each of which is then split into four at its edges'
-    middles."""
+def decimated_split(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], triangles: int) -> ForeignMesh:
+    """Returns the surface split into four at the middles of its edges, then decimated to a number of triangles: edges
+    run elsewhere, and most vertices that stay are the surface's own."""
     count = len(vertices)
-    even, free = np.ones(count), np.zeros(count, bool)
-    rows, coarse = decimate(vertices, faces, (triangles,), importance=even, fixed=free)[0]
-    edges, opposite, _ = edges_of(coarse)
-    a, b, c = coarse.T
-    near_a, near_b, near_c = (len(rows) + opposite).T  # the middle of the edge opposite each corner
+    edges, opposite, _ = edges_of(faces)
+    a, b, c = faces.T
+    near_a, near_b, near_c = (count + opposite).T  # the middle of the edge opposite each corner
     quarters = [(a, near_c, near_b), (b, near_a, near_c), (c, near_b, near_a), (near_a, near_b, near_c)]
-    polygons = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
-    kept = sparse.csr_array((np.ones(len(rows)), (np.arange(len(rows)), rows)), shape=(len(rows), count))
-    places = (np.repeat(np.arange(len(edges)), 2), rows[edges].ravel())
+    fine = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
+    places = (np.repeat(np.arange(len(edges)), 2), edges.ravel())
     middles = sparse.csr_array((np.full(2 * len(edges), 0.5), places), shape=(len(edges), count))
-    return ForeignMesh(sparse.csr_array(sparse.vstack([kept, middles])), [*polygons])
+    whole = sparse.csr_array(sparse.vstack([sparse.eye_array(count), middles]))
+    points = whole @ vertices
+    # weights of three decades let chance decide where edges run
+    weight = 10.0 ** np.random.default_rng(0).uniform(0.0, 3.0, len(points))
+    rows, kept = decimate(points, fine, (triangles,), importance=weight, fixed=np.zeros(len(points), bool))[0]
+    return ForeignMesh(sparse.csr_array(whole[rows]), [*kept])

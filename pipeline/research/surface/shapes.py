@@ -1,8 +1,7 @@
 """Apple's shapes carried to foreign meshes (``pipeline.templates.animated``), beside how these meshes truly move.
 
 The meshes are made of a model's own surface (``foreign_meshes``), so that the true motion of every vertex is the
-model's. They are the mean head when they are registered, those ``of_another`` a random head; shapes are carried on the
-mean head.
+model's. The last two have the shape of another person when they are registered; shapes are carried on the mean head.
 An error is the root mean square over a mesh's vertices, divided by that of the true motion.
 """
 
@@ -17,7 +16,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.research import markdown
 from pipeline.research.outcome import Outcome, Row
 from pipeline.research.records import Records, key_of
-from pipeline.research.surface.foreign_meshes import ForeignMesh, dual, over, shuffled, split_decimation
+from pipeline.research.surface.foreign_meshes import ForeignMesh, decimated_split, dual, shuffled
 from pipeline.results.clay import clay
 from pipeline.templates import animated, carrying, contact, likeness, placement, registration, shape_carrying
 from pipeline.templates.animated import parted_shapes
@@ -32,7 +31,7 @@ SEED = 38
 LIMIT = 0.1  # of the motion
 BETWEEN = tuple(k / 8.0 for k in range(1, 9))  # weights at which crossings are counted once they are kept apart
 OPEN_TRIANGLES = 22288  # of ICT-FaceKit's face and head; what follows in the model closes eyes and mouth
-TRIANGLES = 4000  # of the decimation that is split
+TRIANGLES = 12000  # of the surface that was split and decimated
 SHOWN = {
     "jawOpen": ("jawOpen",),
     "smile": ("mouthSmileLeft", "mouthSmileRight"),
@@ -70,20 +69,11 @@ def _cases(default: HeadModel, facekit: HeadModel) -> dict[str, tuple[HeadModel,
     faces = full.faces[:OPEN_TRIANGLES]
     mean = facekit.vertices(np.zeros(0))
     count, of_default = full.count, default.levels["full"].count
-
-    def dual_mesh() -> ForeignMesh:
-        return over(dual(coarse.faces, coarse.count), coarse.rows, of_default)
-
-    def split_mesh() -> ForeignMesh:
-        return split_decimation(mean, faces, TRIANGLES)
-
     return {
         "facekit": (facekit, lambda: shuffled(faces, np.arange(count), count, SEED), False),
         "makehuman": (default, lambda: shuffled(coarse.faces, coarse.rows, of_default, SEED), False),
-        "dual": (default, dual_mesh, False),
-        "split": (facekit, split_mesh, False),
-        "dual_of_another": (default, dual_mesh, True),
-        "split_of_another": (facekit, split_mesh, True),
+        "remeshed": (facekit, lambda: decimated_split(mean, faces, TRIANGLES), True),
+        "dual": (facekit, lambda: dual(faces, count), True),
     }
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from pipeline.head_model.subdivision import check_manifold
-from pipeline.research.surface.foreign_meshes import ForeignMesh, dual, shuffled, split_decimation
+from pipeline.research.surface.foreign_meshes import ForeignMesh, decimated_split, dual, shuffled
 from rig.mesh import boundary_edges
 
 BALL = trimesh.creation.icosphere(subdivisions=4, radius=100.0)
@@ -38,9 +38,11 @@ def test_the_dual_has_a_polygon_about_every_vertex_and_none_on_the_border() -> N
     assert np.cross(polygon[1] - polygon[0], polygon[2] - polygon[1]) @ polygon.mean(axis=0) > 0.0  # faces outwards
 
 
-def test_a_split_decimation_has_four_triangles_for_each() -> None:
-    mesh = split_decimation(VERTICES, FACES, 1000)
+def test_a_decimated_split_lies_on_the_surface_with_other_edges() -> None:
+    mesh = decimated_split(VERTICES, FACES, 4000)
     assert len(boundary_edges(closed_triangles(mesh))) == 0
     assert len(mesh.polygons) == 4000
+    entries = np.diff(mesh.operator.indptr)
+    assert set(entries) <= {1, 2}
     radius = np.linalg.norm(mesh.operator @ VERTICES, axis=1)
-    assert 98.0 < radius.min() < radius.max() < 100.01
+    assert 99.0 < radius.min() < radius.max() < 100.01
