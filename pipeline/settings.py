@@ -228,7 +228,7 @@ class OutputSettings:
     ply_texture: bool = False  # head.ply names head.png and has texture coordinates
     neutral: bool = False  # neutral.glb, the head without its expression
     normal_map: bool = False  # head.glb has 10,000 triangles, and a normal map of what they leave out
-    morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names
+    morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names; of a template head-NAME.glb, too
     slicer: bool = False  # landmarks.mrk.json, a point list for 3D Slicer
     template: str | None = None  # head-NAME.obj: the head in the vertex order of a registered template, too
     obj: bool = False  # of earlier versions: "obj" among the formats

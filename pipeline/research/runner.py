@@ -32,6 +32,7 @@ from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
 from pipeline.research.surface.relief import relief
 from pipeline.research.surface.repeat import repeat
+from pipeline.research.surface.shapes import shapes
 from pipeline.research.surface.surfaces import surfaces
 from pipeline.research.surface.templates import templates
 from pipeline.research.surface.texture import texture
@@ -283,6 +284,10 @@ def _templates(task: Task) -> Outcome:
     return templates({"default": task.head}, facekit, report=task.report, folder=task.folder, **count)
 
 
+def _shapes(task: Task) -> Outcome:
+    return shapes(task.head, _facekit(task.shared), report=task.report, folder=task.folder)
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
@@ -317,6 +322,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "texture": _texture,
     "light": _drawn(light),
     "templates": _templates,
+    "shapes": _shapes,
     "scaling": _scaling,
     "growth": _growth,
 }

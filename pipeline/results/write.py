@@ -8,11 +8,13 @@
     neutral.glb         on request: the head without its expression; posed.glb, with morphs to make others
     landmarks.mrk.json  on request: the landmarks as a point list of 3D Slicer
     head-NAME.obj       on request: the head in the vertex order of the template NAME, with its texture
+    head-NAME.glb, head-NAME-shapes.npz     with morphs: that mesh without expression, with shapes and pivots
 
 Files of the same input, model, settings and version are the same bytes, report.json's seconds excepted.
 """
 
 import json
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,8 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.slicer_landmarks import landmarks_document
 from pipeline.results.write_expression import write_expression
-from pipeline.results.write_template import write_template
+from pipeline.results.write_template import template_colours, write_template
+from pipeline.results.write_template_shapes import write_template_shapes
 from pipeline.stages.bust import Bust
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
@@ -58,6 +61,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
             pool.submit(_write_overviews, folder, result, capture, head),
             *([] if blendshape_rig is None else [pool.submit(write_expression, folder, result, blendshape_rig)]),
             *([] if template is None else [pool.submit(write_template, folder, result, template)]),
+            *_shape_jobs(pool, folder, result, template),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
         ]
@@ -68,6 +72,16 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
         write_atomically(folder / "landmarks.mrk.json", points.encode())
     text = json.dumps(report_document(result, template), indent=1, allow_nan=False)
     write_atomically(folder / "report.json", text.encode())
+
+
+def _shape_jobs(
+    pool: ThreadPoolExecutor, folder: Path, result: Reconstruction, template: Template | None
+) -> list[Future[None]]:
+    blendshape_rig = result.evidence.blendshape_rig
+    if template is None or blendshape_rig is None or not result.settings.outputs.morphs:
+        return []
+    colours = template_colours(result, template)
+    return [pool.submit(write_template_shapes, folder, result, template, blendshape_rig, colours)]
 
 
 def _write_bust(folder: Path, result: Reconstruction, bust: Bust) -> None:

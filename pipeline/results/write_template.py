@@ -53,7 +53,7 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
         mesh,
         vertices,
         vertex_normals(vertices, mesh.triangles()),
-        colours=None if textures else _colours(result, template),
+        colours=None if textures else template_colours(result, template),
         comments=comments,
         library=library,
     )
@@ -65,7 +65,8 @@ def _tile_suffix(tile: Tile) -> str:
     return "" if tile == (0, 0) else f"-{1001 + tile[0] + 10 * tile[1]}"
 
 
-def _colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
+def template_colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
+    """Returns the colours of the template's vertices: the head's on the skin, grey elsewhere."""
     attached = template.surface_binding.attachment
     corners = result.texturing.vertices.colours[result.mesh_world.faces[attached.triangles]].astype(float)
     out = np.full((len(template.surface_binding.rest), 3), NO_SKIN, np.uint8)

@@ -3,14 +3,13 @@
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#morph-targets. Names are stored in ``extras.targetNames``,
 where three.js, Blender and others look for them."""
 
-import json
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from rig.formats.glb_document import appended_view, closed_glb, opened_glb
 from rig.mesh import vertex_normals
 
 LEAST_MM = 0.005  # smaller displacements are left out
@@ -33,7 +32,7 @@ def with_morphs(
         morphs: displacements by name, mm, at weight 1.
         weights: by name, those that the mesh is shown with.
     """
-    document, payload = _opened(glb)
+    document, payload = opened_glb(glb)
     primitive = document["meshes"][0]["primitives"][0]
     normals, targets = vertex_normals(vertices, faces), []
     for displacement in morphs.values():
@@ -47,7 +46,7 @@ def with_morphs(
     primitive["targets"] = targets
     document["meshes"][0]["weights"] = [float(weights.get(name, 0.0)) for name in morphs]
     document["meshes"][0]["extras"] = {"targetNames": list(morphs)}
-    return _closed(document, payload)
+    return closed_glb(document, payload)
 
 
 def _sparse(
@@ -60,8 +59,8 @@ def _sparse(
     if len(rows):
         accessor["sparse"] = {
             "count": len(rows),
-            "indices": {"bufferView": _view(document, payload, rows.astype("<u4")), "componentType": 5125},
-            "values": {"bufferView": _view(document, payload, moved)},
+            "indices": {"bufferView": appended_view(document, payload, rows.astype("<u4")), "componentType": 5125},
+            "values": {"bufferView": appended_view(document, payload, moved)},
         }
     if bounds:
         still = [np.zeros((1, 3), "<f4")] if len(rows) < len(values) else []
@@ -69,24 +68,3 @@ def _sparse(
         accessor |= {"min": whole.min(axis=0).tolist(), "max": whole.max(axis=0).tolist()}
     document["accessors"].append(accessor)
     return len(document["accessors"]) - 1
-
-
-def _view(document: dict[str, Any], payload: bytearray, array: np.ndarray) -> int:
-    payload.extend(b"\0" * (-len(payload) % 4))
-    document["bufferViews"].append({"buffer": 0, "byteOffset": len(payload), "byteLength": array.nbytes})
-    payload.extend(array.tobytes())
-    return len(document["bufferViews"]) - 1
-
-
-def _opened(glb: bytes) -> tuple[dict[str, Any], bytearray]:
-    (length,) = struct.unpack_from("<I", glb, 12)
-    return json.loads(glb[20 : 20 + length]), bytearray(glb[28 + length :])
-
-
-def _closed(document: dict[str, Any], payload: Sequence[int] | bytearray) -> bytes:
-    data = bytes(payload) + b"\0" * (-len(payload) % 4)
-    document["buffers"] = [{"byteLength": len(data)}]
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    header = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
-    return header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data

@@ -132,7 +132,10 @@ def reconstruct(
     ] = False,
     neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
     morphs: Annotated[
-        bool, typer.Option("--morphs", help="Write posed.glb too, with morph targets under Apple's names.")
+        bool,
+        typer.Option(
+            "--morphs", help="Write posed.glb too, with morph targets by Apple's names; of a template head-NAME.glb."
+        ),
     ] = False,
     slicer: Annotated[
         bool, typer.Option("--slicer", help="Write landmarks.mrk.json too, a point list for 3D Slicer.")

@@ -3,8 +3,9 @@ dependency of this project (GPL, 350 MB) and stands in an environment of its own
 
     uv run --no-project --python 3.11 --with bpy==4.2.0 python tests/support/blender.py heads/one --pictures out/blender
 
-for a result of ``eigenhead reconstruct ... --formats glb,obj,usdz,stl``. Prints a line a file and ends with status 1
-where something is wrong; each file is drawn as it stands in the scene, to be looked at.
+for a result of ``eigenhead reconstruct ... --formats glb,obj,usdz,stl``, with ``--template NAME --morphs`` its shapes,
+too. Prints a line a file and ends with status 1 where something is wrong; each file is drawn as it stands in the
+scene, to be looked at.
 """
 
 import argparse
@@ -25,6 +26,7 @@ OPENED = {
 }
 TEXTURED = (".glb", ".obj", ".usdz")
 UNITS_A_METRE = {".glb": 1.0, ".usdz": 1.0, ".obj": 1000.0, ".stl": 1000.0}
+PIVOTS = ("neck", "head", "jaw", "eye_right", "eye_left")
 HEIGHT_M = (0.2, 0.4)  # of a head with its neck
 
 
@@ -43,6 +45,37 @@ def opened(path: Path) -> tuple[str, list[str]]:
     if path.suffix in TEXTURED and not any(min(size) > 1 for size in images):
         found.append(f"{path.name}: no texture")
     return f"{path.name}: {len(corners)} vertices, {np.round(extent_m, 3)} m, textures {images}", found
+
+
+def played(path: Path) -> tuple[str, list[str]]:
+    """What a template's mesh with shapes is in Blender, and what is wrong with it: every shape key must move what its
+    morph target says, and every pivot must be an object."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    OPENED[path.suffix](str(path))
+    head = bpy.data.objects["head"]
+    keys = head.data.shape_keys.key_blocks
+    found = [f"{path.name}: no object {name}" for name in PIVOTS if name not in bpy.data.objects]
+    found += [] if "jawOpen" in keys else [f"{path.name}: no shape key jawOpen"]
+    rest = np.array([point.co for point in keys[0].data])
+    moved_mm = {key.name: 1000.0 * np.linalg.norm(np.array([p.co for p in key.data]) - rest, axis=1) for key in keys}
+    for key in keys:
+        key.value = 0.0
+    still = shown(head)
+    for name in moved_mm.keys() & {"jawOpen", "eyeBlinkLeft"}:
+        keys[name].value = 0.5
+        played_mm = 1000.0 * np.linalg.norm(shown(head) - still, axis=1)
+        keys[name].value = 0.0
+        if not np.allclose(played_mm, 0.5 * moved_mm[name], atol=0.01):
+            found.append(f"{path.name}: {name} does not play")
+    open_mm = moved_mm.get("jawOpen", np.zeros(1)).max()
+    return f"{path.name}: {len(keys) - 1} shape keys, jawOpen moves {open_mm:.1f} mm", found
+
+
+def shown(thing: Any) -> np.ndarray:
+    """(n, 3), the vertices of an object as its shape keys have them now."""
+    bpy.context.view_layer.update()
+    mesh = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
+    return np.array([vertex.co for vertex in mesh.vertices])
 
 
 def vertices() -> np.ndarray:
@@ -79,7 +112,12 @@ def main() -> int:
     parser.add_argument("--pictures", type=Path)
     arguments = parser.parse_args()
     paths = [path for path in sorted(arguments.result.glob("*head.*")) if path.suffix in OPENED]
-    found = [] if paths else [f"{arguments.result}: no head in it"]
+    animated = sorted(arguments.result.glob("head-*.glb"))
+    found = [] if paths or animated else [f"{arguments.result}: no head in it"]
+    for path in animated:
+        line, wrong = played(path.resolve())
+        sys.stdout.write(line + "\n")
+        found += wrong
     for path in paths:
         line, wrong = opened(path.resolve())
         sys.stdout.write(line + "\n")

@@ -74,7 +74,9 @@ def test_a_head_is_written_in_a_templates_order(tmp_path: Path) -> None:
     again = command("template", "add", str(tmp_path / "low.obj"), data=data)
     assert (again.returncode, "--overwrite" in again.stderr) == (1, True)
     arguments = ["reconstruct", str(shared("data/captures/scan-a")), "--detail", "span", "--surface", "head"]
-    done = command(*arguments, "--template", "low", "--formats", "ply", "--out", str(tmp_path / "out"), data=data)
+    done = command(
+        *arguments, "--template", "low", "--morphs", "--formats", "ply", "--out", str(tmp_path / "out"), data=data
+    )
     assert done.returncode == 0, done.stderr
     head = read_head_ply(tmp_path / "out" / "head.ply")[0].vertices[level.rows[order]]
     named = json.loads((tmp_path / "out" / "report.json").read_text())["template"]
@@ -83,3 +85,11 @@ def test_a_head_is_written_in_a_templates_order(tmp_path: Path) -> None:
     assert named["registration"] == pytest.approx(printed["figures"])
     written = read_polygons(tmp_path / "out" / "head-low.obj")
     assert np.median(np.linalg.norm(written.vertices - head, axis=1)) < 0.15  # chords of 9 mm sag by 0.1 mm
+    with np.load(tmp_path / "out" / "head-low-shapes.npz") as file:
+        names, displacements = json.loads(file["meta"].tobytes())["names"], file["displacements"]
+    assert displacements.shape == (len(names), level.count, 3)
+    scale = json.loads((tmp_path / "out" / "report.json").read_text())["world_from_head"]["scale"]
+    true = scale * (level.operator @ model.expressions.moved({"jawOpen": 1.0}))[order]
+    error = np.linalg.norm(displacements[names.index("jawOpen")] - true) / np.linalg.norm(true)
+    assert error < 0.1
+    assert (tmp_path / "out" / "head-low.glb").is_file()

@@ -1,0 +1,113 @@
+"""``head-NAME.glb`` and ``head-NAME-shapes.npz`` of a result: the template's mesh without expression, with shapes.
+
+Head frame; the GLB in metres, the archive in mm. Vertices keep the template's order; in the GLB, eyeballs are parts of
+their own (``extras.rows`` of a node says which vertices it has).
+"""
+
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from pipeline.evidence.expression import BlendshapeRig
+from pipeline.head_model.visemes import VISEMES
+from pipeline.results.metadata import asset_extras
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.templates.animated import AnimatedMesh, animated_mesh
+from pipeline.templates.template_file import Template
+from rig.atomic_write import write_atomically
+from rig.formats.glb import glb_bytes
+from rig.formats.morph_glb import with_morphs
+from rig.formats.pivot_glb import with_pivots
+from rig.geometry import RigidTransform
+from rig.mesh import Mesh, vertex_normals
+
+FORMAT = "eigenhead-shapes/1"
+
+
+def write_template_shapes(
+    folder: Path,
+    result: Reconstruction,
+    template: Template,
+    blendshape_rig: BlendshapeRig,
+    colours: UInt8[np.ndarray, "t 3"],
+) -> None:
+    """Writes the template's mesh with morph targets and pivots, and the same as arrays. ``colours``: of its vertices.
+    Raises OSError."""
+    place, model = result.head.fit.world_from_head, result.head.model
+    head_from_world = RigidTransform(place.rotation, place.translation).inverse()
+    vertices = head_from_world.apply(blendshape_rig.neutral_world.vertices)
+    triangles = template.mesh.triangles()
+    animated = animated_mesh(
+        template.surface_binding,
+        triangles,
+        vertices,
+        blendshape_rig.neutral_world.faces,
+        blendshape_rig.morphs,
+        model.landmarks,
+    )
+    name = f"head-{template.name}"
+    extras = asset_extras(result) | {"template": template.name, "template_sha256": template.source_sha256}
+    data = animated_glb(animated, triangles, colours, blendshape_rig.weights, extras)
+    write_atomically(folder / f"{name}.glb", data)
+    write_atomically(folder / f"{name}-shapes.npz", _archive(animated, template, blendshape_rig))
+
+
+def animated_glb(
+    animated: AnimatedMesh,
+    triangles: Int[np.ndarray, "g 3"],
+    colours: UInt8[np.ndarray, "t 3"],
+    weights: Mapping[str, float],
+    extras: Mapping[str, object],
+) -> bytes:
+    """Encodes an animated mesh: morph targets by name, nodes at its pivots, eyeballs as parts of their own."""
+    turning = np.zeros(len(animated.neutral), bool)
+    for rows in animated.eyeballs.values():
+        turning[rows] = True
+    rows = np.flatnonzero(~turning)
+    head = _part(animated, triangles, colours, rows)
+    glb = glb_bytes(head, normals=vertex_normals(head.vertices, head.faces), colours=head.colours, extras=extras)
+    morphs = {name: shape[rows] for name, shape in animated.shapes.items()}
+    glb = with_morphs(glb, head.vertices, head.faces, morphs, weights)
+    parts = {name: _part(animated, triangles, colours, part) for name, part in animated.eyeballs.items()}
+    named = {"head": rows.tolist()} | {name: part.tolist() for name, part in animated.eyeballs.items()}
+    return with_pivots(glb, animated.pivots, parts, named if turning.any() else {})
+
+
+def _part(
+    animated: AnimatedMesh,
+    triangles: Int[np.ndarray, "g 3"],
+    colours: UInt8[np.ndarray, "t 3"],
+    rows: Int[np.ndarray, " r"],
+) -> Mesh:
+    number = np.full(len(animated.neutral), -1)
+    number[rows] = np.arange(len(rows))
+    inside = triangles[(number[triangles] >= 0).all(axis=1)]
+    return Mesh(animated.neutral[rows], number[inside].astype(np.int32), colours[rows])
+
+
+def _archive(animated: AnimatedMesh, template: Template, blendshape_rig: BlendshapeRig) -> bytes:
+    meta = {
+        "format": FORMAT,
+        "template": template.name,
+        "template_sha256": template.source_sha256,
+        "frame": "head",
+        "unit": "mm",
+        "names": list(animated.shapes),
+        "weights": dict(blendshape_rig.weights),
+        "without_counterpart": list(blendshape_rig.missing),
+        "visemes": {name: dict(mixture) for name, mixture in VISEMES.items()},
+        "pivots": {name: pivot.tolist() for name, pivot in animated.pivots.items()},
+    }
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed,
+        meta=np.frombuffer(json.dumps(meta, sort_keys=True).encode(), np.uint8),
+        neutral=animated.neutral.astype(np.float32),
+        displacements=np.stack(list(animated.shapes.values())).astype(np.float32),
+        triangles=template.mesh.triangles().astype(np.int32),
+    )
+    return packed.getvalue()

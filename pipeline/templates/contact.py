@@ -1,0 +1,214 @@
+"""Shapes that let lips and lids meet but not pass through each other, at every weight from 0 to 1.
+
+A blendshape is linear, and knows nothing of what it meets. Where triangles of a posed mesh cross that did not at rest:
+
+- lids, which are apart at rest and meet late, stop where they first meet: their displacement is scaled there;
+- lips, which touch at rest, move together: their displacement is blended with its mean over the space about them (a
+  smooth field in space carries both lips alike, and what moves less in a millimetre than a millimetre cannot cross).
+
+Both are done no more than needed, ever wider until nothing crosses; all other vertices keep their displacement.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.fusion.crossings import crossing_faces
+
+WEIGHTS = (0.25, 0.5, 0.75, 1.0)  # at which shapes are looked at
+MEETING = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # ... lids, which meet late
+MEETING_ROUNDS = 6
+STILL_MM = 0.01  # what moves less stays
+MARGIN = 0.02  # of the weight: lids stop so much before they meet
+RADII_MM = (3.0, 6.0, 12.0, 24.0)  # of the space over which lips move together; lips are some 10 mm high
+BLEND_STEP = 0.25  # of the way to moving together, a round
+MAX_ROUNDS = 60
+ZONE_RINGS = 6  # of triangles about what crosses that are looked at in a round; all are at the end
+MAX_ZONES = 5  # that a change makes wider
+FEW = 0.35  # share of the triangles from which looking at all of them takes less time
+SOFT_RINGS = 3  # over which a change fades
+RELAXING = 4  # halvings of the search for the least change that is enough
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RestSurface:
+    """Holds a mesh at rest for contact: ``beside`` has 1 for every two vertices joined by an edge. Triangles that cross
+    others at rest, and those next to them, are ``excluded``: no shape can part them."""
+
+    vertices: Float[np.ndarray, "t 3"]
+    faces: Int[np.ndarray, "f 3"]
+    beside: sparse.csr_array
+    excluded: Bool[np.ndarray, " f"]
+
+
+def rest_surface(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> RestSurface:
+    """Prepares a mesh at rest (mm)."""
+    count = len(vertices)
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    ones = sparse.csr_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    beside = sparse.csr_array(((ones + ones.T) > 0).astype(float))
+    spoilt = np.zeros(count, bool)
+    spoilt[faces[crossing_faces(vertices, faces)]] = True
+    excluded = np.asarray(spoilt[faces].any(axis=1))
+    return RestSurface(vertices, faces, beside, excluded)
+
+
+def crossings(
+    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], weights: tuple[float, ...] = WEIGHTS
+) -> Int[np.ndarray, " w"]:
+    """Returns how many triangles cross others at each weight of a shape that do not at rest."""
+    moved = _moved(rest, displacement)
+    return np.array([np.count_nonzero(_crossing(rest, displacement, w, moved)) for w in weights])
+
+
+def kept_apart(rest: RestSurface, displacement: Float[np.ndarray, "t 3"], *, closing: bool) -> Float[np.ndarray, "t 3"]:
+    """Returns the displacement (mm, weight 1) changed so little that no triangles cross at ``WEIGHTS`` that do not at
+    rest; where that cannot be, so that the fewest do. ``closing``: lids, which stop where they meet; everything else
+    moves together."""
+    spot = _spot(rest, displacement, WEIGHTS[1::2])
+    best, fewest, zone = displacement, np.count_nonzero(spot), np.zeros(len(rest.vertices), bool)
+    for _ in range(MAX_ZONES):
+        if not fewest:
+            break
+        zone = _grown(rest, zone | spot, ZONE_RINGS)
+        rows = np.flatnonzero(zone[rest.faces].any(axis=1))
+        out = _stopped(rest, displacement, rows) if closing else displacement
+        out = _relaxed(rest, displacement, _together(rest, out, rows), rows)
+        spot = _spot(rest, out, WEIGHTS)
+        if np.count_nonzero(spot) < fewest:
+            best, fewest = out, np.count_nonzero(spot)
+    return best
+
+
+def _moved(rest: RestSurface, displacement: Float[np.ndarray, "t 3"]) -> Bool[np.ndarray, " f"]:
+    """Tells which triangles a shape moves. Triangles that stay cross none that stay."""
+    return (np.abs(displacement).max(axis=1) > STILL_MM)[rest.faces].any(axis=1)
+
+
+def _stopped(
+    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], zone: Int[np.ndarray, " r"]
+) -> Float[np.ndarray, "t 3"]:
+    """Returns the displacement scaled by the weight at which its triangles first meet."""
+    scale = np.ones(len(displacement))
+    for _ in range(MEETING_ROUNDS):
+        first = np.full(len(displacement), np.inf)
+        for weight in reversed(MEETING):
+            spot = _spot(rest, scale[:, None] * displacement, (weight,), zone)
+            first[spot] = weight
+        if np.isinf(first).all():
+            break
+        step = MEETING[1] - MEETING[0]
+        allowed = np.where(np.isinf(first), 1.0, first - step / 2.0 - MARGIN)
+        scale *= _faded(rest, allowed)
+    return scale[:, None] * displacement
+
+
+def _together(
+    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], zone: Int[np.ndarray, " r"]
+) -> Float[np.ndarray, "t 3"]:
+    """Returns the displacement blended with its mean over space, ever wider, until no triangles of a zone cross."""
+    out, rounds = displacement, 0
+    best, fewest = displacement, np.inf
+    for radius_mm in RADII_MM:
+        base, times = out, np.zeros(len(out), int)
+        while rounds < MAX_ROUNDS:
+            spot = _spot(rest, out, WEIGHTS, zone)
+            if np.count_nonzero(spot) < fewest:
+                best, fewest = out, np.count_nonzero(spot)
+            if not spot.any():
+                return out
+            if times[spot].min() * BLEND_STEP >= 1.0:
+                break
+            rounds += 1
+            times[_grown(rest, spot, 2)] += 1
+            retained = _faded(rest, np.clip(1.0 - BLEND_STEP * times, 0.0, 1.0))
+            rows = np.flatnonzero(retained < 1.0)
+            mean = _mean_in_space(rest.vertices, rows, radius_mm) @ base
+            out = base.copy()
+            out[rows] = mean + retained[rows, None] * (base[rows] - mean)
+    return best
+
+
+def _relaxed(
+    rest: RestSurface,
+    wanted: Float[np.ndarray, "t 3"],
+    clean: Float[np.ndarray, "t 3"],
+    zone: Int[np.ndarray, " r"],
+) -> Float[np.ndarray, "t 3"]:
+    """Returns the displacement nearest to ``wanted``, on the way from ``clean``, that does not cross either."""
+    if (wanted == clean).all() or _spot(rest, clean, WEIGHTS, zone).any():
+        return clean
+    low, high = 0.0, 1.0
+    for _ in range(RELAXING):
+        middle = 0.5 * (low + high)
+        crosses = _spot(rest, clean + middle * (wanted - clean), WEIGHTS, zone).any()
+        low, high = (low, middle) if crosses else (middle, high)
+    return clean + low * (wanted - clean)
+
+
+def _mean_in_space(
+    vertices: Float[np.ndarray, "t 3"], rows: Int[np.ndarray, " r"], radius_mm: float
+) -> sparse.csr_array:
+    """Returns the matrix of Gaussian means about some vertices over all vertices near them."""
+    near = KDTree(vertices).query_ball_point(vertices[rows], 2.0 * radius_mm)
+    counts = np.array([len(each) for each in near])
+    column, row = np.concatenate(near).astype(int), np.repeat(np.arange(len(rows)), counts)
+    square = ((vertices[column] - vertices[rows][row]) ** 2).sum(axis=1)
+    weight = np.exp(-0.5 * square / radius_mm**2)
+    total = np.bincount(row, weight, len(rows))
+    return sparse.csr_array((weight / total[row], (row, column)), shape=(len(rows), len(vertices)))
+
+
+def _crossing(
+    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], weight: float, active: Bool[np.ndarray, " f"]
+) -> Bool[np.ndarray, " f"]:
+    """Tells which triangles cross at a weight; only pairs with an active one are looked at."""
+    if not active.any():
+        return active
+    few = active if active.mean() < FEW else None
+    return crossing_faces(rest.vertices + weight * displacement, rest.faces, few) & ~rest.excluded
+
+
+def _crossing_within(
+    rest: RestSurface, displacement: Float[np.ndarray, "t 3"], weight: float, rows: Int[np.ndarray, " r"]
+) -> Bool[np.ndarray, " f"]:
+    """Tells which triangles of some rows cross each other at a weight: a tenth of the time of looking at all."""
+    out = np.zeros(len(rest.faces), bool)
+    out[rows] = crossing_faces(rest.vertices + weight * displacement, rest.faces[rows])
+    return out & ~rest.excluded
+
+
+def _spot(
+    rest: RestSurface,
+    displacement: Float[np.ndarray, "t 3"],
+    weights: tuple[float, ...],
+    zone: Int[np.ndarray, " r"] | None = None,
+) -> Bool[np.ndarray, " t"]:
+    """Tells which vertices are corners of triangles that cross at some weight; of a zone's triangles alone, if any."""
+    out, moved = np.zeros(len(rest.vertices), bool), _moved(rest, displacement)
+    for weight in weights:
+        crossing = (
+            _crossing(rest, displacement, weight, moved)
+            if zone is None
+            else _crossing_within(rest, displacement, weight, zone)
+        )
+        out[rest.faces[crossing]] = True
+    return out
+
+
+def _grown(rest: RestSurface, chosen: Bool[np.ndarray, " t"], rings: int) -> Bool[np.ndarray, " t"]:
+    for _ in range(rings):
+        chosen = chosen | (rest.beside @ chosen.astype(float) > 0)
+    return chosen
+
+
+def _faded(rest: RestSurface, retained: Float[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """Returns shares that fade to 1 over the rings about the smaller ones."""
+    count = np.maximum(np.asarray(rest.beside.sum(axis=1)).ravel(), 1.0)
+    out = retained
+    for _ in range(SOFT_RINGS):
+        out = np.minimum(out, 0.5 * out + 0.5 * (rest.beside @ out) / count)
+    return out

@@ -1,0 +1,73 @@
+"""head-NAME.glb and head-NAME-shapes.npz of a made-up result."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.contour_fit.fit import Fit
+from pipeline.evidence.expression import BlendshapeRig, build_blendshape_rig
+from pipeline.head_model.model import load_model
+from pipeline.head_model.visemes import VISEMES
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.write import write_result
+from pipeline.settings import OutputSettings, Settings
+from rig.capture import Capture
+from rig.formats.glb_document import opened_glb
+from rig.geometry import Similarity, rotation_from_vector
+from rig.mesh import Mesh
+from tests.support.made_up_results import made_up_result
+from tests.support.ready_templates import EYE_CENTRE, ready_template
+
+NAMES = ("jawOpen", "browInnerUp")
+PLACE = Similarity(1.1, rotation_from_vector(np.array([0.1, -0.3, 0.05])), np.array([12.0, -7.0, 30.0]))
+
+
+@pytest.fixture(scope="module")
+def result() -> Reconstruction:
+    """The mean head, with two of Apple's shapes."""
+    model = load_model()
+    world = Mesh(PLACE.apply(model.vertices(np.zeros(0))), model.levels["full"].faces)
+    whole = build_blendshape_rig(model, PLACE, world, ())
+    morphs = {name: whole.morphs[name] for name in NAMES}
+    shapes = BlendshapeRig(world, morphs, {"jawOpen": 0.25, "browInnerUp": 0.0}, whole.missing)
+    made = made_up_result(world, Fit("contour", np.zeros(1), PLACE, 42, "the cost no longer falls"))
+    return replace(made, evidence=replace(made.evidence, blendshape_rig=shapes))
+
+
+def written(result: Reconstruction, folder: Path, *, morphs: bool) -> set[str]:
+    outputs = OutputSettings(surface="head", formats=("ply",), template="low", morphs=morphs, neutral=not morphs)
+    chosen = replace(result, settings=Settings(outputs=outputs))
+    write_result(folder, chosen, Capture({}), ready_template(load_model()))
+    return {path.name for path in folder.iterdir()}
+
+
+def test_shapes_are_written_where_morphs_are_asked_for(result: Reconstruction, tmp_path: Path) -> None:
+    (tmp_path / "morphs").mkdir()
+    (tmp_path / "none").mkdir()
+    ours = {"head-low.glb", "head-low-shapes.npz"}
+    assert ours < written(result, tmp_path / "morphs", morphs=True)
+    assert not ours & written(result, tmp_path / "none", morphs=False)
+    with np.load(tmp_path / "morphs" / "head-low-shapes.npz") as file:
+        meta = json.loads(file["meta"].tobytes())
+        neutral, displacements = file["neutral"], file["displacements"]
+    assert (meta["format"], meta["frame"], meta["unit"]) == ("eigenhead-shapes/1", "head", "mm")
+    assert meta["names"] == [*NAMES, *VISEMES]
+    assert meta["visemes"]["viseme_aa"]["jawOpen"] == 0.6
+    model, level = load_model(), load_model().levels["p95"]
+    np.testing.assert_allclose(neutral[: level.count], 1.1 * model.vertices(np.zeros(0), "p95"), atol=0.05)
+    true = 1.1 * (level.operator @ model.expressions.moved({"browInnerUp": 1.0}))
+    np.testing.assert_allclose(displacements[1, : level.count], true, atol=0.05)
+    assert not displacements[:, level.count :].any()  # the eyeball
+    np.testing.assert_allclose(meta["pivots"]["eye_left"], 1.1 * EYE_CENTRE, atol=1.0)
+    document, _ = opened_glb((tmp_path / "morphs" / "head-low.glb").read_bytes())
+    head, eye = document["meshes"]
+    assert head["extras"]["targetNames"] == meta["names"]
+    assert head["weights"][0] == 0.25
+    assert (head["name"], eye["name"]) == ("head", "eye_left")
+    nodes = {node["name"]: node for node in document["nodes"]}
+    assert set(nodes) == {"head", "jaw", "eye_left", "eye_right", "neck"}
+    assert nodes["eye_left"]["extras"]["rows"] == list(range(level.count, len(neutral)))
+    assert nodes["head"]["extras"]["rows"] == list(range(level.count))

@@ -1,0 +1,36 @@
+"""A template that is bound without a registration: the default model's 5 % level, with an eyeball."""
+
+import numpy as np
+import trimesh
+
+from pipeline.head_model.model import HeadModel
+from pipeline.templates.carrying import bind_vertices, surface_binding
+from pipeline.templates.template_file import Template
+from rig.formats.polygon_obj import PolygonMesh
+from rig.mesh import vertex_normals
+
+EYE_CENTRE = np.array([31.0, 12.5, 62.0])
+
+
+def ready_template(model: HeadModel, name: str = "low") -> Template:
+    """Returns the template; its last vertices are the left eyeball's."""
+    level, mean = model.levels["p95"], model.vertices(np.zeros(0))
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=12.0)
+    skin = mean[level.rows]
+    rest = np.concatenate([skin, np.array(ball.vertices) + EYE_CENTRE])
+    triangles = np.concatenate([level.faces, np.array(ball.faces) + len(skin)]).astype(np.int32)
+    attachment, _, _ = bind_vertices(skin, vertex_normals(skin, level.faces), mean, model.levels["full"].faces)
+    wholes = np.r_[np.full(len(skin), -1), np.zeros(len(ball.vertices), int)]
+    corners = triangles.ravel()
+    mesh = PolygonMesh(
+        rest, np.full(len(triangles), 3, np.int32), corners, np.zeros((0, 2)), np.full(len(corners), -1, np.int32)
+    )
+    return Template(
+        name=name,
+        source=f"{name}.obj",
+        source_sha256="ef" * 32,
+        model_name=model.name,
+        model_sha256=model.sha256,
+        mesh=mesh,
+        surface_binding=surface_binding(rest, np.arange(len(skin)), attachment, wholes),
+    )
