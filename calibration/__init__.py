@@ -1,1 +1,1 @@
-"""A rig from pictures of a board, refined by silhouettes, and the checks on it."""
+"""Calibrates a rig from pictures of a board, refines it by silhouettes, and checks it."""

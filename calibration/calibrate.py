@@ -1,4 +1,5 @@
-"""From pictures of a board to a calibrated rig: detection, lenses, pose graph, bundle, checks; one function."""
+"""Calibrates a rig from pictures of a board: detection, lenses, pose graph, bundle adjustment and checks in one
+function."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -61,11 +62,20 @@ def calibrate(
     workers: int = 2,
     report: Progress = ignore_progress,
 ) -> Calibration:
-    """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``; pictures of one shot name show one moment.
+    """Calibrates the cameras of ``IMAGES/<camera>/<shot>.<ext>``. Pictures with the same name of a shot were taken at
+    the same moment.
 
-    Raises InputError on damaged pictures, WrongBoard, PoseGraphError or CalibrationRefused with what to do.
-    ``previous`` is the rig's last calibration, against which names, layout, scale and lenses are checked; ``cache`` a
-    folder that keeps detections by the pictures' content."""
+    Args:
+        images: the folder IMAGES.
+        board: the calibration board.
+        front: the camera that the subject faces; None takes the middle one.
+        previous: the rig's last calibration, against which names, layout, scale and lenses are checked.
+        cache: folder that keeps detections by the pictures' content.
+        workers: processes that search the pictures.
+        report: progress.
+
+    Raises InputError for damaged pictures, and WrongBoard, PoseGraphError or CalibrationRefused, each with what to do.
+    """
     detections = detect_folder(images, board, cache=cache, workers=workers, report=report)
     calibration = calibrate_detections(detections, front=front, previous=previous, report=report)
     first = {name: next(iter(shots.values())) for name, shots in list_pictures(images).items()}
@@ -75,7 +85,7 @@ def calibrate(
 def calibrate_detections(
     detections: Detections, *, front: str | None = None, previous: Rig | None = None, report: Progress = ignore_progress
 ) -> Calibration:
-    """``calibrate`` after detection: a pure function."""
+    """Calibrates from detected corners, as ``calibrate`` does from pictures. It reads no file."""
     detected = detections.corner_count
     report("lenses", 0.0)
     detections, dropped = drop_blurred(detections)

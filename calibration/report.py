@@ -1,4 +1,4 @@
-"""The calibration's report: one HTML page that needs nothing else, and the same as JSON."""
+"""Writes the report of a calibration: one self-contained HTML page, and the same content as JSON."""
 
 import json
 from collections.abc import Iterable
@@ -28,14 +28,15 @@ tr:nth-child(even) td { background: #f4f5f7 } svg { background: #fbfbfc; border:
 
 
 def write_report(calibration: Calibration, html: Path, document: Path | None = None) -> None:
-    """Writes the page and, if asked, the JSON that ``calibrate --json`` prints."""
+    """Writes the page to ``html`` and, unless ``document`` is None, the JSON that ``calibrate --json`` prints to
+    ``document``."""
     write_atomically(html, report_page(calibration).encode())
     if document is not None:
         write_atomically(document, json.dumps(calibration.document(), indent=1).encode())
 
 
 def report_page(calibration: Calibration) -> str:
-    """Returns the HTML page."""
+    """Returns the report as an HTML page."""
     figures = calibration.figures()
     summary = (
         f"{len(calibration.rig)} cameras, {figures['corners']} corners used "
@@ -73,7 +74,7 @@ def _checks(calibration: Calibration) -> str:
 
 
 def listed(title: str, lines: Iterable[Message | str]) -> str:
-    """Returns a headed list, or nothing."""
+    """Returns an HTML list with a heading; nothing for no lines."""
     items = "".join(f"<li>{escape(str(line))}</li>" for line in lines)
     return f"<h2>{title}</h2><ul>{items}</ul>" if items else ""
 
@@ -128,7 +129,7 @@ def _parameter_table(calibration: Calibration) -> str:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Returns rows of cells that are markup already."""
+    """Returns an HTML table. Cells of ``rows`` are already markup."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{top}</tr>{body}</table>"

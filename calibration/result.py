@@ -1,4 +1,4 @@
-"""What a calibration is: the rig with its covariances, and the figures and checks that speak for it."""
+"""Defines the result of a calibration: the rig with its covariances, and the figures and checks behind it."""
 
 import json
 from collections.abc import Iterable
@@ -29,7 +29,8 @@ CELLS = (4, 3)  # of a picture, across and down
 
 
 class CalibrationRefused(EigenheadError):
-    """The pictures were understood, but what they give is not to be used. ``calibration`` is there for the report."""
+    """Reports that the pictures were understood but determine no rig that may be used. ``calibration`` is kept for the
+    report."""
 
     def __init__(self, reasons: Iterable[Message | str], calibration: "Calibration | None" = None) -> None:
         self.reasons = tuple(message_of(reason) for reason in reasons)
@@ -38,6 +39,10 @@ class CalibrationRefused(EigenheadError):
 
 
 class CameraFigures(TypedDict):
+    """Describes how well one camera is calibrated: reprojection errors in the joint solution and by its own lens alone
+    (RMS, px), its views and corners, the standard deviations of pose and focal length, and the share of the picture
+    with corners."""
+
     rms_px: float
     alone_rms_px: float
     views: int
@@ -49,7 +54,8 @@ class CameraFigures(TypedDict):
 
 
 class Figures(TypedDict):
-    """Holds the numbers of ``calibrate --json``."""
+    """Describes the numbers of ``calibrate --json``. ``sync_px`` is the part of the corners' noise that all cameras
+    share, a sign that they were not simultaneous."""
 
     rms_px: float
     used_share: float
@@ -59,6 +65,9 @@ class Figures(TypedDict):
 
 
 class CheckDocument(TypedDict):
+    """Describes the result of one check, and what to do if it failed. ``passed`` is null if there was nothing to check
+    against."""
+
     name: str
     passed: bool | None
     detail: str
@@ -68,6 +77,8 @@ class CheckDocument(TypedDict):
 
 
 class DroppedDocument(TypedDict):
+    """Describes a view that was left out, and why; ``camera`` is null for a whole shot."""
+
     shot: str
     camera: str | None
     reason: str
@@ -75,6 +86,9 @@ class DroppedDocument(TypedDict):
 
 
 class OffsetsDocument(TypedDict):
+    """Describes the time offset of each camera with its standard deviation, in units of the time between shots, and
+    whether the offsets were used."""
+
     used: bool
     unit: str
     cameras: dict[str, float]
@@ -84,7 +98,7 @@ class OffsetsDocument(TypedDict):
 
 
 class CalibrationDocument(TypedDict):
-    """``calibration.json``."""
+    """Describes ``calibration.json``."""
 
     verdict: Word
     missing: list[str]
@@ -102,12 +116,16 @@ class CalibrationDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """Holds a calibrated rig with its evidence.
+    """Holds a calibrated rig with its evidence. Covariances are in the gauge of ``calibration.adjustment.gauge``.
 
-    ``rig`` has per-camera pose covariances in the gauge of ``calibration.adjustment.gauge``; ``pose_covariance`` is the
-    joint one of all cameras' left perturbations (rad, mm) in that gauge, with what the uncertainty of the lenses adds
-    to it; ``pose_sigma_px`` its size at the subject; ``intrinsics_sigma`` per camera that of fx fy cx cy k1 k2 p1 p2
-    k3. ``misses`` per view: the used corners' numbers, pixels, and projected less detected (px)."""
+    Attributes:
+        rig: the cameras, each with the covariance of its pose.
+        pose_covariance: joint covariance of all poses (left perturbations, rad and mm), the lenses' uncertainty
+            included.
+        pose_sigma_px: its size at the subject, by camera.
+        intrinsics_sigma: standard deviations of fx fy cx cy k1 k2 p1 p2 k3, by camera.
+        misses: for each camera and shot, the used corners' numbers, pixels, and projected less detected pixels.
+    """
 
     rig: Rig
     board: Board
@@ -157,7 +175,7 @@ class Calibration:
         return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 
     def verdict(self) -> Verdict:
-        """Tells whether it is worth using, and what it lacks."""
+        """Judges whether the calibration is worth using, and what it lacks."""
         cameras = self.figures()["cameras"]
         evidence = {
             name: CameraEvidence(c["views"], c["focal_share"], c["pose_sigma_px"], c["covered"])
@@ -166,7 +184,7 @@ class Calibration:
         return judge(evidence, self.checks)
 
     def document(self) -> CalibrationDocument:
-        """Returns everything but the residuals, as JSON."""
+        """Returns everything but the residuals as JSON types."""
         names = self.rig.names
         offsets: OffsetsDocument | None = None
         if self.offsets is not None:

@@ -41,16 +41,18 @@ class Links(HTMLParser):
         self.targets: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Notes the target of a link; other tags are ignored."""
         self.targets += [value for key, value in attrs if tag == "a" and key == "href" and value]
 
 
 def index_url() -> str:
+    """Returns the package index to use: that of the first set variable of uv and pip, else PyPI."""
     names = ("UV_DEFAULT_INDEX", "UV_INDEX_URL", "PIP_INDEX_URL")
     return next((os.environ[name] for name in names if os.environ.get(name)), "https://pypi.org/simple")
 
 
 def fetch(url: str) -> bytes:
-    """The body of ``url``. Raises OSError after the last try."""
+    """Returns the body of ``url``. Raises OSError after the last try."""
     for attempt in range(TRIES):
         try:
             with urllib.request.urlopen(url, timeout=TIMEOUT_S) as reply:
@@ -64,6 +66,8 @@ def fetch(url: str) -> bytes:
 
 
 def wheel_url(filename: str) -> str:
+    """Returns the address of uv's wheel of this name in the package index. Exits with a message if the index does not
+    list it."""
     page = f"{index_url().rstrip('/')}/uv/"
     links = Links()
     links.feed(fetch(page).decode())
@@ -87,6 +91,8 @@ def unpack(wheel: bytes, target: Path) -> None:
 
 
 def main(folder: Path) -> None:
+    """Puts the pinned uv for this machine into ``folder``. Exits with a message if it cannot be fetched or is not the
+    pinned file."""
     machine = platform.machine()
     if sys.platform != "linux" or machine not in WHEELS:
         raise SystemExit(f"no uv is pinned for {sys.platform} on {machine}; install uv: https://docs.astral.sh/uv/")

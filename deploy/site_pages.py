@@ -19,6 +19,7 @@ _TO_TOP = re.compile(r"(?<=\]\()((?:\.\./)+)(\w+\.md)")
 
 
 def on_files(files: Files, config: Any, **_: Any) -> Files:
+    """Adds the pages at the top of the repository to the site, with their links into docs/ adapted."""
     for name, place in PAGES.items():
         text = (ROOT / name).read_text(encoding="utf-8")
         files.append(File.generated(config, place, content=_FROM_TOP.sub("", text)))

@@ -51,6 +51,7 @@ class WheelImports(BuildHookInterface):
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Makes the package `eigenhead` in a temporary folder, and tells Hatchling to take it into the wheel."""
         self._scratch = Path(tempfile.mkdtemp(prefix="eigenhead-wheel-"))
         public: Mapping[str, str] = self.config.get("public", {})
         package = self._scratch / WHEEL_PACKAGE
@@ -67,6 +68,7 @@ class WheelImports(BuildHookInterface):
             build_data["force_include"] = {str(package): WHEEL_PACKAGE}
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        """Removes the temporary folder."""
         shutil.rmtree(self._scratch)
 
 

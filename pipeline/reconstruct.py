@@ -1,4 +1,4 @@
-"""Capture to textured head (section 4): the order of the stages, for every caller."""
+"""Reconstructs a textured head from a capture (section 4): the order of the stages, for every caller."""
 
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
@@ -21,7 +21,8 @@ from rig.formats.usdz import check_usd
 def fit_shape(
     run: Recorder, context: ReconstructionContext, views: Views, alignment: Alignment
 ) -> tuple[PartLabels, HeadFit]:
-    """Fits the head to outlines and photographs, with what the pixels show decided in between."""
+    """Fits the head to the outlines, labels the pixels as skin, hair or clothes, and then fits the head to the
+    photographs."""
     outlines = run(fit_outlines, context, views, alignment)
     labels = run(label_parts, context, views, outlines.model, outlines.mesh_world)
     return labels, run(fit_head, context, views, outlines, labels)

@@ -1,4 +1,4 @@
-"""Every tunable of the pipeline, with its source. Values are frozen; unknown keys of a document are refused."""
+"""Defines every setting of the pipeline, with its source. Values are frozen; unknown keys of a document are refused."""
 
 import dataclasses
 import math
@@ -24,8 +24,7 @@ FINE_LEVELS = (None, "fine")  # and those that draw the head to the dense surfac
 
 @dataclass(frozen=True, slots=True)
 class SegmentationSettings:
-    """Background subtraction (section 5.4). Sources: measured on the two captures rendered by another program, whose
-    plates differ from the shots by 2 % of light, and on the faults that the tests plant."""
+    """Sets how the background is subtracted (section 5.4). Chosen on two rendered captures, and on planted faults."""
 
     coarse_columns: int = 256  # decisions are taken there: 16 pixels a decision quarter the noise, and edges stay sharp
     field_share: float = 0.12  # sigma of the illumination field by image width: drift of lamps is smoother than that
@@ -56,14 +55,14 @@ class SegmentationSettings:
 
 @dataclass(frozen=True, slots=True)
 class FaceSettings:
-    """Faces found in the photographs."""
+    """Sets whether faces are searched in the photographs."""
 
     find: bool = True  # false: outlines alone say where the head is, unless feature points are given
 
 
 @dataclass(frozen=True, slots=True)
 class AlignmentSettings:
-    """Section 4.2, and the search that replaces it when there are no feature points."""
+    """Sets the alignment (section 4.2), and the search that replaces it without feature points."""
 
     feature_noise_px: float = CLICK_NOISE_PX
     landmark_noise_mm: float = LANDMARK_NOISE_MM
@@ -71,7 +70,7 @@ class AlignmentSettings:
 
 @dataclass(frozen=True, slots=True)
 class FittingSettings:
-    """Sections 4.3 and 4.4."""
+    """Sets the fit to the outlines (sections 4.3 and 4.4)."""
 
     modes: int = 60  # section 3.1: the first 60 eigenheads are used in fitting
     modes_first: int = 15  # coarse stage of the contour solver; 10 to 20 measured alike
@@ -93,7 +92,7 @@ class FittingSettings:
 
 @dataclass(frozen=True, slots=True)
 class PartSettings:
-    """What every pixel shows: skin, hair or clothes. Chosen on studio captures and two captures rendered by another
+    """Sets how pixels are labelled as skin, hair or clothes. Chosen on studio captures and two captures of another
     program."""
 
     cell_mm: float = 2.2  # of the grid that parts are told on: four pixels of the usual rig
@@ -105,7 +104,7 @@ class PartSettings:
 
 @dataclass(frozen=True, slots=True)
 class PhotoSettings:
-    """Photo-consistency inside the outline. Chosen on two captures rendered by another program."""
+    """Sets how photographs are compared inside the outline. Chosen on two captures rendered by another program."""
 
     sample_mm: float = 1.0  # distance of samples on the surface: two pixels of the usual rig
     centre_mm: float = 3.0  # distance of patches
@@ -124,7 +123,7 @@ class PhotoSettings:
 
 @dataclass(frozen=True, slots=True)
 class FineSettings:
-    """The head drawn to the dense surface. Chosen on two captures rendered by another program."""
+    """Sets how the head is deformed to the measured surface. Chosen on two captures rendered by another program."""
 
     coarse_length_mm: float = 12.0  # over which a displacement of the nodes fades where nothing is seen
     length_mm: float = 5.0  # the same of the displacement along the normals that follows it
@@ -147,8 +146,7 @@ class FineSettings:
 
 @dataclass(frozen=True, slots=True)
 class DenseSettings:
-    """Depth in every view from the photographs. Chosen on two captures rendered by another program; where no unit is in
-    the name, numbers are shares or counts."""
+    """Sets how depth is measured in every view. Chosen on two rendered captures. Numbers without unit are shares."""
 
     pixel_mm: float = 0.4  # on the subject; finer photographs are reduced to it, for their noise is below 0.1 mm there
     reach_mm: float = 90.0  # behind the hull's front where the fitted head bounds nothing: hair is 60 mm thick at most
@@ -173,7 +171,7 @@ class DenseSettings:
 
 @dataclass(frozen=True, slots=True)
 class SelectionSettings:
-    """Which photograph the detail comes from; costs are by that of a view which sees nothing of a place."""
+    """Sets which photograph a texture's detail comes from. Costs are relative to that of a view that sees nothing."""
 
     disagreement: float = 0.06  # of the colour's code: a view that differs so much from the others ...
     outlier: float = 2.0  # ... has half of this cost
@@ -186,7 +184,7 @@ class SelectionSettings:
 
 @dataclass(frozen=True, slots=True)
 class TextureSettings:
-    """Section 4.5. Chosen by the colour error over the visible face of captures rendered by another program."""
+    """Sets how the head is coloured (section 4.5). Chosen by the colour error over the face of rendered captures."""
 
     blend: Literal["default", "reference"] = "default"  # reference: the paper's weighted mean
     sharpness: float = 1.0  # exponent of normal . viewing direction, as the paper's weight; 2 is 1 dB worse in a view
@@ -207,7 +205,7 @@ SPACING_RANGE_MM = (0.5, 3.0)  # finer is below the photographs' pixels, coarser
 
 @dataclass(frozen=True, slots=True)
 class BustSettings:
-    """The whole visible surface."""
+    """Sets the mesh of the bust, the whole visible surface."""
 
     spacing_mm: float = 1.5  # of its vertices, 0.5 to 3: three pixels of the usual rig
 
@@ -219,7 +217,7 @@ TEMPLATE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")  # it becomes part
 
 @dataclass(frozen=True, slots=True)
 class OutputSettings:
-    """Which surfaces are made, and files beside those that every result has."""
+    """Sets which surfaces are made, and which files beside those that every result has."""
 
     surface: Literal["head", "bust", "both"] = "both"  # the model's head, all that the cameras see, or both
     formats: tuple[str, ...] = ("glb", "ply")  # of the head, of FORMATS; head.ply is always written
@@ -238,24 +236,24 @@ class OutputSettings:
 
     @property
     def written(self) -> tuple[str, ...]:
-        """The formats, those of earlier settings included."""
+        """Returns the formats to write, those of earlier settings included."""
         return (*self.formats, *(["obj"] if self.obj and "obj" not in self.formats else []))
 
     @property
     def textured(self) -> bool:
-        """Whether any file has a texture."""
+        """Tells whether any file has a texture."""
         requested = self.ply_texture or self.delit or bool({"glb", "obj", "usdz"} & set(self.written))
         return self.surface != "bust" and requested
 
     @property
     def delit(self) -> bool:
-        """Whether the albedo is asked for."""
+        """Tells whether the albedo is requested."""
         return self.delight or self.skin == "albedo"
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """All settings of one reconstruction."""
+    """Holds all settings of one reconstruction."""
 
     method: Literal["contour", "simplex"] = "contour"
     detail: Literal["span", "kernel", "photo", "fine"] | None = None  # None: fine where the photographs carry it
@@ -279,7 +277,7 @@ class Settings:
 
 
 def settings_from_document(document: Mapping[str, Any], subject: str = "settings") -> Settings:
-    """Settings from decoded JSON or TOML. Raises InputError naming every unknown key and every wrong value."""
+    """Returns the settings in decoded JSON or TOML. Raises InputError that names every unknown key and wrong value."""
     faults: list[Message] = []
     settings = _read(Settings, document, "", faults)
     unknown = [code for code in settings.fail_on if code not in WARNING_CODES]
@@ -301,7 +299,7 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
 
 
 def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
-    """A frozen table of settings (a dataclass) from decoded JSON or TOML. Raises InputError as above."""
+    """Returns a table of settings (the dataclass ``kind``) from decoded JSON or TOML. Raises InputError likewise."""
     faults: list[Message] = []
     found = _read(kind, document, "", faults)
     if faults:
@@ -310,7 +308,7 @@ def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
 
 
 def document_from_settings(settings: Settings) -> dict[str, object]:
-    """Settings as nested dictionaries, the form that ``settings_from_document`` reads."""
+    """Returns settings as nested dictionaries, the form that ``settings_from_document`` reads."""
     return dataclasses.asdict(settings)
 
 

@@ -1,4 +1,5 @@
-"""What stages say beside their values: warnings for the operator, and how deep a fit went."""
+"""Defines what stages report besides their products: warnings for the operator, and the level of detail that a fit
+reached."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -60,7 +61,7 @@ ReportWarning = Message
 
 @dataclass(frozen=True, slots=True)
 class Detail:
-    """Says how deep the fit went, and why no deeper or why so deep."""
+    """Holds the level of detail that the fit reached, and the reason why it was not higher or lower."""
 
     level: Literal["span", "kernel", "photo", "fine"]
     reason: Message

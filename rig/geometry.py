@@ -15,13 +15,14 @@ class RigidTransform:
 
     @classmethod
     def identity(cls) -> "RigidTransform":
+        """Returns the transform that changes nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     def __matmul__(self, other: "RigidTransform") -> "RigidTransform":
         return RigidTransform(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def inverse(self) -> "RigidTransform":
-        """Returns a_from_b."""
+        """Returns the inverse, a_from_b, which maps coordinates in frame b to frame a."""
         return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
 
     def apply(self, points: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
@@ -41,6 +42,7 @@ class Similarity:
 
     @classmethod
     def identity(cls) -> "Similarity":
+        """Returns the similarity that changes nothing."""
         return cls(1.0, np.eye(3), np.zeros(3))
 
     @classmethod
@@ -53,7 +55,7 @@ class Similarity:
         return Similarity(self.scale * inner, self.rotation @ other.rotation, self.apply(other.translation))
 
     def inverse(self) -> "Similarity":
-        """Returns a_from_b."""
+        """Returns the inverse, a_from_b, which maps coordinates in frame b to frame a."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 

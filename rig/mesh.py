@@ -8,8 +8,8 @@ from jaxtyping import Float, Int, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Holds vertices (mm) and triangles, whose corners run counter-clockwise seen from outside. ``colours`` are sRGB,
-    one a vertex."""
+    """Holds vertices (mm) and triangles, whose corners run counter-clockwise seen from outside. ``colours`` are the
+    sRGB colours of the vertices."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]

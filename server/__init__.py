@@ -1,3 +1,5 @@
-"""The front doors: HTTP service, workers, command line. The only package that knows of the web framework and of the
-job engine; everything it does for a head is one call of ``pipeline.reconstruct.reconstruct``.
+"""Makes heads available to users: HTTP service with its pages, workers, command line.
+
+It is the only package that imports the web framework and the job engine. Everything that it does for a head is one call
+of ``pipeline.reconstruct.reconstruct``.
 """

@@ -1,4 +1,4 @@
-"""Where the service listens."""
+"""Opens the socket at which the service listens, and recognises this machine's own addresses."""
 
 import errno
 import ipaddress
@@ -8,7 +8,7 @@ from rig.errors import EigenheadError
 
 
 class AddressTaken(EigenheadError):
-    """Another program listens there, or the address is not this machine's."""
+    """Reports that the service cannot listen at an address: another program does, or it is not this machine's."""
 
     def __init__(self, host: str, port: int, error: OSError) -> None:
         who = "another program listens there" if error.errno == errno.EADDRINUSE else error.strerror or str(error)
@@ -16,7 +16,7 @@ class AddressTaken(EigenheadError):
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Opens a listening socket; port 0 takes a free one. Raises AddressTaken."""
+    """Opens a listening socket. Port 0 chooses a free one. Raises AddressTaken."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_STREAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -30,7 +30,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def is_loopback(host: str) -> bool:
-    """Tells whether a host name or address is this machine's own."""
+    """Returns whether a host name or address is reached from this machine only."""
     if host == "localhost":
         return True
     try:

@@ -1,4 +1,5 @@
-"""What the service refuses, however it was asked: by HTTP, from a page, on the command line, in a worker.
+"""The errors with which the service refuses something, whether it was requested over HTTP, on a page, on the command
+line or by a worker.
 
 ``kind`` is a stable name, ``detail`` says what is wrong and what to do, ``errors`` lists every fault found.
 ``server.wire.problems`` gives each class its HTTP status.
@@ -12,7 +13,7 @@ from server.problem_types import type_of_input
 
 
 class Refused(EigenheadError):
-    """The root of what the service refuses."""
+    """Refuses a request. It is the base of all refusals; ``retry_after_s`` says when to try again."""
 
     def __init__(
         self,
@@ -28,7 +29,7 @@ class Refused(EigenheadError):
 
 
 class Unauthenticated(Refused):
-    """Refuses a caller whose key is missing or belongs to nobody."""
+    """Refuses a caller whose API key is missing or unknown."""
 
 
 class Forbidden(Refused):
@@ -39,13 +40,14 @@ class NotFound(Refused):
     """Refuses what does not exist."""
 
     def __init__(self, what: Message, identity: str, hint: Message | None = None) -> None:
-        """``what``: a thing of the catalogue; ``hint``: where to look for what there is."""
+        """Words the refusal. ``what``: the kind of thing, a message of the catalogue; ``hint``: where to look for what
+        there is."""
         where = hint or compose("hint-list")
         super().__init__("not-found", compose("not-found", what=what, identity=f"{identity!r:.80}", where=where))
 
 
 class Conflict(Refused):
-    """Refuses what the state of a thing forbids."""
+    """Refuses what the present state of a thing does not allow."""
 
 
 class Gone(Refused):
@@ -53,28 +55,30 @@ class Gone(Refused):
 
 
 class TooLarge(Refused):
-    """Refuses more bytes than the service takes."""
+    """Refuses more bytes than the settings allow."""
 
 
 class InvalidInput(Refused):
-    """Refuses an input that is understood and cannot be used."""
+    """Refuses an input that can be read but not used."""
 
 
 class TooMany(Refused):
-    """Refuses more at once than the caller may have."""
+    """Refuses a caller who has as many jobs or batches at once as the settings allow."""
 
 
 class Unavailable(Refused):
-    """Refuses what cannot be done now and may succeed later: a rig, a worker."""
+    """Refuses what cannot be done now and may succeed later, for lack of a rig or worker, say."""
 
 
 class DiskFull(Refused):
+    """Refuses what would leave less free disk space than the settings demand."""
+
     def __init__(self) -> None:
         super().__init__("disk-full", compose("service-disk-full"))
 
 
 def unusable_input(error: InputError) -> InvalidInput:
-    """Converts an InputError to a refusal; its kind follows from its subject."""
+    """Converts an InputError to a refusal whose ``kind`` follows from the error's subject."""
     kind = type_of_input(error.subject)
     found = compose("faults-found", subject=error.subject, count=len(error.faults))
     detail = compose("input-unusable", found=found)

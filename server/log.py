@@ -1,7 +1,7 @@
-"""Log lines on standard error: for people, or JSON for machines. Each carries the request's or job's id.
+"""Writes log lines to standard error, for people or as JSON. Each carries the id of its request or job.
 
-Lines of libraries take the same way. How a job failed or was cancelled is said in a line of ours; the job engine's own
-traceback of it is left out.
+Lines of libraries are written in the same form. How a job failed or was cancelled is said in one line; the job engine's
+own traceback of it is left out.
 """
 
 import logging
@@ -18,18 +18,22 @@ NOT_FOR_CALLERS = ("timestamp", "level", "event", "job", "trace", "exc_info")
 
 
 def log_file(jobs: Path, job_id: str) -> Path:
-    """Returns where the lines of a job are kept, beside its result."""
+    """Returns the path of a job's log, which lies beside its result."""
     return jobs / job_id / "log.txt"
 
 
 class JobLog:
-    """A processor that also writes the lines of a job to its own file, for whoever may read the job. Without traces,
-    which tell of the service's inside; a job whose folder is gone has no log."""
+    """Writes lines about a job to the job's own file, too, for everyone who may read the job. It is a processor of
+    structlog.
+
+    Tracebacks are left out, since they show the inside of the service. A job whose folder was removed has no log.
+    """
 
     def __init__(self, jobs: Path) -> None:
         self._jobs = jobs
 
     def __call__(self, logger: object, method: str, event: EventDict) -> EventDict:
+        """Writes one line to its job's file, if it is about a job, and returns the line unchanged."""
         if "job" in event and log_file(self._jobs, str(event["job"])).parent.is_dir():
             public = {key: value for key, value in event.items() if key not in NOT_FOR_CALLERS}
             words = " ".join(f"{key}={value}" for key, value in public.items())
@@ -51,7 +55,7 @@ class _OnStandardError(structlog.PrintLogger):
 
 
 def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None:
-    """Configures this process's logging. ``jobs``: the folder of jobs, of which each gets its lines in a file too."""
+    """Configures the logging of this process. ``jobs``: the folder of all jobs; with it each job gets a log file."""
     shared = [
         structlog.contextvars.merge_contextvars,
         structlog.processors.add_log_level,
@@ -82,7 +86,8 @@ def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None
 
 
 def is_no_known_failure(record: logging.LogRecord) -> bool:
-    """Returns False for the traceback of a job that failed for a known reason, or was cancelled."""
+    """Returns False for a log record with the traceback of a job that failed for a known reason or was cancelled, True
+    for all others."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return True

@@ -1,4 +1,5 @@
-"""Prometheus metrics: counted by the middleware, measured when asked."""
+"""Collects metrics for Prometheus: requests are counted as they end, everything else is measured when the metrics are
+read."""
 
 import resource
 import time
@@ -13,8 +14,8 @@ BUCKETS = (0.005, 0.02, 0.1, 0.5, 2.0, 10.0, 60.0)
 
 @dataclass(frozen=True, slots=True)
 class QueueFigures:
-    """Holds how many jobs wait in a queue, for how long the oldest has waited (s), and how many its live workers run at
-    once."""
+    """Holds how many jobs wait in a queue, how long the oldest has waited (s), and how many jobs its live workers run
+    at once."""
 
     jobs: int
     oldest_s: float
@@ -22,7 +23,7 @@ class QueueFigures:
 
 
 class Metrics:
-    """The counters of one process; a registry of its own, so that two apps in one process do not mix."""
+    """Holds the metrics of one app. Each has a registry of its own, so that two apps in one process do not mix."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -55,6 +56,7 @@ class Metrics:
         )
 
     def observe(self, method: str, route: str, status: int, began: float) -> None:
+        """Counts a request that has ended. ``began`` is its start on the monotonic clock (s)."""
         self.requests.labels(method, route, str(status)).inc()
         self.seconds.labels(route).observe(time.monotonic() - began)
 
@@ -68,7 +70,8 @@ class Metrics:
         queues: Mapping[str, QueueFigures],
         failures: Mapping[str, int],
     ) -> bytes:
-        """Returns Prometheus' text format. ``jobs`` by state, ``free`` in bytes, ``failures`` by kind."""
+        """Returns all metrics in Prometheus' text format. ``jobs``: number by state; ``free``: bytes; ``failures``:
+        number by kind."""
         for gauge in (self.queued, self.oldest, self.slots):
             gauge.clear()  # of queues that nobody uses any more
         for name, figures in queues.items():

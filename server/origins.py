@@ -1,9 +1,9 @@
-"""Servers elsewhere that this service calls because a caller asked for it: which, and at which address.
+"""Decides which servers elsewhere this service may call on behalf of a caller, and at which address.
 
-Who names an address must not turn the service against the network it stands in (server-side request forgery). Only
-origins that the operator listed are called; ``https://*`` stands for every public one. A name is looked up once, each
-of its addresses is judged, and the connection goes to the judged address, so that a name that means another machine a
-moment later changes nothing. Whoever follows a redirection judges where it leads in the same way.
+A caller who names an address must not turn the service against its own network (server-side request forgery). Only
+origins that the operator listed are called; ``https://*`` stands for every public one. A name is looked up once and
+each of its addresses is judged. The connection then goes to a judged address, so it does not matter if the name means
+another machine a moment later. Whoever follows a redirection must judge the new address in the same way.
 """
 
 import ipaddress
@@ -27,7 +27,8 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Holds a judged address: the URL to connect to, and what says in the request whom it is meant for."""
+    """Holds a judged address: the URL to connect to, and the headers and extensions that name the intended host in the
+    request."""
 
     url: httpx.URL
     headers: dict[str, str]
@@ -35,8 +36,11 @@ class Target:
 
 
 def target(url: str, origins: Collection[str]) -> Target:
-    """Returns where a request for ``url`` goes, if it may. Blocks on the name service. Raises InvalidInput
-    ("url-refused")."""
+    """Judges ``url`` and returns where to connect. ``origins``: those that the operator allows. Blocks on the name
+    service.
+
+    Raises InvalidInput ("url-refused") for an address that is malformed, not allowed, or not public.
+    """
     wanted = parsed(url)
     if wanted.userinfo:
         raise _refused(compose("url-with-user"))
@@ -55,7 +59,8 @@ def target(url: str, origins: Collection[str]) -> Target:
 
 
 def parsed(url: str) -> httpx.URL:
-    """Parses a web address whose host can be looked up, without looking it up. Raises InvalidInput ("url-refused")."""
+    """Parses a web address, without looking up its host. Raises InvalidInput ("url-refused") for one whose host could
+    not be looked up."""
     try:
         wanted = httpx.URL(url)
         shown, host = wanted.host, wanted.raw_host.decode("ascii")  # httpx decodes a host no sooner than it is asked
@@ -70,14 +75,15 @@ def parsed(url: str) -> httpx.URL:
 
 
 def origin_of(url: httpx.URL) -> str:
-    """scheme://host, and the port where it is not the scheme's own."""
+    """Returns scheme://host of a URL, with the port if it is not the scheme's default."""
     port = "" if url.port in (None, PORTS.get(url.scheme)) else f":{url.port}"
     host = url.raw_host.decode("ascii").lower()
     return f"{url.scheme}://{f'[{host}]' if ':' in host else host}{port}"
 
 
 def is_public(address: Address) -> bool:
-    """Tells whether a machine of the open internet has this address, also where it is an IPv4 one in IPv6's clothes."""
+    """Returns whether an IP address belongs to the public internet. An IPv6 address that contains an IPv4 one is judged
+    by that."""
     if isinstance(address, ipaddress.IPv6Address):
         inner = [address.ipv4_mapped, address.sixtofour, *(address.teredo or ())]
         inner.append(ipaddress.IPv4Address(int(address) & 0xFFFFFFFF) if address in NAT64 else None)

@@ -1,7 +1,8 @@
-"""Every public type of a problem and of a failed job, with its title: stable names for programs, in one table.
+"""Lists the public type of every problem and of every failed job, with its title: stable names on which programs may
+rely.
 
-A type is written out here and never made of a class's name or a message, which may change. ``urn:eigenhead:problem:``
-stands before it on the wire.
+Types are written out here. They are not derived from names of classes or from messages, since those may change. On the
+wire ``urn:eigenhead:problem:`` stands before a type.
 """
 
 URN = "urn:eigenhead:problem:"
@@ -245,15 +246,17 @@ HTTP_TYPES = {
 
 
 def type_of_input(subject: str) -> str:
-    """Returns the type of an ``InputError``."""
+    """Returns the stable name of the problem for an ``InputError`` with this subject."""
     return INPUT_TYPES.get(subject, "invalid-input")
 
 
 def type_of_failure(kind: str) -> str:
-    """Returns the type of a failed piece of work."""
+    """Returns the stable name of the problem for failed work. ``kind``: the class of its error, or how its child
+    process ended."""
     return FAILURE_TYPES.get(kind, "eigenhead-error")
 
 
 def type_of_status(status: int) -> str:
-    """Returns the type of what the web framework refuses."""
+    """Returns the stable name of the problem for a request that the web framework itself refuses with this HTTP
+    status."""
     return HTTP_TYPES.get(status, "http-error")

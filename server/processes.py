@@ -1,8 +1,8 @@
-"""Python processes of this package's own code: the worker beside the service, and the children that do heavy work; and
-who a process is.
+"""Starts Python processes that run this package's own code, and identifies processes: the worker beside the service,
+and the children that do heavy work.
 
-They must run this installation's code and no other: a folder named like one of the packages may lie in the working
-directory or on PYTHONPATH.
+They must run the code of this installation and no other, even if a folder named like one of the packages lies in the
+working directory or on PYTHONPATH.
 """
 
 import os
@@ -19,15 +19,15 @@ SERVER = __package__ or "server"  # "eigenhead.server" in the wheel
 
 
 def python_command(module: str, *arguments: str) -> list[str]:
-    """Returns the command that runs ``module`` (relative to this package: "cli") with the working directory off the
+    """Returns the command that runs a module of this package (such as "cli") without the working directory on Python's
     path."""
     return [sys.executable, "-P", "-m", f"{SERVER}.{module}", *arguments]
 
 
 def python_environment() -> dict[str, str]:
-    """This process's variables, with the checkout before everything else that PYTHONPATH names.
+    """Returns this process's environment variables, with the checkout put before everything else on PYTHONPATH.
 
-    The wheel's packages lie under a name of their own, which needs no such care.
+    In the wheel the packages have a name of their own, so the variables stay as they are.
     """
     if "." in SERVER:
         return dict(os.environ)
@@ -37,10 +37,11 @@ def python_environment() -> dict[str, str]:
 
 
 def share_one_heap() -> None:
-    """Has all threads of this process use one heap, where the C library is glibc; to be called before there are any.
+    """Makes all threads of this process share one heap, if the C library is glibc. To be called before there are
+    threads.
 
-    By default each has its own, and none gives what it has free to the others: a default job then holds 150 MB more,
-    and takes as many seconds.
+    By default each thread has a heap and gives nothing it has freed to the others. A default job then uses 150 MB more
+    and is no faster.
     """
     import ctypes
 
@@ -49,7 +50,8 @@ def share_one_heap() -> None:
 
 
 def process_identity() -> tuple[str, str, int, int]:
-    """(machine: boot and pid namespace, host name, pid, the pid's start time in clock ticks after boot)."""
+    """Returns what identifies this process: machine (boot and pid namespace), host name, pid, and start time in clock
+    ticks after boot."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         machine = f"{boot}/{Path('/proc/self/ns/pid').readlink()}"
@@ -59,7 +61,8 @@ def process_identity() -> tuple[str, str, int, int]:
 
 
 def process_started(pid: int) -> int:
-    """Field 22 of /proc/<pid>/stat (proc(5)); 0 where there is no such process."""
+    """Returns when a process started, in clock ticks after boot (field 22 of /proc/<pid>/stat); 0 if there is no such
+    process."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
@@ -68,8 +71,10 @@ def process_started(pid: int) -> int:
 
 
 def end_with_parent(parent: int) -> None:
-    """Has the kernel kill this process when the thread that started it ends, ``parent`` being that thread's process:
-    what a SIGKILL leaves behind would go on writing, and hold its memory. Linux alone knows how."""
+    """Makes the kernel kill this process when the thread that started it ends; ``parent`` is that thread's process.
+
+    Otherwise a child would go on writing and hold memory after a SIGKILL of its parent. Works on Linux only.
+    """
     import ctypes
 
     with suppress(AttributeError):

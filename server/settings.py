@@ -19,7 +19,7 @@ MOVED: dict[str, str] = {"server.work:reconstruct_capture": RECONSTRUCT}
 
 
 class ServiceSettings(BaseSettings):
-    """What an operator may set; each field is also the variable ``EIGENHEAD_<FIELD>``."""
+    """Holds what an operator may set. Each field is also the environment variable ``EIGENHEAD_<FIELD>``."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True, extra="forbid")
 
@@ -123,18 +123,21 @@ class ServiceSettings(BaseSettings):
 
     @property
     def public_host(self) -> str | None:
-        """Returns the host, and the port where there is one, of ``public_url``."""
+        """Returns host and port of ``public_url``; None without one."""
         return None if self.public_url is None else self.public_url.partition("://")[2]
 
     @property
     def is_private(self) -> bool:
-        """Tells whether nobody but this machine's own people can reach the service, so that it may go without keys."""
+        """Returns whether only programs on this machine can reach the service, so that it may run without API keys."""
         return self.public_url is None and is_loopback(self.host)
 
     @property
     def url(self) -> str:
-        """Returns the database's URL in SQLAlchemy's form. PostgreSQL is told to end a session that idles inside a
-        transaction: a worker that vanished there would keep its row locks, and nobody could take over its job."""
+        """Returns the database's URL in SQLAlchemy's form.
+
+        PostgreSQL is set to end a session that idles inside a transaction: a worker that vanished there would keep its
+        row locks, and no other worker could take over its job.
+        """
         if self.database_url is None:
             return f"sqlite:///{self.data.resolve() / 'eigenhead.sqlite'}"
         scheme, _, rest = self.database_url.partition("://")
@@ -147,7 +150,7 @@ class ServiceSettings(BaseSettings):
 
     @property
     def place(self) -> str:
-        """Returns where keys and jobs are kept, as a person may read it: the data folder, or the database without
+        """Returns where keys and jobs are kept, for people to read: the data folder, or the database's URL without
         password."""
         if self.database_url is None:
             return str(self.data.resolve())
@@ -156,7 +159,7 @@ class ServiceSettings(BaseSettings):
         return sa.make_url(self.url).render_as_string(hide_password=True).partition("?")[0]
 
     def environment(self) -> dict[str, str]:
-        """Returns the variables with which another process reads the same settings."""
+        """Returns the environment variables with which another process reads the same settings."""
         values = self.model_dump(mode="json", exclude_defaults=True) | {"data": str(self.data.resolve())}
         return {
             PREFIX + k.upper(): v if isinstance(v, str) else json.dumps(v) for k, v in values.items() if v is not None
@@ -164,5 +167,6 @@ class ServiceSettings(BaseSettings):
 
 
 def variable_in(error: SettingsError) -> str:
-    """Returns the variable whose value cannot be decoded: pydantic names its field in the text alone."""
+    """Returns the environment variable whose value could not be decoded. pydantic names its field only in the error's
+    text."""
     return next((PREFIX + name.upper() for name in ServiceSettings.model_fields if f'"{name}"' in str(error)), PREFIX)

@@ -14,6 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("rig", "pipeline", "calibration", "server", "deploy", "tests")
+DOCUMENTED = ("rig", "pipeline", "calibration", "server")  # whose docstrings are held to begin as docs/style.md says
 WORDS = frozenset({"told", "given", "own", "asked", "looks"})
 REPLACED = {
     "About": "CaptureMetadata",
@@ -139,6 +140,29 @@ def test_bounds_of_the_pipeline_begin_with_min_or_max() -> None:
     modules = {path: path.read_text(encoding="utf-8") for path in sorted((ROOT / "pipeline").rglob("*.py"))}
     wrong = [f"{path.relative_to(ROOT)}: {name}" for path, text in modules.items() for name in bound.findall(text)]
     assert not wrong, "\n".join(wrong)
+
+
+def wrong_beginnings(source: str) -> list[str]:
+    """Lists the public classes and functions whose docstring does not begin with a verb in the third person."""
+    nodes = ast.walk(ast.parse(source))
+    named = [node for node in nodes if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)]
+    texts = [(node.name, ast.get_docstring(node, clean=False) or "") for node in named if node.name[0] != "_"]
+    firsts = [(name, word) for name, text in texts for word in text.split(maxsplit=1)[:1]]
+    return [name for name, word in firsts if not re.fullmatch(r"[A-Z][a-z]*s,?", word)]
+
+
+def test_docstrings_begin_with_a_verb_in_the_third_person() -> None:
+    modules = [path for room in DOCUMENTED for path in sorted((ROOT / room).rglob("*.py"))]
+    modules = [path for path in modules if path.parent.name != "cli"]  # a command's docstring is its help: an order
+    wrong = {path: wrong_beginnings(path.read_text(encoding="utf-8")) for path in modules}
+    assert not [f"{path.relative_to(ROOT)}: {name}" for path, names in wrong.items() for name in names]
+
+
+def test_a_noun_is_seen_where_a_verb_should_begin() -> None:
+    source = (
+        'def f():\n    """The sum."""\ndef g():\n    """Returns, in order, all."""\nclass A:\n    """``a.json``."""'
+    )
+    assert wrong_beginnings(source) == ["f", "A"]
 
 
 @pytest.mark.parametrize(

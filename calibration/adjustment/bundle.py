@@ -48,8 +48,8 @@ class Free:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution:
-    """Holds the state in which the adjustment ended, and the normal matrix there. ``free`` marks the parameters that it
-    changed."""
+    """Holds the state in which the adjustment ended, and the normal matrix there (over the parameters that it changed,
+    which ``free`` marks)."""
 
     state: BundleState
     normal: Float[np.ndarray, "p p"]  # of the free parameters, at the solution, residuals in sigmas

@@ -1,4 +1,4 @@
-"""Contains the compiled loops of ``calibration.adjustment.cholesky``."""
+"""Compiled loops of ``calibration.adjustment.cholesky``."""
 
 import numpy as np
 
@@ -7,8 +7,9 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True)
 def factor_lower(a: np.ndarray) -> bool:
-    """Replaces the lower triangle of ``a`` by its Cholesky factor; returns False if the matrix is not positive
-    definite."""
+    """Computes the Cholesky factor L of a symmetric matrix A = L L^T (n, n), in place: the lower triangle of ``a``
+    becomes L, the upper one is neither read nor changed. Returns False, with ``a`` partly overwritten, if A is not
+    positive definite."""
     n = a.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -26,7 +27,8 @@ def factor_lower(a: np.ndarray) -> bool:
 
 @njit(cache=True)
 def solve_lower(lower: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Replaces ``x`` by the solution of ``L L^T y = x``, with L the lower triangle ``lower``, and returns it."""
+    """Solves ``L L^T y = x`` for every column of ``x`` (n, m), in place, where L is the lower triangle of ``lower`` (n,
+    n). Returns ``x``, which then holds y."""
     n, m = x.shape
     for i in range(n):
         for k in range(i):

@@ -20,8 +20,7 @@ SUBJECT_RADIUS_MM = 110.0  # of a sphere as large as a head
 
 
 def subject_points(rig: Rig, radius_mm: float = SUBJECT_RADIUS_MM, count: int = 60) -> Float[np.ndarray, "n 3"]:
-    """Returns points (mm) spread evenly over a sphere about the point at which the cameras look (a Fibonacci
-    lattice)."""
+    """Returns points (mm) spread evenly over a sphere around the point that the cameras see (a Fibonacci lattice)."""
     index = np.arange(count) + 0.5
     height, angle = 1 - 2 * index / count, np.pi * (1 + np.sqrt(5)) * index
     ring = np.sqrt(1 - height**2)

@@ -1,1 +1,1 @@
-"""Checkerboards and ChArUco boards: what they are, how they print, where their corners lie in a picture."""
+"""Describes checkerboards and ChArUco boards, prints them, and finds their corners in pictures."""

@@ -1,9 +1,9 @@
-"""The calibration board: what is printed, and where its corners lie.
+"""Describes the calibration board: what is printed, and where its corners lie.
 
 Board frame: origin at the outer corner of the first square, x along a row of squares, y down its columns, z *into* the
-board (away from who looks at it), so that a camera before the board sees x to the right when y points down: the frame
-is right-handed and matches OpenCV's. The first square is black (white if ``inverted``, or if a ChArUco board of an
-even number of rows is ``legacy``: as OpenCV before 4.6 and calib.io draw it). Corners are the inner ones, numbered row
+board (away from the viewer), so that a camera in front of the board sees x to the right when y points down. The frame
+is right-handed and matches OpenCV's. The first square is black (white if ``inverted``, or if a ChArUco board with an
+even number of rows is ``legacy``, as OpenCV before 4.6 and calib.io draw it). Corners are the inner ones, numbered row
 by row.
 """
 
@@ -57,11 +57,12 @@ class Board:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Returns the inner corners as (columns, rows), OpenCV's pattern size."""
+        """Returns the numbers of inner corners as (columns, rows), which is OpenCV's pattern size."""
         return self.columns - 1, self.rows - 1
 
     @property
     def corner_count(self) -> int:
+        """Returns the number of inner corners."""
         return self.grid[0] * self.grid[1]
 
     @property
@@ -75,11 +76,13 @@ class Board:
         return self.square_mm * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
     def centre(self) -> Float[np.ndarray, " 3"]:
+        """Returns the middle of the board, in the board frame, mm."""
         return 0.5 * self.square_mm * np.array([self.columns, self.rows, 0.0])
 
     def turns(self) -> list[Int[np.ndarray, " _"]]:
-        """Returns the orders of the corners that no picture can tell apart: ``order[i]`` is the corner that looks like
-        corner i once the board is turned. A ChArUco board has only one, because its markers differ."""
+        """Returns the orders of the corners that no picture can distinguish: for each rotation of the board that leaves
+        its colours unchanged, ``order[i]`` is the corner that then looks like corner i. A ChArUco board has only one
+        order, because its markers differ."""
         index = np.arange(self.corner_count).reshape(self.rows - 1, self.columns - 1)
         if self.kind == "charuco":
             return [index.ravel()]
@@ -101,7 +104,7 @@ class Board:
         return self.columns % 2 == 0 and self.rows % 2 == 0 and self.columns != self.rows
 
     def squares(self) -> Bool[np.ndarray, "rows columns"]:
-        """Returns for each square whether it is black."""
+        """Tells for each square whether it is black."""
         row, column = np.indices((self.rows, self.columns))
         white_first = self.kind == "charuco" and self.legacy and self.rows % 2 == 0
         return ((row + column) % 2 == 0) ^ self.inverted ^ white_first
@@ -117,7 +120,7 @@ class Board:
 
 
 def read_board(path: Path) -> Board:
-    """Reads a board from a ``board.toml`` file. Raises InputError naming every fault."""
+    """Reads a board from a ``board.toml`` file. Raises InputError that names every fault."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
@@ -126,7 +129,7 @@ def read_board(path: Path) -> Board:
 
 
 def board_from_document(document: Mapping[str, Any], subject: str = "board.toml") -> Board:
-    """Returns the board that a decoded ``board.toml`` describes. Raises InputError naming every fault."""
+    """Returns the board that a decoded ``board.toml`` describes. Raises InputError that names every fault."""
     known = set(Board.__dataclass_fields__)
     strange = [key for key in document if key not in known]
     faults = [compose("board-key-unknown", key=f"{key!r}", known=sorted(known)) for key in strange]
@@ -194,7 +197,8 @@ def _side(board: Board, key: str) -> int:
 
 
 def write_board_pdf(board: Board, path: Path) -> None:
-    """Writes the board as a PDF at true scale, on the smallest paper that holds it, with a ruler to check the print."""
+    """Writes the board as a PDF at true scale, on the smallest paper that can hold it, with a ruler to check the
+    print."""
     width, height = board.columns * board.square_mm, board.rows * board.square_mm
     page = _paper(width, height)
     pdf = FPDF(unit="mm", format=page)

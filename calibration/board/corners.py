@@ -1,11 +1,12 @@
-"""Corners of a board in one grey picture: which they are, and where to a fraction of a pixel.
+"""Finds the corners of a board in one grey picture: which they are, and where, to a fraction of a pixel.
 
 Checkerboards: ``findChessboardCornersSB`` (A. Duda, U. Frese, "Accurate Detection and Localization of Checkerboard
-Corners for Calibration", BMVC 2018), first plain, then exhaustive; where it finds nothing the classic detector with
-``cornerSubPix``. ChArUco: ``CharucoDetector``. Every find is checked: the corners must be the image of a flat grid seen
-from its front, a checkerboard must end where the described one ends, and the order of its corners is made the board's
-own by handedness and colour; the turns that colours cannot settle (``Board.turns``) are left to the pose graph, which
-compares cameras. CALIB_CB_LARGER would show a larger board as such but, on real pictures, adds rows that are not there.
+Corners for Calibration", BMVC 2018), first plain, then exhaustive; if it finds nothing, the classic detector with
+``cornerSubPix``. ChArUco: ``CharucoDetector``. Every result is checked. The corners must be the image of a flat grid
+seen from its front, a checkerboard must end where the described one ends, and its corners are put into the board's
+order by handedness and colour. Rotations that colours cannot determine (``Board.turns``) are left to the pose graph,
+which compares cameras. CALIB_CB_LARGER would report a larger board as such but, on real pictures, adds rows that are
+not there.
 """
 
 from dataclasses import dataclass
@@ -35,8 +36,8 @@ class Found:
 
 
 def detect(grey: UInt8[np.ndarray, "h w"], board: Board) -> Found | None:
-    """Finds the board in one grey picture. Returns its corners to a fraction of a pixel, in the board's order, or None
-    where the board is not found."""
+    """Finds the board in one grey picture. Returns its corners to a fraction of a pixel, in the board's order; None if
+    the board is not found."""
     picture = 255 - grey if board.inverted else grey
     found = (_charuco if board.kind == "charuco" else _checkerboard)(picture, board)
     if found is None or len(found[0]) < CORNERS_LEAST or not is_flat_grid(board, *found):
@@ -58,8 +59,8 @@ def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.nda
 
 def rise(grey: UInt8[np.ndarray, "h w"], board: Board, found: Corners) -> float:
     """Computes the width (px) of the board's edges, from 10 to 90 % of their height, in the blurrier of the board's two
-    directions. Infinite where no edge rises within the room that the pattern leaves (half a square, or the rim around a
-    marker)."""
+    directions. Infinite if no edge rises within the space that the pattern leaves (half a square, or the border around
+    a marker)."""
     ids, corners = found
     flat = board.corners()[ids, :2] / board.square_mm
     homography = _homography(flat, corners)
@@ -175,8 +176,8 @@ def _sector_based_exhaustive(grey: np.ndarray, board: Board) -> np.ndarray | Non
 
 
 def classic_corners(grey: np.ndarray, board: Board) -> np.ndarray | None:
-    """Returns the corners (px, row by row) that OpenCV's detector with adaptive threshold finds; None where it does not
-    find the whole board."""
+    """Returns the corners (px, row by row) that OpenCV's detector with adaptive threshold finds; None unless it finds
+    the whole board."""
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     ok, corners = cv2.findChessboardCorners(grey, board.grid, flags=flags)
     return _refine(grey, corners.reshape(-1, 2), 0.35, board) if ok else None

@@ -1,4 +1,5 @@
-"""Finding the board in pictures, in parallel, remembered by content. ``corners`` looks at one picture."""
+"""Finds the board in many pictures, in parallel, and caches the results by the pictures' content. ``corners`` examines
+one picture."""
 
 import contextlib
 import hashlib
@@ -49,14 +50,23 @@ class PictureNote:
     reason: Message
 
     def message(self) -> Message:
+        """Returns the note as a message that names the picture and the reason."""
         return compose("located", where=f"{self.camera}/{self.picture}", fault=self.reason)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """Holds where the board was found in all pictures. ``sizes``: (width, height) by camera; ``missed``: (camera, shot)
-    of each picture without the board; ``notes``: for cameras that never see the board, what their pictures show
-    instead; ``remarks``: how the board differs from its description."""
+    """Holds where the board was found in all pictures.
+
+    Attributes:
+        board: as it is, perhaps corrected.
+        sizes: width and height of each camera's pictures, px.
+        shots: their names.
+        views: the corners that each camera saw in each shot.
+        missed: camera and shot of each picture without the board.
+        notes: for cameras that never see the board, what their pictures show instead.
+        remarks: how the board differs from its description.
+    """
 
     board: Board
     sizes: dict[str, tuple[int, int]]
@@ -68,6 +78,7 @@ class Detections:
 
     @property
     def corner_count(self) -> int:
+        """Returns the number of corners in all views."""
         return sum(len(view.found.ids) for view in self.views)
 
 
@@ -95,17 +106,17 @@ def _some_pictures(names: list[str]) -> str | Message:
 
 
 def ignore_progress(stage: str, fraction: float) -> None:
-    """Does nothing; the progress hook of callers that want none."""
+    """Does nothing: the default for callers that need no progress."""
 
 
 def detect_folder(
     folder: Path, board: Board, *, cache: Path | None = None, workers: int = 2, report: Progress = ignore_progress
 ) -> Detections:
-    """Finds the board in every picture of ``folder``. A ChArUco board is also found if its first square is white or its
-    markers begin at another number than described. ``cache``: a folder in which results are kept by the SHA-256 of the
-    picture.
+    """Finds the board in every picture of ``folder``. A ChArUco board is also found if its first square is white, or if
+    its markers begin at another number than described.
 
-    Raises InputError for damaged input, and WrongBoard where no picture shows the board and some show another.
+    ``cache`` is a folder that keeps results by the pictures' SHA-256. Raises InputError for damaged input, and
+    WrongBoard if no picture shows the board and some show another.
     """
     pictures = list_pictures(folder)
     detections = _detect_pictures(folder, pictures, board, cache, workers, report)

@@ -1,9 +1,10 @@
-"""What board the markers in pictures belong to: measured, where the described one is not found.
+"""Finds out which board the markers in pictures belong to, if the described one is not found.
 
-A ChArUco board's markers are numbered row by row over its white squares. OpenCV before 4.6, and calib.io, begin an even
-number of rows with a white square; the second board of a pair begins with another number; squares are counted wrongly,
-the marker's side is measured wrongly, the dictionary is another. Each leaves centres of markers that a homography takes
-onto another layout, which tells the cause; the side of a marker by the squares is then its own measure.
+A ChArUco board's markers are numbered row by row over its white squares. The description may be wrong in several ways:
+OpenCV before 4.6 and calib.io begin an even number of rows with a white square; the second board of a pair begins with
+another number; squares may be miscounted, the marker's side mismeasured, the dictionary another. In each case a
+homography maps the markers' centres onto another layout, which shows the cause. A marker's side is measured in units of
+the squares.
 
 Enters: grey pictures. Leaves: the board that explains most of them, or the reason why none does.
 """
@@ -50,8 +51,8 @@ def _detected(grey: np.ndarray, dictionary: cv2.aruco.Dictionary) -> dict[int, F
 
 
 def find_layout(pictures: Sequence[Markers], board: Board) -> Layout | None:
-    """Finds the layout that explains the markers in most pictures, preferring one with as many columns as ``board``.
-    Returns None where no layout does."""
+    """Finds the layout that explains the markers in most pictures, preferring one with as many columns as ``board``;
+    None if no layout does."""
     shown = [markers for markers in pictures if len(markers) >= MARKERS_LEAST]
     if not shown:
         return None
@@ -115,8 +116,8 @@ def _fit(flat: Float[np.ndarray, "m 4 2"], seen: Float[np.ndarray, "m 4 2"]) -> 
 
 
 def other_dictionary(greys: Iterable[UInt8[np.ndarray, "h w"]], dictionary: str) -> str | None:
-    """Finds another of OpenCV's dictionaries whose markers a picture shows, the smallest that holds them. Returns None
-    where there is none."""
+    """Finds another of OpenCV's dictionaries whose markers a picture shows, the smallest that has them; None if there
+    is none."""
     names = sorted((name for name in dir(cv2.aruco) if name.startswith("DICT_") and name != dictionary), key=_size)
     for grey in greys:
         counts = {name: len(find_markers(grey, name)) for name in names}
@@ -150,8 +151,8 @@ def is_april_grid(markers: Markers) -> bool:
 
 
 def board_of(layout: Layout, board: Board) -> Board | None:
-    """Returns ``board`` with the first marker and the colour of the first square that ``layout`` has. Returns None
-    where the layout's squares or markers are of another number or size."""
+    """Returns ``board`` with the first marker number and the colour of the first square that ``layout`` has; None if
+    the layout differs in the number of squares or in the size of markers."""
     if layout.columns != board.columns or abs(layout.ratio - board.marker_ratio) > RATIO_OFF:
         return None
     return replace(board, legacy=layout.legacy, first_marker=layout.first_marker)

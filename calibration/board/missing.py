@@ -1,4 +1,4 @@
-"""Why no board was found in a picture, as an operator would say it."""
+"""Explains to an operator why no board was found in a picture."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ from rig.messages.message import Message, compose
 
 
 def explain(grey: UInt8[np.ndarray, "h w"], board: Board) -> Message | None:
-    """Explains why ``detect`` finds no board in a picture that does show a pattern. Returns None where no pattern is
+    """Explains why ``detect`` finds no board in a picture that does show a pattern; None if no pattern is
     recognised."""
     inverse = replace(board, inverted=not board.inverted)
     mirrored = detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None
@@ -78,8 +78,8 @@ def _explain_charuco(grey: np.ndarray, board: Board) -> Message | None:
 
 
 def explain_markers(pictures: Sequence[Markers], board: Board) -> Message | None:
-    """Explains how the board in the pictures differs from ``board``, from the markers that they show. Returns None
-    where it does not differ."""
+    """Explains how the board in the pictures differs from ``board``, from the markers that they show; None if it does
+    not differ."""
     layout = find_layout(pictures, board)
     if layout is None:
         if any(map(is_april_grid, pictures)):

@@ -1,8 +1,7 @@
-"""Which files of a folder are board pictures of which camera and shot: ``IMAGES/<camera>/<shot>.<ext>``.
+"""Lists the board pictures of a folder by camera and shot: ``IMAGES/<camera>/<shot>.<ext>``.
 
-Enters: a folder. Leaves: files by camera, then by shot. Many programs save a folder a shot instead, with a file
-for each camera in it; that is told by the names or, where they say nothing, by the pictures: a camera that stands still
-sees the same room in every shot.
+Many programs save a folder for each shot instead, with a file for each camera in it. That is recognised by the names
+or, if these do not show it, by the pictures: a camera that stands still sees the same room in every shot.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +31,7 @@ _Thing = TypeVar("_Thing")
 
 
 def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
-    """Returns the pictures of a folder as {camera: {shot: path}}. Raises InputError naming every fault."""
+    """Returns the pictures of a folder as {camera: {shot: path}}. Raises InputError that names every fault."""
     if not folder.is_dir():
         raise InputError(str(folder), [compose("no-picture-folder")])
     faults, filed = list[Message](), dict[str, dict[str, Path]]()
@@ -63,7 +62,7 @@ def _named_apart(cameras: Filed) -> list[Message]:
 
 
 def filed_by_shot(pictures: Filed) -> bool:
-    """Tells whether the pictures that ``list_pictures`` returned lie in folders of shots."""
+    """Tells whether the pictures that ``list_pictures`` returned lie in folders of shots instead of cameras."""
     return any(path.parent.name != camera for camera, shots in pictures.items() for path in shots.values())
 
 

@@ -1,1 +1,1 @@
-"""Which corners are wrong, and what the operator is told about a calibration."""
+"""Judges a calibration: which corners are wrong, and what the operator is told."""

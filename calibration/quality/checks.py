@@ -1,4 +1,4 @@
-"""Checks that a low reprojection error does not imply. A calibration that fails one is refused, with what to do."""
+"""Checks what a low reprojection error does not imply. A calibration that fails a check is refused, with what to do."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,8 +37,8 @@ class Check:
 
 
 def check_cheirality(state: BundleState, seen: Observations, board: Board) -> Check:
-    """Checks that every corner lies before its camera, that every board shows its face and that the rotations are
-    proper."""
+    """Checks that every corner lies in front of its camera, that every board shows its front, and that all rotations
+    are proper."""
     camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
     world = np.einsum("nij,nj->ni", state.board_rotations[shot], seen.points) + state.board_translations[shot]
     points = np.einsum("nij,nj->ni", state.camera_rotations[camera], world) + state.camera_translations[camera]
@@ -81,8 +81,8 @@ def check_held_out(
 
 
 def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
-    """Checks the square size against the measured size of the print, and the print's height over its width as measured
-    by the cameras."""
+    """Checks the size of the squares against the measured size of the print, and the print's height over width against
+    the value that the cameras measured."""
     pairs = [
         ("width", board.measured_width_mm, board.columns),
         ("height", board.measured_height_mm, board.rows),
@@ -207,8 +207,8 @@ def _check_lenses(now: Rig, then: Rig) -> Check:
 def measure_aspect(
     state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
 ) -> tuple[float, float]:
-    """Measures the height of the board's squares over their width, and its standard deviation, from the parabola
-    through the costs of three solutions with the board stretched."""
+    """Measures the height of the board's squares over their width, and its standard deviation: the minimum of a
+    parabola through the costs of three solutions with the board stretched."""
     step = 0.003
     costs = []
     for stretch in (-step, 0.0, step):

@@ -1,4 +1,5 @@
-"""Views and shots that the rest of the rig contradicts, and why: each is named, none silently weighed away."""
+"""Finds views and shots that contradict the rest of the rig, and why. Each is named; none is only given less weight in
+silence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ MATCH_RATIO = 3.0  # an explanation must bring a view this much closer than it w
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """Holds a view that was left out (camera None: the whole shot), and the reason."""
+    """Holds a view that was left out, and the reason; ``camera`` None stands for the whole shot."""
 
     shot: str
     camera: str | None

@@ -1,6 +1,8 @@
-"""Whether a calibration is worth using, and what it lacks: shots may pass every check and still say too little.
+"""Judges whether a calibration is worth using, and what it lacks: shots may pass every check and still determine too
+little.
 
-The limits were chosen on planted sessions of 4 to 30 shots (``tests.support.board_sessions``); nothing prints them.
+The limits were chosen on simulated sessions of 4 to 30 shots (``tests.support.board_sessions``); no command prints
+them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,8 +22,8 @@ COVERED_GOOD = 0.25  # share of the picture's twelfths that hold a corner: lense
 
 @dataclass(frozen=True, slots=True)
 class CameraEvidence:
-    """Holds how well one camera is calibrated. ``focal_share``: standard deviation of the focal length divided by it;
-    ``covered``: share of the picture's twelfths with corners."""
+    """Holds how well one camera is calibrated. ``focal_share`` is the relative standard deviation of its focal length;
+    ``covered`` is the share of twelve equal parts of the picture in which corners were seen."""
 
     views: int
     focal_share: float
@@ -31,8 +33,8 @@ class CameraEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Holds the verdict on a calibration. ``missing``: what would improve it, most urgent first; empty if it is
-    good."""
+    """Holds the verdict on a calibration: good, usable or poor. ``missing`` lists what would improve it, the most
+    urgent first; empty if it is good."""
 
     word: Word
     missing: tuple[Message, ...]

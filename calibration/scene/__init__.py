@@ -1,1 +1,1 @@
-"""Cameras from photographs of a scene alone: no board, no clean plates."""
+"""Calibrates cameras from photographs of a scene alone, without board or clean plates."""

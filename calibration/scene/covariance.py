@@ -1,11 +1,13 @@
-"""What the points leave open of the cameras: the reduced camera system of the bundle adjustment, inverted.
+"""Computes how uncertain the cameras are, given the points: the inverse of the reduced camera system of the bundle
+adjustment.
 
-With U, V and W the blocks of the normal equations of cameras, of points and between them, eliminating the points leaves
-``S = U - W V^-1 W^T`` (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1). It is singular along
-the seven motions of the world (rotation, shift, scale); the covariance is given in the subject's gauge of
-``calibration.adjustment.gauge``, where those are no error of a camera. What of a lens was not
-estimated (few views: its principal point, taken to be the picture's middle; a lens each: its bend, too) has a spread
-that is carried through the solution ("consider" covariance: Tapley et al., Statistical Orbit Determination, 2004, 6.3).
+With U, V and W the blocks of the normal equations of cameras, of points, and between both, eliminating the points
+leaves ``S = U - W V^-1 W^T`` (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 1999, section 6.1). It is
+singular along the seven motions of the world (rotation, translation, scale). The covariance is therefore given in the
+subject's gauge of ``calibration.adjustment.gauge``, in which these are no error of a camera. Parameters of a lens that
+were not estimated (with few views the principal point, taken to be the picture's middle; with a lens for each camera
+also its distortion) have an assumed spread that is propagated ("consider" covariance: Tapley et al., Statistical Orbit
+Determination, 2004, 6.3).
 """
 
 from dataclasses import dataclass, replace
@@ -39,12 +41,14 @@ OUTLIER_SIGMAS = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Holds how well the cameras of a solved structure are known.
+    """Holds how precisely the cameras of a solved structure are known.
 
-    ``blocks``: covariance of each camera's pose as a left perturbation (rad, mm), the lens's uncertainty included;
-    ``pose_sigma_px``: what it amounts to at the subject (px); ``focal_sigma_px``: standard deviation of each focal
-    length (px); ``noise_px``: noise of a keypoint along each axis. ``misfit``: result of ``lens_misfit``; above 1 it
-    widens all of them.
+    Attributes:
+        blocks: covariance of each camera's pose as a left perturbation (rad, mm), the lens's uncertainty included.
+        pose_sigma_px: its size in the image of the subject.
+        focal_sigma_px: standard deviation of each focal length.
+        noise_px: noise of a keypoint along each axis.
+        misfit: the result of ``lens_misfit``; above 1 it enlarges all of the above.
     """
 
     blocks: Float[np.ndarray, "c 6 6"]
@@ -88,7 +92,7 @@ def uncertainty(structure: Structure) -> Uncertainty:
 
 
 def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
-    """Returns, for each camera, the indices of its unknowns (f k1 k2 cx cy, then the six of its pose) among all
+    """Returns, for each camera, the positions of its parameters (f k1 k2 cx cy, then the six of its pose) among all
     unknowns."""
     count = len(structure.rig)
     lenses = np.zeros(count, int) if structure.one_lens else np.arange(count)
@@ -97,17 +101,17 @@ def camera_places(structure: Structure) -> Int[np.ndarray, "c 11"]:
 
 
 def reduced_camera_system(structure: Structure, noise_px: float) -> Float[np.ndarray, "p p"]:
-    """Returns the reduced camera system ``S`` of the module's docstring for keypoints with a noise of ``noise_px``
-    along each axis. Outliers are left out."""
+    """Returns the matrix ``S`` of the module's docstring, for keypoints with a noise of ``noise_px`` along each axis.
+    Outliers are left out."""
     return _reduced(structure, noise_px)[0]
 
 
 def lens_misfit(structure: Structure, noise_px: float) -> float:
-    """Computes how much better the points would be explained if each camera had a lens of its own: about 1 for one
-    common lens, more where the lenses differ.
+    """Computes how much better the points would be explained if each camera had its own lens: about 1 if one lens fits
+    all, more if the lenses differ.
 
-    A score test (Rao 1948): the fall of chi-squared in one Gauss-Newton step, divided by the number of values set free.
-    The residuals themselves hardly show a wrong lens, because the poses make up for it.
+    It is a score test (Rao 1948): the decrease of chi-squared in one Gauss-Newton step, divided by the number of added
+    parameters. The residuals themselves hardly show a wrong lens, because the poses compensate for it.
     """
     if not structure.one_lens or len(structure.rig) < 2:
         return 1.0

@@ -1,9 +1,9 @@
-"""Which points of two photographs are one point of the scene: SIFT on the processor, by pycolmap.
+"""Finds which keypoints of two photographs are one point of the scene: SIFT on the processor, by pycolmap.
 
-Shots of one rig share its cameras but not the scene: heads turn from shot to shot. So pictures are matched within a
-shot only, and then all shots' keypoints of a camera are put into one image of it, which makes "the cameras stand still"
-a matter of the data and needs no constraint in the solver. Everything runs in one thread from one seed: with more, the
-order of RANSAC's draws, and so the result, is that of the scheduler.
+Shots of one rig have its cameras in common but not the scene, since heads turn from shot to shot. So pictures are
+matched within each shot only. The keypoints of all shots of a camera are then put into a single image of it, so that
+the data alone say that the cameras stand still, and the solver needs no constraint. Everything runs in one thread from
+one seed; with more threads, the order of RANSAC's draws, and so the result, would depend on the scheduler.
 """
 
 from collections.abc import Iterator
@@ -30,11 +30,16 @@ SIDE_MOST_PX = 2400  # features are found in pictures no larger; they are placed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """Holds the matches between photographs, in COLMAP databases that have one image a camera.
+    """Holds the matches between photographs, in COLMAP databases that have one image for each camera.
 
-    ``databases``: the first has one lens for all images where they are of one size; the last has a lens for each image
-    unless ``one_lens``. ``features``: number of keypoints by camera; ``matched``: number of verified matches by pair of
-    cameras; ``matched_keypoints``: number of keypoints that have a match.
+    Attributes:
+        databases: the first has one lens for all images if these have one size; the last has a lens for each image,
+            unless ``one_lens``.
+        one_lens: whether all photographs were taken with one camera at one setting.
+        sizes: width and height of each camera's photographs, px.
+        features: number of keypoints by camera.
+        matched: number of verified matches by pair of cameras.
+        matched_keypoints: number of keypoints that have a match.
     """
 
     databases: tuple[Path, ...]
@@ -46,11 +51,16 @@ class Matches:
 
 
 def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool | None, report: Progress) -> Matches:
-    """Finds keypoints in all photographs, matches them within each shot and verifies the matches by two-view geometry.
+    """Finds keypoints in all photographs, matches them within each shot, and verifies the matches by two-view geometry.
 
-    ``scratch`` is a folder of the caller's that may be deleted once the structure is solved. ``one_lens`` says whether
-    all photographs are of one camera at one setting; None takes that for granted where each camera has one picture and
-    all are of one size. Raises InputError naming every picture that cannot be used.
+    Args:
+        photographs: by camera and shot.
+        scratch: folder of the caller, which may be deleted once the structure is solved.
+        one_lens: whether all photographs were taken with one camera at one setting; None assumes so if each camera has
+            one picture and all have one size.
+        report: progress.
+
+    Raises InputError that names every picture that cannot be used.
     """
     sizes = _write_grey(photographs, scratch / "pictures")
     if one_lens is None:
@@ -71,7 +81,7 @@ def match_photographs(photographs: Photographs, scratch: Path, *, one_lens: bool
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silences COLMAP's log while the block runs; only one of its lines in a thousand is for a user."""
+    """Silences COLMAP's log while the block runs; hardly one of its lines is meant for a user."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel

@@ -1,7 +1,7 @@
-"""Which photographs a folder holds, of which camera, and of which shot.
+"""Lists the photographs of a folder by camera and shot.
 
 ``PHOTOS/<camera>.<ext>``, or ``PHOTOS/<camera>/<shot>.<ext>`` where the same name of a shot means the same moment; both
-also inside ``PHOTOS/images/``. A camera's name becomes that of its file in a capture, so it must be fit for one.
+also inside ``PHOTOS/images/``. A camera's name becomes that of its file in a capture, so it must be a valid one.
 """
 
 from collections.abc import Mapping
@@ -32,15 +32,17 @@ class Photographs:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Returns the names of the cameras."""
         return tuple(self.files)
 
     @property
     def shots(self) -> tuple[str, ...]:
+        """Returns the names of all shots, sorted."""
         return tuple(sorted({shot for files in self.files.values() for shot in files}))
 
 
 def find_photographs(folder: Path) -> Photographs:
-    """Lists the photographs in ``folder`` by camera and shot. Raises InputError naming every fault."""
+    """Lists the photographs in ``folder`` by camera and shot. Raises InputError that names every fault."""
     if not folder.is_dir():
         raise InputError(folder.name, [compose("no-folder-of-photographs")])
     root = capture_root(folder)
@@ -68,8 +70,8 @@ def find_photographs(folder: Path) -> Photographs:
 
 
 def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
-    """Returns the masks (True = subject) by camera that lie in masks/ beside the photographs of a single shot. Raises
-    InputError for a mask that is damaged or of another size than its photograph."""
+    """Reads the masks (True = subject) in masks/ beside the photographs of a single shot, by camera. Raises InputError
+    for a mask that is damaged or of another size than its photograph."""
     root = capture_root(folder)
     if photographs.shots != (ONE_SHOT,) or not (root / "masks").is_dir():
         return {}

@@ -1,4 +1,4 @@
-"""The report of a calibration from the scene: one HTML page that needs nothing else."""
+"""Writes the report of a calibration from a scene: one self-contained HTML page."""
 
 from html import escape
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""What a calibration from the scene is: the rig with its covariances, its scale, and which views did not join."""
+"""Defines the result of a calibration from a scene: the rig with its covariances, its scale, and the views that were
+left out."""
 
 from dataclasses import dataclass
 from typing import TypedDict
@@ -14,6 +15,9 @@ from rig.rig import Rig
 
 
 class SceneCameraFigures(TypedDict):
+    """Describes how well one camera is calibrated: its reprojection error (RMS, px), its keypoints and solved points,
+    its focal length, and the standard deviations of pose and focal length."""
+
     rms_px: float
     features: int
     points: int
@@ -23,7 +27,8 @@ class SceneCameraFigures(TypedDict):
 
 
 class SceneFigures(TypedDict):
-    """Holds the numbers that ``calibrate --from scene --json`` prints."""
+    """Describes the numbers that ``calibrate --from scene --json`` prints. ``used_share`` is the share of matched
+    keypoints in the solution."""
 
     rms_px: float
     used_share: float
@@ -34,6 +39,9 @@ class SceneFigures(TypedDict):
 
 
 class ScaleDocument(TypedDict):
+    """Describes where the scale comes from, in words too (``told``), whether it is only assumed, and its relative
+    standard deviation."""
+
     source: str
     assumed: bool
     told: str
@@ -41,7 +49,7 @@ class ScaleDocument(TypedDict):
 
 
 class SceneDocument(TypedDict):
-    """Holds the content of a scene's ``calibration.json``."""
+    """Describes a scene's ``calibration.json``."""
 
     figures: SceneFigures
     front: str
@@ -58,9 +66,16 @@ class SceneDocument(TypedDict):
 class SceneCalibration:
     """Holds a rig that was calibrated from photographs of a scene (mm, world frame, with covariances).
 
-    ``structure``: the same cameras with their points; ``left_out``: views that did not join, and why; ``features``:
-    number of keypoints found in each view; ``matched``: number of keypoints, over all views, that are found in another
-    view too; ``refinement``: how silhouettes changed the poses, where there were masks.
+    Attributes:
+        rig: the cameras.
+        structure: the same cameras with their points.
+        uncertainty: how precisely the cameras are known.
+        scale: how the unit became millimetres.
+        front: the camera that the subject faces.
+        left_out: views that could not be joined to the others, and why.
+        features: number of keypoints in each view.
+        matched: number of keypoints, over all views, that were found in another view too.
+        refinement: how silhouettes changed the poses, if there were masks.
     """
 
     rig: Rig
@@ -75,7 +90,7 @@ class SceneCalibration:
     refinement: Message | None = None
 
     def absences(self) -> list[Message]:
-        """Returns for every view that did not join the others which view it is and why."""
+        """Returns a message for every view that could not be joined to the others: which it is, and why."""
         return [compose("located", where=name, fault=why) for name, why in self.left_out.items()]
 
     def figures(self) -> SceneFigures:
@@ -102,7 +117,7 @@ class SceneCalibration:
         }
 
     def document(self) -> SceneDocument:
-        """Returns the calibration as plain values for JSON, without points and residuals."""
+        """Returns the calibration as JSON types, without points and residuals."""
         return {
             "figures": self.figures(),
             "front": self.front,

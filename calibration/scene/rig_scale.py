@@ -1,7 +1,8 @@
-"""A known length beside cameras of another program, whose unit nobody knows: the rig in millimetres.
+"""Brings the cameras of another program, whose unit is unknown, to millimetres by a known length in the pictures.
 
 Enters: a capture with its rig in any unit, and scale.json. Leaves: the rig scaled so that the length is right, and what
-was done. Cameras that agree with the length within its own uncertainty stay as they are: a board knows better.
+was done. Cameras that agree with the length within its uncertainty are not changed, since a calibration board is more
+precise.
 """
 
 from dataclasses import replace
@@ -26,16 +27,16 @@ AGREES_LEAST = 0.002  # and at least this share: half a millimetre of a head
 
 
 def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) -> tuple[Rig, list[Message]]:
-    """Scales a rig so that a known length is right (mm). Returns the rig and a message of what was done; the rig as it
-    is, and no message, where it agrees with the length within the length's uncertainty.
+    """Scales a rig so that a known length is right (mm). Returns the rig and a message of what was done. If the rig
+    agrees with the length within the length's uncertainty, it is returned unchanged, without a message.
 
     Args:
         capture: pictures as ``rig`` took them.
-        rig: the cameras, perhaps of pictures that were read smaller.
-        full: the cameras of the files, in whose pixels points were picked.
+        rig: the cameras, perhaps of pictures that were read at a smaller size.
+        full: the cameras of the original files, in whose pixels points were picked.
         known: the length.
 
-    Raises InputError where the pictures do not show the length.
+    Raises InputError if the pictures do not show the length.
     """
     scale = _scale(capture, rig, full, known)
     if abs(np.log(scale.factor)) <= max(AGREES_LEAST, AGREES_SHARES * scale.share):

@@ -1,9 +1,9 @@
-"""How many millimetres the scene's unit is: from a known length in it, or else from the size that heads have.
+"""Finds how many millimetres the unit of a scene is: from a known length in it, or else from the usual size of heads.
 
-Enters: a structure in any unit. Leaves: the factor, with its standard deviation as a share and where it comes from. The
-known lengths are those of ``scale.json``. Without one, the points about the place that the cameras look at are taken
-to be a head, as far from their middle as the model's mean head is from its own: hair, a neck and the table pull at it,
-so it is good to a fifth only, and is said to be an assumption wherever it is shown.
+Enters: a structure in any unit. Leaves: the factor, with its relative standard deviation and where it comes from. The
+known lengths are those of ``scale.json``. Without one, the points around the point that the cameras see are assumed to
+be a head, as far from their middle as the model's mean head is from its own. Hair, a neck and the table distort that,
+so that it is right to a fifth only, and it is marked as an assumption wherever it is shown.
 """
 
 from collections.abc import Mapping
@@ -35,9 +35,14 @@ POINTS_LEAST = 30
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Holds the scale of a structure. ``factor``: millimetres in its unit of length; ``share``: relative standard
-    deviation of ``factor``; ``source``: points, tag, cameras or head-size; ``provenance``: where the scale comes from,
-    as a sentence."""
+    """Holds the scale of a structure.
+
+    Attributes:
+        factor: millimetres in its unit of length.
+        share: relative standard deviation of ``factor``.
+        source: points, tag, cameras or head-size.
+        provenance: where the scale comes from, as a sentence.
+    """
 
     factor: float
     share: float
@@ -53,11 +58,8 @@ class Scale:
 def find_scale(
     structure: Structure, known: KnownLength | None, photographs: Photographs, head: Float[np.ndarray, "v 3"]
 ) -> Scale:
-    """Computes the scale of a structure from a ``known`` length or, where that is None, from the size of a mean head
-    (``head``: its vertices, mm). Raises InputError where the photographs that joined do not show the known length.
-
-    Raises InputError where the photographs that joined do not show the known length.
-    """
+    """Computes the scale of a structure from a ``known`` length or, if that is None, from the size of a mean head
+    (``head``: its vertices, mm). Raises InputError if the photographs do not show the known length."""
     if isinstance(known, PointDistance):
         return scale_from_points(structure.rig, known)
     if isinstance(known, CameraDistance):
@@ -68,8 +70,8 @@ def find_scale(
 
 
 def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
-    """Computes the scale from the known distance of two cameras' centres. From outside, the entrance pupil of a lens is
-    known to some millimetres. Raises InputError where a camera did not join."""
+    """Computes the scale from the known distance between two cameras' centres. Seen from outside, the position of a
+    lens's entrance pupil is known to a few millimetres only. Raises InputError if one of the cameras was left out."""
     lost = [name for name in known.cameras if name not in rig]
     if lost:
         raise InputError("scale.json", [compose("scale-camera-lost", camera=name) for name in lost])
@@ -82,8 +84,8 @@ def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
 
 
 def scale_from_points(rig: Rig, known: PointDistance) -> Scale:
-    """Computes the scale from the known distance of two points, each picked in two views or more. Raises InputError
-    where a point cannot be triangulated."""
+    """Computes the scale from the known distance between two points, each picked in two views or more. Raises
+    InputError if a point cannot be triangulated."""
     ends, faults = [], []
     for name, views in (("first", known.first), ("second", known.second)):
         joined = {camera: pixel for camera, pixel in views.items() if camera in rig}
@@ -127,8 +129,8 @@ def find_tags(photographs: Photographs, known: TagSize) -> Tags:
 
 
 def find_tags_of_shot(images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], known: TagSize) -> Tags:
-    """Finds the tags of a dictionary in the pictures of one shot. Returns their corners (px) by ("", number of the
-    tag), then by camera."""
+    """Finds the tags of a dictionary in the pictures of one shot. Returns their corners (px) by tag, then by camera.
+    The key of a tag is ("", its number), since the shot has no name."""
     detector = _tag_detector(known)
     tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
     for camera, image in images.items():
@@ -156,8 +158,8 @@ def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) 
 
 
 def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
-    """Computes the scale from the known side of tags, as the median over all tags that two views or more show. Raises
-    InputError where there is none."""
+    """Computes the scale from the known side of tags: the median over all tags that two views or more show. Raises
+    InputError if there is none."""
     found = []
     for number, views in tags.items():
         joined = {camera: corners for camera, corners in views.items() if camera in rig}
@@ -183,8 +185,8 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
 
 
 def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:
-    """Assumes the scale at which the points that the cameras look at are as far from their middle (median) as the
-    vertices of a mean head ``head`` (mm) are from theirs."""
+    """Assumes the scale at which the points around the subject are as far from their middle (median) as the vertices of
+    a mean head ``head`` (mm) are from theirs."""
     points = _looked_at(structure)
     ratio = _median_radius(head) / _median_radius(points)
     provenance = compose("scale-by-head")

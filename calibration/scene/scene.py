@@ -1,7 +1,7 @@
-"""From photographs of a scene to a calibrated rig: matches, structure from motion, scale, world frame, covariances.
+"""Calibrates a rig from photographs of a scene: matches, structure from motion, scale, world frame, covariances.
 
-Enters: one photograph a camera, or a folder of shots a camera, of a scene that has enough on it to be matched: a head
-with skin and hair in view of cameras 10 to 25 degrees apart, a table with things on it, a room. Leaves: the rig.
+Enters: one photograph for each camera, or a folder of shots for each, of a scene with enough detail to be matched: a
+head with skin and hair in view of cameras 10 to 25 degrees apart, a table with things on it, a room. Leaves: the rig.
 """
 
 import tempfile
@@ -48,14 +48,19 @@ def calibrate_scene(
     one_lens: bool | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> SceneCalibration:
-    """Calibrates the cameras of the photographs ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``.
+    """Calibrates the cameras of the photographs ``PHOTOS/<camera>.<ext>`` or ``PHOTOS/<camera>/<shot>.<ext>``. The same
+    photographs give the same rig on the same machine.
 
-    ``scale``: path of a ``scale.json``; ``front``: the camera that the subject faces, guessed if None; ``one_lens``:
-    whether all photographs are of one camera at one setting; None takes that for granted where each camera has one
-    picture and all are of one size. The same photographs give the same rig on the same machine.
+    Args:
+        folder: the folder PHOTOS.
+        scale: path of a ``scale.json``; None assumes the scale from the size of a head.
+        front: the camera that the subject faces; None guesses it.
+        one_lens: whether all photographs were taken with one camera at one setting; None assumes so if each camera has
+            one picture and all have one size.
+        report: progress.
 
-    Raises InputError naming every fault of the photographs and of ``scale.json``, and CalibrationRefused with the views
-    that did not join, why, and what to add.
+    Raises InputError that names every fault of the photographs and of ``scale.json``, and CalibrationRefused with the
+    views that could not be joined, why, and what to add.
     """
     photographs = find_photographs(folder)
     names = photographs.names
@@ -77,8 +82,8 @@ def calibrate_scene(
 
 
 def judged(structure: Structure | None, matches: Matches) -> tuple[Structure, dict[str, Message]]:
-    """Returns the structure and, by name, why views are left out of it. Raises CalibrationRefused where too few views
-    joined."""
+    """Returns the structure and, by name, why views are left out of it. Raises CalibrationRefused if too few views
+    could be joined."""
     names = list(matches.sizes)
     joined = structure.rig.names if structure is not None else ()
     left_out = {name: why_not(name, matches, joined) for name in names if name not in joined}
@@ -93,7 +98,7 @@ def placed(
     structure: Structure, scale: Scale, matches: Matches, left_out: dict[str, Message], front: str | None
 ) -> SceneCalibration:
     """Returns the calibration of a structure, in millimetres and in the world frame, with covariances and warnings.
-    Raises CalibrationRefused where ``front`` did not join."""
+    Raises CalibrationRefused if the view ``front`` is left out."""
     if front in left_out:
         raise CalibrationRefused([compose("front-left-out", camera=str(front), why=left_out[str(front)])])
     here = transformed(structure, structure.rig, scale.factor)
@@ -127,8 +132,8 @@ def placed(
 
 
 def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.ndarray, "_ _"]]) -> SceneCalibration:
-    """Refines the poses of a calibration so that the subject's silhouettes agree, and returns it with the new poses if
-    pairs of views that were held out agree better. Returns the calibration unchanged where there are too few masks."""
+    """Refines the poses of a calibration so that the subject's silhouettes agree. The new poses are kept if pairs of
+    views that were held out agree better. Returns the calibration unchanged if there are too few masks."""
     rig = calibration.rig
     known = [name for name in rig.names if name in masks]
     if len(known) < VIEWS_LEAST:
@@ -140,8 +145,8 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
 
 
 def transformed(structure: Structure, moved: Rig, factor: float) -> Structure:
-    """Returns the structure with its lengths multiplied by ``factor``, moved to the frame in which the structure's
-    cameras have the poses of ``moved``."""
+    """Returns the structure with its lengths multiplied by ``factor``, in the frame in which its cameras have the poses
+    of ``moved``."""
     before, after = structure.rig.cameras[0].camera_from_world, moved.cameras[0].camera_from_world
     new_from_old = after.inverse() @ before
     cameras = tuple(

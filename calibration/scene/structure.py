@@ -1,8 +1,9 @@
-"""Cameras and points from matches: COLMAP's incremental structure from motion, one after another from the best pair.
+"""Solves for cameras and points from matches: COLMAP's incremental structure from motion, which starts from the best
+pair and adds one view after another.
 
-Source: J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016, in pycolmap. The unit of length is
-free and so is the frame; both are given afterwards. COLMAP puts pixel (0.5, 0.5) at the centre of the top-left pixel,
-this project (0, 0): principal points and keypoints are shifted on the way out.
+Source: J. L. Schoenberger, J.-M. Frahm, Structure-from-Motion Revisited, CVPR 2016, in pycolmap. The unit of length and
+the frame are arbitrary and chosen afterwards. COLMAP has the centre of the top-left pixel at (0.5, 0.5), this project
+at (0, 0): principal points and keypoints are shifted when they are read.
 """
 
 from collections.abc import Collection
@@ -32,10 +33,10 @@ TRACK_LEAST = 3  # a point in two views only tells nothing about the third; and 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Structure:
-    """Holds cameras and points that were solved from matches.
+    """Holds cameras and points that were solved from matches, in an arbitrary frame and unit.
 
-    ``rig`` and ``points`` are in the frame and unit of the scene. Observation i is the pixel ``pixels[i]`` of camera
-    ``camera_of[i]`` and of point ``point_of[i]``. ``one_lens``: all cameras have the same intrinsics.
+    Observation i is the pixel ``pixels[i]`` of the point ``point_of[i]`` in the camera ``camera_of[i]``. ``one_lens``
+    says that all cameras have the same intrinsics.
     """
 
     rig: Rig
@@ -47,13 +48,13 @@ class Structure:
 
     @property
     def estimated(self) -> int:
-        """Returns how many of the values f, k1, k2, cx, cy of a lens, in this order, were estimated."""
+        """Returns how many of the parameters f, k1, k2, cx, cy of a lens, counted in this order, were estimated."""
         if not self.one_lens:
             return 1
         return 5 if len(self.rig) >= CENTRE_VIEWS else 3
 
     def residuals(self) -> Float[np.ndarray, "n 2"]:
-        """Returns the projected less the observed pixel of each observation (px)."""
+        """Returns projected minus observed pixel of each observation."""
         projected = np.empty_like(self.pixels)
         for index, camera in enumerate(self.rig):
             of_camera = self.camera_of == index
@@ -62,12 +63,12 @@ class Structure:
 
 
 def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Structure | None:
-    """Solves for the largest set of cameras that join, with their points. Returns None where no pair of views gives a
-    start.
+    """Solves for the largest set of cameras that can be joined, with their points. Returns None if no pair of views can
+    start it.
 
-    If each camera has a lens of its own, it starts from the one lens that explains all views best and keeps its
-    distortion: in a view of a head, focal length and distance cannot be told apart, and 300 points do not tell
-    distortion from noise.
+    If each camera has its own lens, it starts from the one lens that explains all views best, and keeps its distortion:
+    in a view of a head, focal length and distance cannot be separated, and 300 points cannot separate distortion from
+    noise.
     """
     import pycolmap
 
@@ -159,7 +160,7 @@ def _camera(name: str, image: Any, lens: Any) -> Camera:
 
 
 def why_not(name: str, matches: Matches, joined: Collection[str]) -> Message:
-    """Explains why a view did not join the others, and what to add."""
+    """Explains why a view could not be joined to the others, and what to add."""
     features = matches.features[name]
     if features < FEATURES_LEAST:
         return compose("join-points-bare", points=features)

@@ -1,4 +1,4 @@
-"""The world frame of a rig whose cameras were held upright, on their side or upside down."""
+"""Chooses the world frame of a rig whose cameras were held upright, on their side or upside down."""
 
 from dataclasses import replace
 
@@ -13,8 +13,8 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # abou
 
 
 def in_guessed_frame(rig: Rig, front: str | None) -> Rig:
-    """Returns the rig in a world frame that is guessed as if every camera had been held upright (``in_world_frame``);
-    cameras held on their side or upside down are turned for the guess alone."""
+    """Returns the rig in a guessed world frame, as ``in_world_frame`` would choose it with all cameras upright. Cameras
+    held on their side or upside down are turned for the guess alone."""
     turns = [np.linalg.matrix_power(QUARTER, int(count)) for count in quarter_turns(rig)]
     upright = Rig(
         tuple(

@@ -1,4 +1,4 @@
-"""Whether a calibration from the scene is worth using for a rig, and what it lacks: the limits of a board's."""
+"""Judges whether a calibration from a scene is worth using for a rig, by the same limits as for a board."""
 
 from calibration.quality.verdict import POSE_GOOD_PX, POSE_POOR_PX, Verdict
 from calibration.scene.result import SceneCalibration

@@ -1,12 +1,13 @@
-"""Extrinsics from silhouettes of any subject: epipolar tangency over several captures, no model of the subject.
+"""Refines extrinsics by silhouettes of any subject: epipolar tangency over several captures, without a model of the
+subject.
 
-The residual and its derivative by the cameras are ``tangency_term``'s. Each step of Levenberg-Marquardt finds the
+The residual and its derivative by the cameras are in ``tangency_term``. Each step of Levenberg-Marquardt finds the
 tangencies anew: the first uses the outer ones of ``pipeline.multiview.tangency``, which cannot be confused, the others
-all frontier points. With a head model, the rims of the fitted heads join in at the end
+all frontier points. With a head model, the rims of fitted heads are added at the end
 (``calibration.silhouette_refinement.rims``). The calibration's covariance is the prior; the gauge is that of
-``calibration.adjustment.gauge``. Silhouettes do not see a rig's scale, so that stays the board's.
+``calibration.adjustment.gauge``. Silhouettes do not determine a rig's scale, so the board's is kept.
 
-Enters: silhouettes of several captures, and the rig. Leaves: the rig, refined if captures held out agree.
+Enters: silhouettes of several captures, and the rig. Leaves: the rig, refined if held-out captures agree.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +54,7 @@ Pairs = Callable[[tuple[str, str]], bool]  # whether the tangencies of two camer
 
 
 class TooFewCaptures(EigenheadError):
-    """Reports that too few captures are left to refine from and to check the result by."""
+    """Reports too few captures to refine the cameras and also check the result."""
 
     def __init__(self, captures: int) -> None:
         super().__init__(compose("refinement-too-few-captures", count=captures))
@@ -75,11 +76,19 @@ class Residuals:
 class Refinement:
     """Holds the result of a refinement.
 
-    ``rig`` is ``proposed`` if the refinement is ``kept``, otherwise the start; ``reason`` says why. ``before`` are the
-    residuals of all captures at the start, ``after`` those of each capture with the cameras that the other captures
-    alone give; ``before_px`` and ``after_px`` are their robust RMS, ``noise_px`` the noise these assume. ``change_px``
-    is, for each camera, the RMS motion (2D) of the image of the subject's region from the start to ``proposed``, worlds
-    aligned."""
+    Attributes:
+        rig: ``proposed`` if the refinement is ``kept``, otherwise the start.
+        proposed: the refined rig.
+        before: residuals of all captures at the start.
+        after: residuals of each capture with cameras refined by the other captures alone.
+        before_px: robust RMS of ``before``.
+        after_px: robust RMS of ``after``.
+        noise_px: the noise that both assume.
+        kept: whether the held-out captures agree better.
+        reason: why it was kept or not.
+        change_px: for each camera, the RMS motion (2D) of the image of the subject's region from the start to
+            ``proposed``, after the worlds are aligned.
+    """
 
     rig: Rig
     proposed: Rig
@@ -302,12 +311,14 @@ def _prior(rig: Rig, *, focal: bool, prior_px: float) -> Float[np.ndarray, "p p"
 
 
 def gauge_free(information: Float[np.ndarray, "p p"], projection: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Returns the information of N(0, information^-1) about what ``projection`` leaves, regardless of motions of the
-    world; and a prior that keeps such motions at zero, since no image determines them.
+    """Removes the choice of the world frame from a prior: returns the information matrix of N(0, information^-1)
+    restricted to what ``projection`` keeps, plus a term that holds motions of the world at zero, since no image
+    determines them.
 
-    With S the projection, I - S = A B of rank 6, and M the information: the minimum of (x - A t)^T M (x - A t) over all
-    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A rig moved as a whole then costs nothing, just as it
-    costs the tangencies nothing, and ``(I - S)^T M (I - S)`` fixes the frame without affecting anything visible."""
+    With S the projection, I - S = A B of rank 6, and M the information, the minimum of (x - A t)^T M (x - A t) over all
+    motions t of the world is x^T (M - M A (A^T M A)^-1 A^T M) x. A rig moved as a whole then costs nothing, as it costs
+    the tangencies nothing. The term ``(I - S)^T M (I - S)`` fixes the frame without affecting anything visible.
+    """
     world = np.eye(len(projection)) - projection
     motions = scipy.linalg.orth(world, rcond=1e-9)
     pulled = information @ motions

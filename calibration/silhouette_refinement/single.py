@@ -42,10 +42,11 @@ class SingleRefinement:
 
 
 def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement | None:
-    """Refines extrinsics from the silhouettes of one capture.
+    """Refines extrinsics by the silhouettes of one capture.
 
-    The result is kept if pairs of cameras, a fifth held out in its turn, agree better. Returns None if fewer than
-    ``VIEWS_LEAST`` views have a usable silhouette."""
+    The result is kept if pairs of cameras agree better while they are held out, a fifth of them at a time. Returns None
+    if fewer than ``VIEWS_LEAST`` views have a usable silhouette.
+    """
     seen = [name for name in rig.names if name in capture and capture[name].quality.usable]
     if len(seen) < VIEWS_LEAST:
         return None

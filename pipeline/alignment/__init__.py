@@ -1,5 +1,5 @@
-"""Where the head stands (section 4.2).
+"""Determines where the head stands (section 4.2).
 
 Enters: feature points in the images, or silhouettes alone, and the mean head. Leaves: ``world_from_head``, the
-similarity that the fit starts from.
+similarity from which the fit starts.
 """

@@ -1,9 +1,9 @@
-"""Alignment to the landmarks of a face that was found in the photographs: section 4.2 without anybody's clicks.
+"""Aligns the head to the landmarks of a face that was found in the photographs: section 4.2 without clicked points.
 
-Enters: a face matched over the views, and which places of the model its points are. Leaves: ``world_from_head`` of the
-mean head, and the same landmarks as the estimator reads them. As for clicked points, the model's own covariance of the
-places says what another head's face may differ by, and what is left over must be the pose's. Places that contradict the
-others (a jaw that is open, a brow under a fringe) lose weight.
+Enters: a face matched over the views, and which points of the model its landmarks are. Leaves: ``world_from_head`` of
+the mean head, and the same landmarks as the contour solver reads them. As for clicked points, the model's covariance of
+these points says how far another head's face may differ; the rest must be due to the pose. Landmarks that contradict
+the others (an open jaw, a brow under a fringe) lose weight.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,8 @@ class FaceAlignment:
 
 
 def align_to_face(model: HeadModel, face: MatchedFaces, places: LandmarkMap) -> FaceAlignment:
-    """Aligns the mean head to the landmarks of a face. ``model`` must have the modes of the later fit."""
+    """Aligns the mean head to the landmarks of a face. ``places`` are the points of the model that these are. ``model``
+    must have the modes of the later fit."""
     which = spread_points(places)
     mean, basis = blended_basis(model, places.rows[which], places.weights[which])
     modes = basis.reshape(len(basis), -1).T.astype(float)

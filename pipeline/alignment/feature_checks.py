@@ -1,5 +1,5 @@
-"""What can be said against feature points before a fit: names, views, whether they span a triangle, and whether they
-lie on the face that the photographs show."""
+"""Checks feature points before a fit: their names, in how many views they are, whether they span a triangle, and
+whether they lie on the face in the photographs."""
 
 import numpy as np
 from jaxtyping import Float
@@ -46,8 +46,9 @@ def feature_faults(features: Features, rig: Rig) -> list[Message]:
 def features_beside_face(
     features: Features, face: MatchedFaces, rig: Rig, model: HeadModel, places: LandmarkMap
 ) -> Message | None:
-    """Returns the fault of points that lie beside the face in the photographs, most of them by more than ``BESIDE_MM``.
-    Points that were picked in a crop, or in pictures of another size, agree with each other and not with the face."""
+    """Returns the fault of feature points most of which lie more than ``BESIDE_MM`` beside the face in the photographs;
+    None if they do not. Points that were picked in cropped pictures, or in pictures of another size, agree with each
+    other but not with the face."""
     marks = model.levels["full"].landmarks
     names = [name for name in features if name in marks]
     if not names:

@@ -1,7 +1,7 @@
-"""Feature points (section 4.2): from pixels picked in a few images to points in the world.
+"""Triangulates feature points (section 4.2): from pixels picked in a few images to points in the world.
 
-A picked point may be wrong in one view (right and left confused, a finger slipped). With three views or more the view
-that contradicts the others is found and left out; with two, the point itself is. Whatever is left out is said.
+A picked point may be wrong in one view (right and left confused, a slip). With three views or more, the view that
+contradicts the others is left out; with two, the point is. Everything that is left out is reported.
 """
 
 from collections.abc import Mapping
@@ -55,8 +55,8 @@ def locate_features(features: Features, rig: Rig, *, noise_px: float) -> Located
 
 
 def features_as_wholes(features: Features, rig: Rig, *, noise_px: float) -> Message | None:
-    """Returns the fault that most points share: rows and columns exchanged, or points of other pictures. None if most
-    points agree between their views, or if there are too few to judge."""
+    """Returns the fault that most points have in common: rows and columns exchanged, or points that belong to other
+    pictures. None if most points agree between their views, or if there are too few to judge."""
     grossly = GROSS_NOISE * noise_px
     judged = {name: views for name, views in features.items() if len(views) >= MIN_JUDGED_VIEWS}
     wrong = len(judged) - len(locate_features(judged, rig, noise_px=grossly).points)

@@ -1,14 +1,18 @@
-"""Alignment from feature points (section 4.2): the similarity ``T(x) = s (R x + t')`` that takes the head to the world.
+"""Aligns the head by feature points (section 4.2): the similarity ``T(x) = s (R x + t')`` that takes the head to the
+world.
 
-Enters: picked points, the rig, the model. Leaves: world_from_head, with what each point says against it.
-
+Enters: picked points, the rig, the model. Leaves: world_from_head, and how far each point is from agreeing with it.
 Step 1 is the paper's: full ordinary Procrustes, the minimum of eq. (3), from the mean head's landmarks to the
-triangulated points. Two departures:
-- A gross outlier among the points (right and left confused) must not turn the head. Every triple of points is tried;
-  the alignment that the points contradict least decides which of them stay.
-- Eq. (3) trusts all points alike and takes the subject for the mean head. Step 2 weighs each residual with the
-  covariance of the triangulated point and with the model's own covariance of its landmarks: a wide jaw is expected to
-  vary with the cheeks, not to turn the head. The paper's alignment is ``FeatureAlignment.procrustes``.
+triangulated points. There are two departures.
+
+A gross outlier among the points (right and left confused) must not turn the head. Every triple of points is tried; the
+alignment with which the points agree best decides which of them are kept.
+
+Eq. (3) trusts all points alike and takes the subject for the mean head. Step 2 weights each residual with the
+covariance of the triangulated point and with the model's covariance of its landmarks: a wide jaw is expected together
+with wide cheeks, and must not turn the head.
+
+The paper's alignment is ``FeatureAlignment.procrustes``.
 """
 
 from collections.abc import Mapping
@@ -60,10 +64,10 @@ class TooFewFeatures(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureAlignment:
-    """Holds the pose ``world_from_head``, the paper's ``procrustes`` of the same points, and the points used.
+    """Holds the pose ``world_from_head`` and the points it was found from.
 
-    ``residuals_mm``: distance of every point from the mean head's landmark, outliers too; ``used``: whether the point
-    counted.
+    ``procrustes`` is the paper's alignment to the same points. ``residuals_mm`` is the distance of every point,
+    outliers too, from the mean head's landmark; ``used`` says whether the point counted.
     """
 
     world_from_head: Similarity
@@ -75,7 +79,8 @@ class FeatureAlignment:
 
 
 def align_to_features(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> Similarity:
-    """Returns only the pose world_from_head of ``feature_alignment``. Raises TooFewFeatures or WrongFeatures."""
+    """Aligns the mean head to picked feature points, as ``feature_alignment``, and returns only the pose
+    world_from_head. Raises TooFewFeatures or WrongFeatures."""
     return feature_alignment(model, features, rig, settings).world_from_head
 
 
@@ -101,7 +106,7 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
     target = np.stack([point.position_world for point in points.values()])
     source, spread = landmark_statistics(model, names, settings.landmark_noise_mm)
     noise = np.stack([point.covariance for point in points.values()])
-    expected = np.sqrt((_own_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
+    expected = np.sqrt((_diagonal_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
     kept = consensus(source, target, expected)
     if kept is None:
         raise TooFewFeatures(points, compose("points-on-line"), remarks)
@@ -136,7 +141,7 @@ def _sides_exchanged(
     if float(kept.mean()) >= MIN_AGREED_SIDES or others == names or not all(name in model.landmarks for name in others):
         return False
     source, spread = landmark_statistics(model, others, settings.landmark_noise_mm)
-    expected = np.sqrt((_own_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
+    expected = np.sqrt((_diagonal_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
     found = consensus(source, target, expected)
     return found is not None and float(found.mean()) >= MIN_AGREED_SIDES and bool(found.sum() > kept.sum() + 1)
 
@@ -157,11 +162,11 @@ def landmark_statistics(
 def consensus(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], expected_mm: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"] | None:
-    """Tells which points fit one rigid alignment; returns None if no three of them span a triangle.
+    """Tells which points agree with one rigid alignment; None if no three of them span a triangle.
 
-    The rigid alignment through every three points is tried, and the one with the least truncated sum of squared
-    residuals wins. Kept are points within ``OUTLIER_SIGMAS`` of an alignment of all that agree. 26 points make 2,600
-    triples: 0.3 s.
+    The rigid alignment through every three points is tried, and the one with the smallest truncated sum of squared
+    residuals wins. Kept are points within ``OUTLIER_SIGMAS`` of the alignment of all that agree with it. 26 points make
+    2,600 triples: 0.3 s.
     """
     best, agreed = np.inf, None
     for triple in combinations(range(len(source)), MIN_POINTS):
@@ -194,7 +199,7 @@ def flatness(points: Float[np.ndarray, "n 3"]) -> float:
     return float(np.hypot(singular[1], singular[2]) / np.sqrt(len(points)))
 
 
-def _own_blocks(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "n 3 3"]:
+def _diagonal_blocks(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "n 3 3"]:
     count = len(covariance) // 3
     blocks = covariance.reshape(count, 3, count, 3)
     return blocks[np.arange(count), :, np.arange(count), :]

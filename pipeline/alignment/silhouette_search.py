@@ -1,14 +1,14 @@
-"""Alignment without feature points or a found face, which the paper leaves open (section 6).
+"""Aligns the head without feature points or a found face, which the paper leaves open (section 6).
 
-Enters: silhouettes, the rig, which camera the subject is thought to face. Leaves: world_from_head of the mean head, and
-how far the best other pose is behind.
+Enters: silhouettes, the rig, and the camera that the subject probably faces. Leaves: world_from_head of the mean head,
+and how much worse the best other pose is.
 
-The subject's crown and the middle of its head come from the visual hull. Down is where the body leaves the pictures;
-where it does not, or the views disagree, every quarter turn about the line of sight is tried. Where cameras stand all
-around there is no middle of a fan to be guessed, and every way to face is tried. Nothing leans on the axes of the world
-frame. From each start the contour solver takes pose and a few modes on the coarsest mesh, the best few go on with a
-finer one, and the one that all eigenheads explain most closely wins: under thick hair 15 modes cannot tell the right
-pose from one that is 50 degrees off. A start 10 mm off ends in a local minimum under hair
+The subject's crown and the middle of its head come from the visual hull. Down is where the body leaves the pictures. If
+it does not leave them, or the views disagree, every quarter turn about the line of sight is tried. If cameras stand all
+around, there is no front camera to be guessed, and every direction is tried. The axes of the world frame are not used.
+From each start the contour solver fits pose and a few modes on the coarsest mesh; the best few continue on a finer one,
+and the pose wins that all eigenheads explain most closely: under thick hair, 15 modes cannot distinguish the right pose
+from one that is 50 degrees off. A start that is 10 mm off ends in a local minimum under hair
 (docs/lab-notes/robustness.md), so the robust scale begins at 40 px.
 """
 
@@ -62,8 +62,8 @@ class NoSubject(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class FoundPose:
-    """Holds the pose that the search found. ``rival``: how much more the best pose turned another way costs, as a share
-    of its cost; None if there is no such pose."""
+    """Holds the pose that the search found. ``rival`` says how much more the best pose in another direction costs, as a
+    share of the found pose's cost; None if there is no such pose."""
 
     world_from_head: Similarity
     rival: float | None
@@ -79,8 +79,8 @@ def search_alignment(
     stated: bool = False,
     report: Progress,
 ) -> FoundPose:
-    """Finds the pose of the mean head from the silhouettes alone. ``stated``: the user named the ``front`` camera.
-    Raises NoSubject."""
+    """Finds the pose of the mean head from the silhouettes alone. ``stated`` says that the user named the ``front``
+    camera. Raises NoSubject."""
     starts = list(start_poses(model, silhouettes, rig, front, stated=stated))
     problem = make_problem(model, starts[0], silhouettes, rig, settings.fitting, {}, levels=("p99", "p95"))
     found = []
@@ -116,8 +116,8 @@ def moved_to_hull(
 def start_poses(
     model: HeadModel, silhouettes: Mapping[str, Silhouette], rig: Rig, front: str, *, stated: bool
 ) -> Iterator[Similarity]:
-    """Yields the poses from which the search starts: upright or, if that is unknown, turned by quarters, and facing the
-    front camera or, if no front is known, all directions around."""
+    """Yields the poses from which the search starts: upright, or in quarter turns if up is unknown; facing the front
+    camera, or in all directions if there is none."""
     forward = rig[front].centre_world - rig.centre_world()
     up = body_up(silhouettes, rig)
     pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
@@ -140,8 +140,8 @@ def upright_axes(up_world: Float[np.ndarray, " 3"], forward_world: Float[np.ndar
 
 
 def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray, " 3"] | None:
-    """Returns the direction (world) opposite to where the body leaves the pictures; None if it leaves none of them, or
-    the views disagree."""
+    """Returns the upward direction (world): opposite to where the body leaves the pictures. None if it leaves no
+    picture, or the views disagree."""
     total, weight = np.zeros(3), 0.0
     for camera in rig:
         silhouette = silhouettes.get(camera.name)
@@ -159,7 +159,8 @@ def body_up(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Float[np.ndarray
 
 
 def fan_strength(rig: Rig) -> float:
-    """Returns how one-sided the cameras stand: 1 if all are on one side of the subject, 0 if evenly around."""
+    """Returns how one-sided the cameras stand around the subject: 1 if all see it from the same side, 0 if evenly from
+    all around."""
     directions = np.stack([camera.centre_world for camera in rig]) - rig.centre_world()
     return float(np.linalg.norm((directions / np.linalg.norm(directions, axis=1, keepdims=True)).mean(axis=0)))
 
@@ -218,7 +219,8 @@ def head_origin(
 
 
 def turned(start: Similarity, yaw_deg: float, pitch_deg: float) -> Similarity:
-    """Returns the pose after turns in the head's own frame: the yaw about its upright axis, and the pitch (nodding)."""
+    """Returns the pose after the head is turned in its own frame: by the yaw about its vertical axis, and by the pitch
+    (nodding)."""
     turn = rotation_from_vector(np.radians([0.0, yaw_deg, 0.0])) @ rotation_from_vector(
         np.radians([pitch_deg, 0.0, 0.0])
     )

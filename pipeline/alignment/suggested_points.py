@@ -1,12 +1,12 @@
-"""Named landmarks where a found face has them: a start for who picks feature points (section 4.2).
+"""Suggests feature points from a found face, as a start for a person who picks them (section 4.2).
 
-Enters: a face matched over the views, a head model, and which places of the model the face's points are. Leaves: pixels
-by landmark and camera. The mean head is laid on the face and bent to its points, with what the finder errs in the mean
-taken off; jaw line and forehead, along which points slide, take no part. A view gets a landmark where the finder saw
-the face in it and the head does not hide the landmark.
+Enters: a face matched over the views, a head model, and which points of the model the face's landmarks are. Leaves:
+pixels by landmark and camera. The mean head is laid on the face and deformed to its landmarks, with the face detector's
+mean error subtracted; jaw line and forehead, along which landmarks slide, are left out. A view gets a landmark if the
+face was found in it and the head does not hide the landmark.
 
-As good as the finder is: on two subjects of the simulated studio 1 to 3.5 mm off at eyes and mouth, 5 to 6 at the tip
-of the nose, 1 and 12 (a beard) at the chin. Each is to be looked at.
+The result is as good as the detector. On two subjects of the simulated studio it was 1 to 3.5 mm off at eyes and mouth,
+5 to 6 at the tip of the nose, 1 and 12 (a beard) at the chin. Each point has to be checked.
 """
 
 from collections.abc import Iterable
@@ -35,8 +35,8 @@ Pixels = Float[np.ndarray, " 2"]
 def suggest_points(
     face: MatchedFaces, rig: Rig, model: HeadModel, places: LandmarkMap, names: Iterable[str]
 ) -> dict[str, dict[str, Pixels]]:
-    """Suggests pixels for named landmarks in each camera, from a face in the photographs. Landmarks that the model
-    lacks or that no view shows are left out."""
+    """Suggests pixels for the landmarks ``names`` in each camera, from a face in the photographs. Landmarks that the
+    model lacks or that no view shows are left out."""
     marks = model.levels["full"].landmarks
     rows = {name: marks[name] for name in names if name in marks}
     positions, world_from_head = locate_landmarks(face, model, places, list(rows.values()))
@@ -54,7 +54,7 @@ def suggest_points(
 def locate_landmarks(
     face: MatchedFaces, model: HeadModel, places: LandmarkMap, rows: list[int]
 ) -> tuple[Float[np.ndarray, "n 3"], Similarity]:
-    """Returns the positions (world) of the mean head's vertices ``rows`` after it is bent to a face, and the pose
+    """Deforms the mean head to a face. Returns the positions (world, mm) of its vertices ``rows``, and the pose
     world_from_head of the mean head."""
     firm = ~places.slides
     mean = model.vertices(np.zeros(0))

@@ -44,10 +44,11 @@ def cached_arrays(
     """Returns the arrays that ``make()`` computes, from a cache file if an earlier process stored them.
 
     Args:
-        name: what the arrays are, for the file's name.
-        inputs: all that ``make`` starts from: arrays, and values whose ``repr`` says what they are.
-        make: makes the arrays, of numbers or booleans.
-        made_by: functions and classes of the other modules whose sources decide what comes out.
+        name: what the arrays are; the file's name begins with it.
+        inputs: everything that ``make`` starts from: arrays, and values whose ``repr`` identifies them.
+        make: computes the arrays, of numbers or booleans, by name.
+        made_by: functions and classes of other modules on which the result depends; when their source changes, the
+            arrays are computed again.
 
     Returns:
         The arrays by name, in C order and read-only.

@@ -65,14 +65,14 @@ _choose_processor()
 
 
 def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compiles as ``numba.njit`` does, and keeps what it compiles in ``cache_folder()``.
+    """Compiles a function as ``numba.njit`` does, and keeps the machine code in ``cache_folder()`` for later processes.
 
     Args:
         cache: whether to keep it.
-        allocates: whether the function, or one that it calls, makes arrays. One that makes none does without counts of
-            references: otherwise every further name of an array, a row or a field too, costs an atomic instruction,
-            which was most of the dense stage's sweep, and which cores wait for each other at.
-        options: of ``numba.njit``.
+        allocates: whether the function, or one that it calls, creates arrays. If False, Numba's reference counting is
+            left out. With it every new name of an array, a row or a field costs an atomic instruction, for which cores
+            wait on each other: most of the time of the dense stage's sweep.
+        options: passed on to ``numba.njit``.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
@@ -88,7 +88,8 @@ def njit(*, cache: bool = True, allocates: bool = True, **options: Any) -> Calla
 
 
 class KeptFunction:
-    """Stores and finds the compiled forms of one function on disk, as the cache that Numba asks."""
+    """Stores and finds the machine code of one function on disk. It takes the place of Numba's own cache object, whose
+    methods it has."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
@@ -96,6 +97,7 @@ class KeptFunction:
 
     @property
     def cache_path(self) -> str:
+        """Returns the folder that new files are written to."""
         return str(cache_folder() / "kernels")
 
     def file(self, signature: Any) -> Path:
@@ -149,7 +151,7 @@ def _warned() -> set[str]:
 
 
 def say_not_kept(error: OSError) -> None:
-    """Logs, once for each process, that the cache folder cannot be written."""
+    """Logs, once for each process, that the cache folder cannot be written and why."""
     folder = str(cache_folder())
     if folder not in _warned():
         _warned().add(folder)
@@ -163,8 +165,8 @@ def say_not_kept(error: OSError) -> None:
 
 @cache
 def machine() -> str:
-    """Returns what a compiled function depends on besides its source: versions, options and the processor's
-    features."""
+    """Returns a text of what machine code depends on besides its source: versions of Python, Numba and LLVM, compiler
+    options, and the processor's features."""
     options: Any = config
     target: Any = cpu_target.target_context
     versions = (numba.__version__, llvmlite.__version__, sys.implementation.cache_tag)

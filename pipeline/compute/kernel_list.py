@@ -32,13 +32,14 @@ _NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """Holds one compiled loop for one set of argument types."""
+    """Holds one compiled function together with the types of its arguments."""
 
     place: str  # "contour_fit.rim_kernels:see", relative to this package
     arguments: tuple[str, ...]
 
     @classmethod
     def from_line(cls, line: str) -> "Kernel":
+        """Reads a kernel from a line of the list: its module and name, then its argument types, separated by spaces."""
         place, *arguments = line.split()
         return cls(place, tuple(arguments))
 
@@ -49,6 +50,7 @@ class Kernel:
 
     @property
     def module(self) -> str:
+        """Returns the dotted name of the kernel's module within the package ``pipeline``."""
         return self.place.partition(":")[0]
 
     def dispatcher(self) -> Dispatcher | None:
@@ -58,17 +60,19 @@ class Kernel:
         return function if isinstance(function, Dispatcher) else None
 
     def signature(self) -> tuple[types.Type, ...]:
+        """Returns the argument types as Numba's type objects. Raises ValueError for a notation that is not known."""
         return tuple(type_from_text(text) for text in self.arguments)
 
     def is_kept(self) -> bool:
-        """Tells whether the compiled loop is in the wheel or in the cache folder; True if loops are not compiled."""
+        """Tells whether the kernel's machine code is in the wheel or in the cache folder. Returns True if loops are not
+        compiled at all (NUMBA_DISABLE_JIT)."""
         dispatcher = self.dispatcher()
         kept = None if dispatcher is None else getattr(dispatcher, "_cache", None)
         return not isinstance(kept, KeptFunction) or kept.is_kept(self.signature())
 
     def size(self) -> int:
-        """Returns the size (bytes of the interpreter's code) of the loop and all that it calls, so that the longest is
-        compiled first."""
+        """Returns the size in bytes of the Python byte code of the kernel and of all that it calls. Kernels are
+        compiled in the order of this size, the largest first; 0 if loops are not compiled."""
         dispatcher = self.dispatcher()
         return 0 if dispatcher is None else code_size(dispatcher)
 
@@ -80,14 +84,14 @@ class Kernel:
 
 
 def listed_kernels(*, dense: bool = True) -> list[Kernel]:
-    """Returns all kernels of the list; without ``dense``, not those that only the dense stage calls."""
+    """Returns all kernels of the list; with ``dense`` False, without those that only the dense stage calls."""
     plain, _, added = LIST.read_text(encoding="utf-8").partition("\n\n")
     return [Kernel.from_line(line) for line in (*plain.splitlines(), *(added.splitlines() if dense else ()))]
 
 
 def by_module(kernels: Iterable[Kernel]) -> Iterator[list[Kernel]]:
-    """Yields the kernels of each module together: they call the same inner loops, which two processes would both
-    compile."""
+    """Yields lists of kernels, one for each module. Kernels of a module call the same inner loops, which two processes
+    would otherwise both compile."""
     groups: dict[str, list[Kernel]] = {}
     for kernel in kernels:
         groups.setdefault(kernel.module, []).append(kernel)

@@ -35,14 +35,14 @@ def thread_count() -> int:
 
 
 def slice_count(threads: int) -> int:
-    """Returns the number of slices that a loop is cut into, at most: a power of two, so that more threads only
-    subdivide the same slices."""
+    """Returns the greatest number of slices that a loop is cut into for this number of threads. It is a power of two,
+    so that more threads only subdivide the same slices."""
     return max(SLICES, 1 << (2 * threads - 1).bit_length())
 
 
 def in_threads(count: int, work: Callable[[int, int], None]) -> None:
-    """Runs ``work(first, last)`` over slices of ``range(count)`` in several threads; for compiled loops that release
-    the interpreter.
+    """Runs ``work(first, last)`` over slices of ``range(count)`` in several threads. Meant for compiled loops, which
+    release Python's interpreter lock.
 
     The result may not depend on how the range is cut. The calling thread takes slices too. A helper thread that has not
     begun when no slices are left is cancelled, so that nobody waits for it.
@@ -73,7 +73,8 @@ def map_in_threads(work: Callable[[int], Result], count: int) -> list[Result]:
 
 
 def cut(count: int, parts: int) -> list[tuple[int, int]]:
-    """Returns ``range(count)`` cut into at most ``parts`` slices, none empty unless the range is."""
+    """Cuts ``range(count)`` into at most ``parts`` slices of nearly equal length. Returns the first index and the index
+    after the last one of each; no slice is empty unless ``count`` is 0."""
     parts = max(1, min(parts, count))
     return list(pairwise(count * k // parts for k in range(parts + 1)))
 
@@ -119,8 +120,8 @@ def _traced(
 
 @contextmanager
 def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
-    """Yields a pool of ``threads`` threads, by default as many as share a loop; a trace records its tasks as slices of
-    one loop."""
+    """Yields a pool of ``threads`` threads; None means as many as share a loop. An active trace records the tasks as
+    slices of one loop."""
     threads, trace = threads or thread_count(), active_trace()
     if trace is None:
         with ThreadPoolExecutor(threads) as pool:
@@ -132,19 +133,20 @@ def task_pool(threads: int | None = None) -> Iterator[ThreadPoolExecutor]:
 
 
 def background_thread(name: str) -> ThreadPoolExecutor:
-    """Returns a pool of one thread, for what runs beside the caller's own work whose loops share the threads."""
+    """Returns a pool of one thread, for work that runs beside the caller's. Compiled loops of either still share the
+    common threads."""
     return ThreadPoolExecutor(1, thread_name_prefix=name)
 
 
 class TracedPool(ThreadPoolExecutor):
-    """Records each task as a slice of one loop."""
+    """Runs tasks in threads and records each of them in a trace, as a slice of one loop."""
 
     def __init__(self, threads: int, trace: Trace, loop: int) -> None:
         super().__init__(threads, thread_name_prefix="tasks")
         self._trace, self._loop = trace, loop
 
     def submit(self, function: Callable[..., Result], /, *arguments: Any, **options: Any) -> Future[Result]:
-        """Submits a task that is recorded in a span."""
+        """Submits a task and records its run as a span of the trace."""
 
         def timed() -> Result:
             with self._trace.span("slice", name_of(function), loop=self._loop):

@@ -8,12 +8,15 @@ on a busy machine only the latter say what work there was.
 
 import functools
 import json
+import math
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import count
+from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar
 
 FORMAT = "eigenhead-trace/1"
@@ -24,7 +27,8 @@ T = TypeVar("T")
 
 
 class Trace:
-    """Collects the spans of all threads of this process, from its creation on."""
+    """Collects spans of all threads of this process, from its creation on. A span is a named piece of work of one
+    thread with its start and duration."""
 
     def __init__(self) -> None:
         self._began = time.perf_counter_ns()
@@ -39,8 +43,11 @@ class Trace:
 
     @contextmanager
     def span(self, kind: Kind, name: str, **arguments: object) -> Iterator[None]:
-        """Records the block as one span of the calling thread, with that thread's processor seconds as ``cpu_s`` and,
-        but for loops and slices, those of all threads as ``process_cpu_s``. A block that raises is recorded, too."""
+        """Records the block as one span of the calling thread, also if it raises.
+
+        ``cpu_s`` of the span are the processor seconds of that thread. Except for loops and slices, ``process_cpu_s``
+        are those of all threads during the span.
+        """
         whole = kind not in ("loop", "slice")
         before_s, process_s = time.thread_time(), time.process_time() if whole else 0.0
         began = time.perf_counter_ns()
@@ -68,6 +75,7 @@ class Trace:
             "threads": threads,
             "cpus": len(os.sched_getaffinity(0)),
             "before_cpu_s": self._before_s,
+            "peak_memory_mb": peak_memory_mb(),
         }
         names: list[dict[str, Any]] = [
             {"ph": "M", "name": "thread_name", "pid": os.getpid(), "tid": thread, "args": {"name": name}}
@@ -76,6 +84,18 @@ class Trace:
         events = names + sorted(self._events, key=lambda event: (event["ts"], -event["dur"]))
         lines = ",\n".join(json.dumps(event) for event in events)
         return f'{json.dumps(header)[:-1]}, "traceEvents": [\n{lines}\n]}}\n'.encode()
+
+
+def peak_memory_mb() -> float:
+    """Returns the most memory (MiB) that this process has held since its program was loaded; NaN where the system does
+    not say.
+
+    ``getrusage`` gives more: its maximum outlives ``exec``, so that a child of a large process begins with the parent's
+    (proc(5), ``VmHWM``).
+    """
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.is_file() else None
+    return int(found[1]) / 1024 if found else math.nan
 
 
 _active: Trace | None = None
@@ -108,7 +128,7 @@ def span(kind: Kind, name: str) -> AbstractContextManager[None]:
 
 
 def traced(function: Callable[P, T]) -> Callable[P, T]:
-    """Makes the decorated function record each call as a span, if a trace is active."""
+    """Decorates a function so that each of its calls is recorded as a span, if a trace is active."""
 
     @functools.wraps(function)
     def timed(*arguments: P.args, **options: P.kwargs) -> T:

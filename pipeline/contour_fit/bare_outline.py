@@ -1,8 +1,8 @@
-"""Which stretches of a silhouette are a bare skull's: the head, and no hair around it.
+"""Finds the stretches of a silhouette's outline that are the hairless head itself.
 
-An outline that a population's skulls do not explain is taken for hair (``noise_model.is_hairless``), though a skull may
-just lie outside the population. What the pixels show decides: along a bare skull skin reaches up to the outline, and
-the outline is smooth. Hair that is as light as skin fails the second test, for strands and tufts stand out of it.
+An outline that a population's heads do not explain is taken for hair (``noise_model.is_hairless``), though a head may
+just lie outside the population. The pixels decide: along a hairless head skin reaches up to the outline, and the
+outline is smooth. Hair as light as skin fails the second test, for strands and tufts stand out of it.
 """
 
 from collections.abc import Mapping
@@ -30,14 +30,15 @@ MISSED_PX = 1.0  # a crown whose outline is farther off is fitted once more
 
 
 def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Float32[np.ndarray, "h w"]]) -> ContourSolution:
-    """Fits the head once more, with the outline of a bare skull counted as the crown's.
+    """Fits the head once more if its crown turns out to be hairless, with the outline of the crown counted in full.
 
     Args:
-        solved: the contours' solution.
-        skin: how probably each pixel shows skin, by camera.
+        solved: the solution of the contour solver.
+        skin: for each camera, the probability that a pixel shows skin.
 
     Returns:
-        The solution with that outline; ``solved`` if the whole head's outline counts already or the crown is not bare.
+        The new solution; ``solved`` if the outline of the whole head counts already or the crown is not bare. Where the
+        crown already fits its outline within ``MISSED_PX``, only the marks of the bare outline are added.
     """
     if solved.stage.whole_head or not skin:
         return solved
@@ -62,7 +63,7 @@ def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Float32[np.nda
 def find_bare(
     problem: ContourProblem, state: State, skin: Mapping[str, Float32[np.ndarray, "h w"]]
 ) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Marks, in every view, the cells of ``CELL_PX`` pixels next to an outline that is a bare skull's."""
+    """Marks, in every view, the square cells (``CELL_PX`` pixels wide) near an outline that is a hairless head's."""
     views, maps = problem.views, []
     for k, camera in enumerate(problem.rig):
         (width, height), first = views.size[k], views.offset[k]
@@ -78,12 +79,13 @@ def find_bare(
 def bare_cells(
     distance: Float32[np.ndarray, "h w"], skin: Float32[np.ndarray, "h w"], px_per_mm: float
 ) -> Bool[np.ndarray, "_ _"]:
-    """Marks the cells within ``REACH_MM`` of an outline that is smooth and skin up to its edge.
+    """Marks the square cells (``CELL_PX`` pixels wide) within ``REACH_MM`` of a hairless head's outline in one view: of
+    an outline that is smooth, with skin up to it.
 
     Args:
-        distance: signed, to the outline (px), negative inside.
-        skin: probability that a pixel shows it.
-        px_per_mm: at the head.
+        distance: signed distance to the outline (px), negative inside.
+        skin: probability that a pixel shows skin.
+        px_per_mm: pixels for each millimetre at the head.
     """
     height, width = distance.shape
     cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), bool)
@@ -108,8 +110,12 @@ def bare_cells(
 def roughness(
     distance: Float32[np.ndarray, "h w"], smooth: Float[np.ndarray, "n 2"], px_per_mm: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns how far (px, RMS) an outline strays from a ``smooth`` curve along it, less what bends the curve off it:
-    signed distances along it have no steps of pixels."""
+    """Returns the roughness (px, RMS) of an outline at each point of the ``smooth`` curve along it: how far the outline
+    strays from the curve within some millimetres, without their mean offset.
+
+    ``distance`` is the signed distance (px) to the outline. Read along the curve it has none of the steps that an
+    outline of whole pixels has.
+    """
     column, row = np.split(smooth.T.astype(np.float32), 2)
     off = cv2.remap(distance, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(float)
     return np.sqrt(np.maximum(_pooled(off**2, px_per_mm) - _pooled(off, px_per_mm) ** 2, 0.0))

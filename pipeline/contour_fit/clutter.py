@@ -1,4 +1,5 @@
-"""Hair, shoulders and clothes only ever add area to a silhouette: which stretches of a rim do not count for that."""
+"""Decides which stretches of a rim do not count because hair, shoulders or clothes may lie there: clutter only ever
+adds area to a silhouette."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +17,7 @@ CELL_PX, CLUTTER_CELLS = 4, 3  # clutter reaches 12 px beyond where it was found
 
 
 def downweight_outside_contour(problem: ContourProblem, evidence: StageEvidence, rim: Rim, level: str) -> Rim:
-    """Returns the rim with less weight outside the face: on cranium, ears and neck a sample counts only where the model
+    """Reduces the weight of the rim outside the face. On cranium, ears and neck a sample counts only where the model
     sticks out of the silhouette, and then with ``OUTSIDE_SHARE`` of its weight."""
     face = face_of(problem, evidence, level)[rim.corner].all(axis=1)
     share = np.where(rim.residual > 0, OUTSIDE_SHARE, 0.0)
@@ -24,15 +25,15 @@ def downweight_outside_contour(problem: ContourProblem, evidence: StageEvidence,
 
 
 def face_of(problem: ContourProblem, evidence: StageEvidence, level: str) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices of a level lie in the face region and not under hair."""
+    """Tells which vertices of a mesh level lie in the face region and not under hair."""
     region = problem.model.levels[level].face_region
     hair = {} if evidence.photographs is None else evidence.photographs.hair
     return region & ~hair[level] if level in hair else region
 
 
 def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tuple[Bool[np.ndarray, "_ _"], ...]:
-    """Marks, in every view, the cells of ``CELL_PX`` pixels where the silhouette reaches farther than ``threshold_px``
-    beyond the model, and the cells around them."""
+    """Marks clutter in every view, as square cells (``CELL_PX`` pixels wide): where the silhouette reaches more than
+    ``threshold_px`` beyond the model, and ``CLUTTER_CELLS`` cells around."""
     maps = []
     for k, (width, height) in enumerate(problem.views.size):
         cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), np.uint8)
@@ -44,7 +45,7 @@ def find_clutter(problem: ContourProblem, rim: Rim, threshold_px: float) -> tupl
 
 
 def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
-    """Returns the rim with zero weight for the samples in cells marked as clutter."""
+    """Returns the rim with zero weight for the samples in cells that ``evidence`` marks as clutter."""
     if evidence.noise.clutter is None:
         return rim
     return replace(rim, length=np.where(within(evidence.noise.clutter, rim), 0.0, rim.length))
@@ -53,8 +54,8 @@ def without_clutter(evidence: StageEvidence, rim: Rim) -> Rim:
 def with_bare_crown(
     problem: ContourProblem, evidence: StageEvidence, rim: Rim, length: Float[np.ndarray, " s"], level: str
 ) -> Rim:
-    """Returns the rim with its full ``length`` where the crown, all that lies above the brows, is by the outline of a
-    bare skull."""
+    """Restores the weight of a hairless crown: samples above the brows that lie in cells marked as bare get back their
+    full ``length``, the rest of the rim stays as it is."""
     if evidence.noise.bare is None:
         return rim
     bare = is_crown(problem, rim, level) & within(evidence.noise.bare, rim)
@@ -62,14 +63,14 @@ def with_bare_crown(
 
 
 def is_crown(problem: ContourProblem, rim: Rim, level: str) -> Bool[np.ndarray, " s"]:
-    """Tells which samples of a level's rim lie above the brows."""
+    """Tells which rim samples lie on the crown, here all of the head above the brows."""
     mean = problem.model.vertices(np.zeros(0), level)
     brows = problem.model.vertices(np.zeros(0))[problem.model.landmarks["glabella"], 1]
     return (mean[:, 1] > brows)[rim.corner].all(axis=1)
 
 
 def within(cells: Sequence[Bool[np.ndarray, "_ _"]], rim: Rim) -> Bool[np.ndarray, " s"]:
-    """Tells which samples lie in marked cells of their view."""
+    """Tells which rim samples lie in the marked cells of their view. ``cells`` has one map for each view."""
     row, column = (rim.pixel / CELL_PX).astype(int).T[::-1]
     found = np.zeros(len(rim.view), bool)
     for k, marked in enumerate(cells):

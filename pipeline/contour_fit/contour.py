@@ -44,7 +44,10 @@ NON_MONOTONE = 4  # costs that a step may climb back to
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourSolution:
-    """Holds a problem of the contour solver and its solution, from which later stages continue."""
+    """Holds a problem of the contour solver and its solution, from which later stages continue.
+
+    ``evaluations`` counts evaluations of the cost. ``misfit_mm`` is handed on to ``Fit``.
+    """
 
     problem: ContourProblem
     evidence: StageEvidence
@@ -65,9 +68,11 @@ def fit_contour(
     features: Mapping[str, Mapping[str, np.ndarray]] | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> Fit:
-    """Fits shape, pose and cameras to the usable silhouettes, from a start pose.
+    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes, from a start
+    pose.
 
-    All modes of ``model`` are used: the first ``settings.modes`` first, the rest once those have settled.
+    ``features`` are feature points in pixels, by camera and landmark name. All modes of ``model`` are fitted: the first
+    ``settings.modes`` first, and the rest once those have converged. Raises ValueError if no silhouette is usable.
     """
     return finish(solve_contour(model, world_from_head, silhouettes, rig, settings, features=features, report=report))
 
@@ -84,7 +89,8 @@ def solve_contour(
     landmarks: LandmarkObservations | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> ContourSolution:
-    """Solves the problem of ``fit_contour`` and returns the solution without computing its covariance."""
+    """Solves the problem of ``fit_contour`` and returns its solution without the covariance, which takes longer.
+    ``landmarks`` are triangulated landmarks of the face, if there are any."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)
@@ -110,9 +116,14 @@ def solve_contour(
 
 
 def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
-    """Returns the stages of the fit in order: pose and a few modes on a decimated mesh; all eigenheads, from the face's
-    rim; the same from the whole head's rim, kept only if the head is bare; the further modes, if the model has any; the
-    full mesh."""
+    """Returns the stages of the fit, from coarse to fine, for a model of ``modes`` modes:
+
+    - pose and a few modes on a decimated mesh;
+    - all eigenheads, with the face's rim;
+    - the same with the whole head's rim, whose result is kept only if the head is hairless;
+    - the further modes, if the model has any;
+    - all modes on the full mesh.
+    """
     few, span = min(settings.modes_first, modes), min(settings.modes, modes)
     last = settings.robust_px
     wider = [Stage("p95", modes, True, (2.0 * last, last), False, True, 4)] if modes > span else []
@@ -128,11 +139,11 @@ def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
 def run_stage(
     problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, report: Callable[[float], None]
 ) -> tuple[State, int, str]:
-    """Runs Levenberg-Marquardt through the robust scales of one stage. Returns the state, the number of evaluations and
-    the reason why it stopped.
+    """Runs Levenberg-Marquardt at each robust scale of one stage in turn. Returns the state, the number of evaluations
+    and the reason why the last search stopped.
 
-    The set of rim samples changes with the state, which makes the cost slightly uneven: strict descent was seen to stop
-    at ridges 0.3 mm from the minimum, so that a step may climb back a little.
+    The set of rim samples changes with the state, which makes the cost slightly uneven. If every step had to lower it,
+    the search stopped at ridges 0.3 mm from the minimum; so a step may raise the cost a little.
     """
     few = state.coefficients[: stage.modes]
     state = replace(state, coefficients=np.concatenate([few, np.zeros(stage.modes - len(few))]))
@@ -149,17 +160,20 @@ def run_stage(
 
 
 def coarsened(evidence: StageEvidence, scale_px: float) -> StageEvidence:
-    """Returns the evidence with its noise unit raised to at least ``coarse_unit``, for steps whose robust scale is
-    still coarse."""
+    """Returns the evidence with its noise unit raised to at least ``coarse_unit(scale_px)``, for steps with a coarse
+    robust scale."""
     noise = evidence.noise
     unit = max(noise.unit, coarse_unit(scale_px))
     return replace(evidence, noise=replace(noise, unit=unit))
 
 
 def coarse_unit(scale_px: float) -> float:
-    """Returns the noise unit l sigma^2 (px^3) for a coarse robust scale, with half the scale as sigma, so that the
-    prior holds the shape. Without it hair over both ears pulled the first 15 modes to 8 standard deviations, and a head
-    5 mm."""
+    """Returns the noise unit l sigma^2 (px^3) to use at a coarse robust scale: l is a fixed correlation length, sigma
+    half the scale.
+
+    With so much noise the prior holds the shape. Without it, hair over both ears moved the head by 5 mm and the first
+    15 modes to 8 standard deviations.
+    """
     return FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2
 
 
@@ -171,7 +185,8 @@ def normal_equations(solved: ContourSolution) -> NormalEquations:
 
 
 def finish(solved: ContourSolution) -> Fit:
-    """Returns the fit with its Laplace covariance: the inverse of the last normal matrix, cameras marginalised."""
+    """Returns the fit with its Laplace covariance: the inverse of the last normal matrix, of which the rows and columns
+    of shape and pose are kept. The uncertainty of the cameras is thereby included."""
     problem, state, stage = solved.problem, solved.state, solved.stage
     kept = stage.modes + POSE
     equations = normal_equations(solved)

@@ -1,10 +1,10 @@
-"""Which part of a face is its expression, and which its shape: the evidence of all that is left of a fit.
+"""Separates what of a face is expression from what is shape, once everything else has been fitted.
 
-A basis of smooth deformations follows a smile as willingly as the shape that makes one. How far a head needs it is
-seen where it is seen: the variance of each group of modes (eigenheads, kernel, fine kernel) is estimated from the very
-fit (MacKay 1992, as in ``posterior``), and where a head hardly strays from its population, a smile is worth a smile.
-Weights keep their prior and their bounds. The problem is the last one's quadratic: nothing is looked at again, and the
-surface hardly moves. A neutral head is left as it is.
+Smooth deformations can follow a smile as well as the shape of a smiling face. Which it is depends on how much this head
+needs them elsewhere. The prior variance of each group of modes (eigenheads, kernel, fine kernel) is therefore estimated
+from the fit itself (MacKay 1992, as in ``posterior``). Where a head hardly deviates from its population, the modes
+become stiff, and the expression has to explain the smile. Expression weights keep their prior and their bounds. The
+images are not read again: the problem is the quadratic one of the last stage, and the surface hardly moves.
 """
 
 from dataclasses import replace
@@ -24,12 +24,12 @@ VARIANCE_RANGE = (0.02, 4.0)
 
 
 def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> ContourSolution:
-    """Returns the solution re-estimated with a prior variance for each group of modes; a neutral face is returned
-    unchanged.
+    """Solves once more for shape and expression, with a prior variance for each group of modes that is estimated from
+    the fit. A neutral face is returned unchanged.
 
     Args:
-        solved: with all modes; its model's ``posed`` says which are expressions.
-        eigenheads: how many of the modes are a population's.
+        solved: a solution for all modes; ``posed`` of its model says which modes are expressions.
+        eigenheads: how many of the modes, the first ones, are eigenheads.
     """
     posed, state = solved.problem.model.posed, solved.state
     if not makes_face(state.coefficients, posed):
@@ -59,8 +59,8 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
 
 
 def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
-    """Tells whether the expression weights among the coefficients sum to at least ``NEUTRAL``, so that the face is not
-    neutral."""
+    """Tells whether the face has an expression: whether the expression weights, ``coefficients[posed]``, sum to at
+    least ``NEUTRAL``."""
     return len(posed) > 0 and bool(coefficients[posed.start : posed.stop].sum() >= NEUTRAL)
 
 

@@ -19,14 +19,16 @@ FEATURE_SCALE = 4.0  # Geman-McClure scale of a feature point, in its standard d
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureTerm:
-    """Computes the cost of feature points as a function of coefficients, pose and, in stages that solve for them,
-    cameras."""
+    """Computes the cost of the feature points as a function of shape, pose and, in stages that solve for them, camera
+    corrections."""
 
     problem: ContourProblem
     observed: Observed
     stage: Stage
 
     def at(self, state: State) -> Residuals:
+        """Returns the offsets of all projected landmarks from their feature points, in standard deviations of a feature
+        point, with Geman and McClure's loss."""
         observed, views = self.observed, moved_views(self.problem, state)
         moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
         points = state.world_from_head.apply(observed.mean + moved)

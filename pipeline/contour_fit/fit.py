@@ -11,10 +11,11 @@ from rig.geometry import Similarity
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Holds a head fitted to the silhouettes.
+    """Holds a head model fitted to the silhouettes.
 
-    ``coefficients`` are in standard deviations, z ~ N(0, 1). ``covariance`` is over (coefficients, rotation (rad, left
-    perturbation about the head's place in the world), translation (mm), log scale); None where a solver has none.
+    ``coefficients`` are in standard deviations of the model's modes. ``covariance`` is over coefficients, rotation
+    (rad, applied on the left about the head's origin), translation (mm) and log scale, in this order; None if the
+    solver computes none.
     """
 
     method: str

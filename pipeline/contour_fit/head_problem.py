@@ -20,8 +20,9 @@ def head_problem(
     scale_px: float,
     reference_px: float | None = None,
 ) -> Problem[State]:
-    """Builds the problem of one stage: all its terms over coefficients, pose and, in stages that solve for them,
-    cameras. ``reference_px`` is the outline length that ``RimTerm`` scales its cost to."""
+    """Builds the least-squares problem of one stage: all its terms as functions of shape, pose and, in stages that
+    solve for them, cameras. ``scale_px`` is the robust scale of the contours, ``reference_px`` the outline length to
+    which ``RimTerm`` scales its cost."""
     cameras = PER_CAMERA * len(problem.views.names) if stage.cameras else 0
     rim = RimTerm(problem, evidence, stage, scale_px, reference_px)
     terms: tuple[Term[State], ...] = (rim, *_other_terms(problem, evidence, stage))
@@ -36,8 +37,8 @@ def head_problem(
 
 
 def weight_bounds(state: State, posed: range, unknowns: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Returns the least and the largest step of every unknown that keep the expression weights between 0 and 1; other
-    unknowns are unbounded."""
+    """Returns the smallest and the largest step of every unknown that keep the expression weights between 0 and 1. All
+    other unknowns are unbounded."""
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]
     weights = np.clip(weights, 0.0, 1.0)
@@ -49,7 +50,7 @@ def started_problem(
     problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, start: State
 ) -> tuple[Problem[State], Linearised]:
     """Returns the problem with its cost scaled to the outline length at ``start``, and its linearisation there. The rim
-    at ``start`` is found only once."""
+    at ``start`` is searched only once for both."""
     seen = RimTerm(problem, evidence, stage, scale_px).at(start)
     whole = head_problem(problem, evidence, stage, scale_px, float(seen.rim.length.sum()))
     rim, *others = whole.terms
@@ -69,7 +70,7 @@ def _other_terms(problem: ContourProblem, evidence: StageEvidence, stage: Stage)
 
 
 def apply_step(state: State, step: Float[np.ndarray, " p"], stage: Stage) -> State:
-    """Returns the state after adding a step, which holds the unknowns of the stage in order: coefficients, pose,
+    """Returns the state after a step. The step holds the stage's unknowns in this order: coefficients, pose,
     cameras."""
     m = stage.modes
     pose = state.world_from_head

@@ -34,11 +34,12 @@ def observe_landmarks(
     """Packs triangulated landmarks for the solver, with the model's mean and modes at each.
 
     Args:
-        model: with the modes of the fit.
-        corner: vertices of the full level about each place.
+        model: the head model with all modes of the fit.
+        corner: the three vertices of the full level around each landmark.
         blend: their weights, which sum to 1.
-        position_world: where the place was found, mm.
-        covariance_world: of all coordinates of the difference, x y z of the first place, then of the second, mm^2.
+        position_world: each landmark's triangulated position, mm.
+        covariance_world: covariance (mm^2) of the difference between head and observation, over all coordinates: x, y,
+            z of the first landmark, then of the second, and so on.
     """
     whiten = np.linalg.inv(np.linalg.cholesky(covariance_world))
     mean, basis = blended_basis(model, corner, blend)
@@ -47,14 +48,17 @@ def observe_landmarks(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkTerm:
-    """Computes the cost of the face's landmarks as a function of coefficients and pose. The cameras are unknowns of the
-    problem too, but the cost does not depend on them."""
+    """Computes the cost of the face's triangulated landmarks as a function of shape and pose. It does not depend on the
+    ``cameras``, whose number it needs only to leave zeros for them."""
 
     observed: LandmarkObservations
     stage: Stage
     cameras: int  # in the problem
 
     def at(self, state: State) -> Residuals:
+        """Returns the differences between the head's landmarks and the triangulated ones as a single residual of many
+        components, in standard deviations, with Geman and McClure's loss. The landmarks thus lose their weight
+        together."""
         points = landmark_points(self.observed, state)
         residual = self.observed.whiten @ (points - self.observed.position_world).ravel()
         loss = GemanMcClure(FORGIVEN_SIGMAS * np.sqrt(len(residual)))
@@ -73,6 +77,6 @@ class LandmarkTerm:
 
 
 def landmark_points(observed: LandmarkObservations, state: State) -> Float[np.ndarray, "n 3"]:
-    """Returns the positions (world, mm) of the landmarks on the head of a state."""
+    """Returns the positions (world, mm) of the landmarks on the head that ``state`` describes."""
     moved = np.einsum("m,mnc->nc", state.coefficients, observed.basis[: len(state.coefficients)])
     return state.world_from_head.apply(observed.mean + moved)

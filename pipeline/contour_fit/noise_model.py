@@ -19,11 +19,11 @@ UNIT_RANGE = (1.0, 40.0)  # px^3: noise of 0.5 px over 4 px; misfit of 2 px over
 
 
 def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> StageEvidence:
-    """Returns the evidence updated from the residuals of a stage: the noise unit, the robust floor and, the first time,
-    where clutter is.
+    """Returns the evidence updated from the residuals of a stage: the noise unit, the lower limit of the robust scale
+    and, the first time, the clutter.
 
-    Clutter is found while the eigenheads alone still hold the shape: a wider basis would rather bulge into the hair
-    than pay for it as an outlier, since every px of outline pays alone.
+    Clutter is searched while the eigenheads alone hold the shape. A wider basis would rather bulge into the hair than
+    treat it as outliers.
     """
     rim = observed_rim(problem, evidence, state, stage)
     near = rim.residual[(np.abs(rim.residual) < 10.0) & (rim.length > 0)]
@@ -40,10 +40,11 @@ def with_misfit(problem: ContourProblem, evidence: StageEvidence, state: State, 
 def with_clutter_of_start(
     problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage
 ) -> StageEvidence:
-    """Returns the evidence with clutter marked at the start: everything that reaches more than ``START_CLUTTER_MM``
-    beyond the mean head placed by landmarks.
+    """Returns the evidence with clutter marked before the first fit: wherever the silhouette reaches more than
+    ``START_CLUTTER_MM`` beyond the mean head at the start pose.
 
-    Long hair before a face is wider than any face, and pulls the first modes to it before residuals could tell.
+    Long hair in front of a face is wider than any face. The first modes would be drawn to it before residuals could
+    show that it is hair.
     """
     rim = observed_rim(problem, evidence, state, stage)
     depths = [camera.camera_from_world.apply(state.world_from_head.translation)[2] for camera in problem.rig]
@@ -53,10 +54,11 @@ def with_clutter_of_start(
 
 
 def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float | None:
-    """Estimates the noise unit l sigma^2 (px^3) from the contours' residuals, misfit of the model included. Returns
-    None if the settings state both noise and correlation length.
+    """Estimates the noise unit l sigma^2 (px^3) of contours from their residuals, which include the model's misfit.
+    Returns None if the settings state both noise and correlation length.
 
-    Means over blocks of B px of outline have the variance l sigma^2 / B where B is well above l, whatever l is.
+    The mean residual over a block of B px of outline has the variance l sigma^2 / B if B is well above the correlation
+    length l. So l itself need not be known. Residuals of ``most_px`` and more are left out.
     """
     stated = problem.settings
     if stated.contour_noise_px is not None and stated.contour_correlation_px is not None:
@@ -78,9 +80,11 @@ def estimated_unit(problem: ContourProblem, rim: Rim, most_px: float) -> float |
 
 
 def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage, from_face: State) -> bool:
-    """Tells whether the fit ``state`` to the whole head explains the outline of cranium and ears, and fits the face
-    about as well as ``from_face``, the fit to the face alone. An outline of hair seldom fits a head; where it does, the
-    fitted face is wrong."""
+    """Tells whether the outline of cranium and ears is that of the head itself rather than of hair.
+
+    It is if ``state``, the fit to the whole head, explains that outline and fits the face about as well as
+    ``from_face``, the fit to the face alone. An outline of hair seldom fits a head; where it does, the face fits worse.
+    """
     rim = observed_rim(problem, evidence, state, replace(stage, whole_head=True))
     region = problem.model.levels[stage.level].face_region
     other = np.flatnonzero(~region[rim.corner].all(axis=1))

@@ -1,15 +1,15 @@
-"""The Laplace posterior of a fit: what its covariance says of every vertex.
+"""Computes the uncertainty of a fitted head: the Laplace posterior, and from it the standard deviation of every vertex.
 
-Where the photographs are silent, under hair above all, the prior speaks alone, and it is only as good as its scale: a
-head of the model's own population deviates there by half of what the kernel allows, one of another population by twice
-as much. How far a head strays is seen where it is seen: ``with_estimated_prior`` estimates the prior's variance from
-the coefficients that the photographs determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
+Where no photograph constrains the surface, above all under hair, the posterior equals the prior, so its variance must
+be right. A head of the model's own population deviates there by half of what the kernel allows, one of another
+population by twice as much. ``with_estimated_prior`` therefore estimates the prior's variance from the coefficients
+that the photographs do determine (the evidence framework; MacKay 1992, *Bayesian interpolation*,
 https://doi.org/10.1162/neco.1992.4.3.415).
 
-Two things follow that no coefficient shows. The kernel moves the surface along its normals, and a head that strays from
-the eigenheads strays along the surface as well: a landmark's place there is as unsure as the kernel allows
-(``Fit.sliding_mm``). And what modes are too coarse for, the relief that only photographs resolve, is there where they
-are silent, too. A fit to the eigenheads alone says nothing of either (``span_misfit``).
+Two more uncertainties follow, which no coefficient describes. The kernel moves the surface along its normals only; a
+head that deviates from the eigenheads deviates along the surface as well, so that a landmark's position there is as
+uncertain as the kernel allows (``Fit.sliding_mm``). And relief that is too fine for the modes exists also where no
+photograph shows it. A fit to the eigenheads alone contains neither (see ``span_misfit``).
 """
 
 import math
@@ -38,14 +38,17 @@ EAR_MISFIT_MM = 5.0  # where the face says that an ear sits, by the variance rat
 def with_estimated_prior(model: HeadModel, fit: Fit, eigenheads: int, *, relief_mm: float) -> Fit:
     """Returns the fit with the covariance that follows from a prior whose variance is estimated from the fit itself.
 
-    What the photographs determine keeps its variance. With ``C`` the covariance under unit priors, group by group of
-    modes ``s^2 = sum z^2 / sum (1 - C_ii)``, and the new covariance is ``(C^-1 + 1 / s^2 - 1)^-1``.
+    Coefficients that the photographs determine keep their variance. With ``C`` the covariance under unit priors, the
+    prior variance of a group of modes is ``s^2 = sum z^2 / sum (1 - C_ii)``, and the new covariance is ``(C^-1 + 1 /
+    s^2 - 1)^-1`` (MacKay 1992).
 
     Args:
-        model: with the modes that the fit has.
-        fit: with its covariance under unit priors; one without is returned as it is.
-        eigenheads: how many of the modes are a population's; the rest are the kernel's.
-        relief_mm: standard deviation of what only photographs show, on a head that strays as the kernel says.
+        model: the head model with all modes of the fit.
+        fit: with its covariance under unit priors; one without a covariance, or without kernel modes, is returned as it
+            is.
+        eigenheads: how many of the modes, the first ones, are eigenheads; the rest are the kernel's.
+        relief_mm: standard deviation of relief that only photographs show, for a head that deviates as far as the
+            kernel assumes.
     """
     if fit.covariance is None or len(fit.coefficients) <= eigenheads:
         return fit
@@ -76,12 +79,11 @@ def _variance_ratio(fit: Fit, modes: Int[np.ndarray, " k"]) -> float:
 
 @traced
 def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation (mm) of every full-level vertex along its normal; zero if the fit has no
+    """Returns the standard deviation (mm) of every vertex of the full level along its normal; zero if the fit has no
     covariance.
 
-    It is computed on the cage, which has a twentieth of the vertices, and interpolated to the full level. Sliding along
-    the surface is left out, since it does not change the shape. Relief too fine for the modes (the fit's misfit) is
-    included.
+    It is computed at the cage's vertices, a twentieth as many, and interpolated. Movement along the surface is left
+    out, since it does not change the shape. Relief too fine for the modes (``Fit.misfit_mm``) is included.
     """
     operator = model.levels["full"].operator
     if fit.covariance is None:
@@ -90,8 +92,8 @@ def vertex_deviation_mm(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v"]:
 
 
 def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
-    """Returns the variance (mm^2) of the cage's vertices along their normals, misfit included. The fit must have a
-    covariance."""
+    """Returns the variance (mm^2) of the cage's vertices along their normals, with the relief that no mode follows. The
+    fit must have a covariance."""
     assert fit.covariance is not None
     rows = normal_rows(model, fit)
     # One triangular factor instead of rows @ covariance twice; the jitter keeps rounding from making it indefinite.
@@ -104,7 +106,8 @@ def cage_variance(model: HeadModel, fit: Fit) -> Float[np.ndarray, " v0"]:
 
 
 def normal_rows(model: HeadModel, fit: Fit) -> Float[np.ndarray, "v0 p"]:
-    """Returns d(position along the normal) / d(parameters of the covariance) at every cage vertex."""
+    """Returns the derivative of every cage vertex's position along its normal (mm) by the parameters of the fit's
+    covariance: coefficients, rotation, translation, log scale."""
     pose, count = fit.world_from_head, len(fit.coefficients)
     cage = model.cage(fit.coefficients)
     normals_head = vertex_normals(cage, model.levels["cage"].faces)

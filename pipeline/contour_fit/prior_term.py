@@ -1,15 +1,16 @@
-"""What is known of a head before it is seen: z ~ N(0, I), few expressions, a metric scale, the cameras' covariance.
+"""Computes the prior: what is known of a head before it is observed. Coefficients are z ~ N(0, I), expressions are few,
+the scale is metric, and cameras stand where their calibration says, within its covariance.
 
-Most faces are neutral, and those that are not make few expressions at a time: the weight of one has a heavy tail,
+Most faces are neutral, and the others combine few expressions. The prior of an expression's weight has a heavy tail,
 
     p(w) ~ (1 + w / t)^-2 N(w; 0, 1),    0 <= w <= 1
 
-(Lomax 1954, of shape 1, whose median is t). A small weight must explain more than it costs; one that shows is hardly
-held back, which a Gaussian or an exponential would do. Its part of the equations is the tangent of the logarithm,
-which lies above it, so that a step that lowers the one lowers the other (Candes, Wakin and Boyd 2008, *Enhancing
-sparsity by reweighted l1 minimization*). The bounds are ``head_problem``'s.
+(Lomax 1954, of shape 1, whose median is t). A small weight is kept only if it explains much; a large one is hardly held
+back, unlike with a Gaussian or an exponential prior. In the equations the logarithm is replaced by its tangent, which
+lies above it, so that a step that lowers the one lowers the other (Candes, Wakin and Boyd 2008, *Enhancing sparsity by
+reweighted l1 minimization*). ``head_problem`` keeps the weights within their bounds.
 
-The Gaussian priors of the coefficients, of log scale (rigs are metric) and of each camera's correction, as one term.
+The other priors are Gaussian: of the coefficients, of log scale and of each camera's correction.
 """
 
 from dataclasses import dataclass
@@ -25,38 +26,39 @@ TAIL = 2.0  # exponent of the weights' prior
 
 
 def weights_of(problem: ContourProblem, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, " e"]:
-    """Returns the expression weights among the coefficients, negative ones as 0; an empty array in stages that do not
-    solve for them."""
+    """Returns the expression weights among the coefficients, negative ones as 0. The array is empty in stages that do
+    not solve for expressions."""
     return np.maximum(coefficients[problem.model.posed.start : problem.model.posed.stop], 0.0)
 
 
 def weight_slope(weights: Float[np.ndarray, " e"], median: float) -> Float[np.ndarray, " e"]:
-    """Returns half the derivative of ``2 TAIL log(1 + w / t)`` at each weight w, where t is ``median``: the
-    non-Gaussian part of the prior on expression weights."""
+    """Returns ``TAIL / (t + w)`` for each expression weight w, where t is ``median``. It is half the derivative of ``2
+    TAIL log(1 + w / t)``, the part of the weights' prior that is not Gaussian."""
     return TAIL / (median + weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PriorTerm:
-    """Computes the cost of the priors as a function of coefficients, pose and, in stages that solve for them,
-    cameras."""
+    """Computes the cost of the prior as a function of shape, pose and camera corrections."""
 
     problem: ContourProblem
     stage: Stage
 
     def at(self, state: State) -> "LinearisedPriorTerm":
+        """Returns the prior's cost and equations at ``state``."""
         return LinearisedPriorTerm(self, state)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedPriorTerm:
-    """Holds the prior term linearised at one state."""
+    """Holds the prior linearised at one state of the solver."""
 
     term: PriorTerm
     state: State
 
     @property
     def cost(self) -> float:
+        """Returns minus twice the logarithm of the prior density, up to a constant."""
         state, problem = self.state, self.term.problem
         shape = float(state.coefficients @ state.coefficients)
         weights = weights_of(problem, state.coefficients)
@@ -65,6 +67,8 @@ class LinearisedPriorTerm:
         return shape + cameras + (np.log(state.world_from_head.scale) / problem.settings.scale_spread) ** 2
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the prior of coefficients, expression weights, log scale and, if the stage solves for them, cameras, in
+        place."""
         state, problem, m = self.state, self.term.problem, self.term.stage.modes
         equations.matrix[np.arange(m), np.arange(m)] += 1.0
         equations.gradient[:m] += state.coefficients

@@ -23,7 +23,8 @@ FIRST_NOISE_PX, FIRST_CORRELATION_PX = 1.0, 6.0  # before the residuals have bee
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Holds the current estimate of the solver: coefficients, pose and the correction of each camera."""
+    """Holds the current estimate of the solver: coefficients (in standard deviations), pose of the head, and the
+    correction of each camera (rotation in rad, then translation in mm)."""
 
     coefficients: Float[np.ndarray, " m"]
     world_from_head: Similarity
@@ -32,7 +33,8 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Holds one level of the coarse-to-fine schedule."""
+    """Holds one stage of the coarse-to-fine schedule: which unknowns it solves for, on which mesh level, and which part
+    of the outline counts."""
 
     level: str
     modes: int
@@ -45,8 +47,8 @@ class Stage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Holds feature points as arrays, one row each: vertex of the full level, view, observed pixel, and the model's
-    mean and modes at the vertex (head frame, mm)."""
+    """Holds feature points as arrays, one row each: the landmark's vertex on the full level, the view, the observed
+    pixel, and the model's mean and modes at the vertex (head frame, mm)."""
 
     vertex: Int[np.ndarray, " n"]
     view: Int[np.ndarray, " n"]
@@ -57,9 +59,16 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkObservations:
-    """Holds triangulated landmarks of the face. ``corner`` and ``blend``: vertices of the full level and their weights;
-    ``position_world``: mm; ``whiten``: turns the stacked differences (mm) into standard deviations; ``mean`` and
-    ``basis``: the model's mean and modes at the landmarks, head frame."""
+    """Holds triangulated landmarks of the face, one row each.
+
+    Attributes:
+        corner: three vertices of the full level around each landmark.
+        blend: their weights, which sum to 1.
+        position_world: triangulated positions, mm.
+        whiten: turns the differences of all coordinates (mm), stacked, into uncorrelated standard deviations.
+        mean: the mean head at the landmarks, head frame, mm.
+        basis: the model's modes there, head frame, mm per standard deviation.
+    """
 
     corner: Int[np.ndarray, "n 3"]
     blend: Float[np.ndarray, "n 3"]
@@ -71,17 +80,20 @@ class LandmarkObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelBasis:
-    """Holds the mean and modes of a level, stored vertex by vertex, and the operator that turns them into the level's
-    vertices. A decimated level stores rows for its vertices (2 MB); the full level stores the cage's, since rows for
-    all its vertices would take 40 to 170 MB."""
+    """Holds the mean and modes (head frame, mm) of a mesh level, and the sparse operator that turns them into the
+    level's vertices.
+
+    A decimated level stores them at its own vertices (2 MB) and its operator is the identity. The full level stores
+    them at the cage's vertices, since rows for all its own would take 40 to 170 MB.
+    """
 
     operator: sparse.csr_array
     mean: Float[np.ndarray, "v 3"]
     modes: Float32[np.ndarray, "v 3 m"]
 
     def vertices(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "V 3"]:
-        """Returns the level's vertices (head frame, mm). The sum over modes is in single precision (1e-5 mm), which
-        needs a third of the memory traffic."""
+        """Returns the level's vertices (head frame, mm) for the first coefficients. The sum over modes is in single
+        precision (exact to 1e-5 mm), which needs a third of the memory traffic."""
         flat = self.modes.reshape(self.mean.size, -1)
         moved = flat[:, : len(coefficients)] @ coefficients.astype(np.float32)
         return self.operator @ (self.mean + moved.reshape(-1, 3))
@@ -89,8 +101,8 @@ class LevelBasis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ContourProblem:
-    """Holds everything that stays fixed while the solver runs: model, cameras, silhouettes, feature points and
-    settings."""
+    """Holds everything that stays fixed while the solver runs: model, cameras, silhouettes, feature points, landmarks
+    and settings."""
 
     model: HeadModel
     rig: Rig
@@ -105,8 +117,8 @@ class ContourProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceObservations:
-    """Holds n point-to-plane observations at vertices of the full level; the K cameras are in the order of the solver's
-    views."""
+    """Holds n point-to-plane observations: each says how far a vertex of the full level should move along a normal. The
+    equation is in ``surface_term``. The k cameras are in the order of the solver's views; c = 6 k."""
 
     vertex: Int[np.ndarray, " n"]
     basis: Float32[np.ndarray, "m n 3"]  # the model's modes at those vertices, head frame
@@ -124,10 +136,16 @@ class SurfaceObservations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimNoise:
-    """Holds how much an outline is trusted. ``unit``: l sigma^2 (px^3), the divisor of squared residual (px^2) per px
-    of outline; ``floor_px``: the least robust scale, three standard deviations of the model's misfit; ``clutter``: for
-    each view the cells with hair or clothes, None before the search; ``is_settled``: whether ``clutter`` comes from a
-    fit rather than from the start; ``bare``: for each view the cells by the outline of a bare skull, None unasked."""
+    """Holds how much the outlines are trusted.
+
+    Attributes:
+        unit: l sigma^2 (px^3) of an outline with noise sigma and correlation length l. The cost is squared residual
+            (px^2) times outline length (px), divided by it.
+        floor_px: the smallest robust scale to use: three standard deviations of the model's misfit.
+        clutter: for each view, the cells with hair or clothes; None before they were searched.
+        is_settled: whether ``clutter`` comes from a fit rather than from the start pose.
+        bare: for each view, the cells near the outline of a hairless head; None before they were searched.
+    """
 
     unit: float
     floor_px: float
@@ -146,7 +164,7 @@ class PhotoEvidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageEvidence:
-    """Holds what earlier stages have found: the noise of the outlines and, once measured, the evidence of the
+    """Holds what earlier stages have found out: the noise of the outlines and, once measured, the surface in the
     photographs."""
 
     noise: RimNoise
@@ -154,8 +172,8 @@ class StageEvidence:
 
 
 def first_evidence(settings: FittingSettings) -> StageEvidence:
-    """Returns the evidence for the first stage, before any residual is known: the noise that the settings state, or a
-    default."""
+    """Returns the evidence for the first stage, before any residual is known: the contour noise that the settings
+    state, or a default."""
     noise, length = settings.contour_noise_px or FIRST_NOISE_PX, settings.contour_correlation_px
     return StageEvidence(RimNoise(noise**2 * (length or FIRST_CORRELATION_PX), 0.0, None))
 
@@ -171,7 +189,8 @@ def make_problem(
     levels: tuple[str, ...] = ("p95", "full"),
     landmarks: LandmarkObservations | None = None,
 ) -> ContourProblem:
-    """Packs everything that stays fixed during a fit. Raises ValueError if no silhouette is usable."""
+    """Packs everything that stays fixed during a fit. ``features`` are feature points (px) by camera and landmark name.
+    Raises ValueError if no silhouette is usable."""
     usable = {name: s.distance for name, s in silhouettes.items() if s.quality.usable and name in rig}
     views = pack_views(rig, usable)
     rig = rig.subset(views.names)
@@ -193,8 +212,8 @@ def make_problem(
 
 @lru_cache(maxsize=4)  # models are few, jobs are many
 def level_basis(model: HeadModel, name: str) -> LevelBasis:
-    """Returns the mean and modes (mm, head frame) of a level: at the level's vertices if they are fewer than the
-    cage's, else at the cage's."""
+    """Returns the mean and modes (head frame, mm) of a mesh level. They are stored at the level's vertices if these are
+    fewer than the cage's, else at the cage's."""
     level = model.levels[name]
     if level.count < len(model.mean):
         coarse_basis = model.basis(name, len(model.modes)).transpose(1, 2, 0)
@@ -205,8 +224,8 @@ def level_basis(model: HeadModel, name: str) -> LevelBasis:
 
 @lru_cache(maxsize=4)
 def level_topology(model: HeadModel, name: str) -> Topology:
-    """Returns a level's edges and regions. Faces of the neck below the chin belong to no region, since heads turn on
-    it, collars hide it, and its lower cut is no contour of a person."""
+    """Returns a mesh level's edges and regions. Faces of the neck below the chin belong to no region: heads turn on the
+    neck, collars hide it, and its lower border is no contour of a person."""
     level = model.levels[name]
     mean = model.vertices(np.zeros(0), name)
     chin = model.vertices(np.zeros(0))[model.landmarks["gnathion"], 1]
@@ -214,11 +233,11 @@ def level_topology(model: HeadModel, name: str) -> Topology:
 
 
 def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Float[np.ndarray, "6 6"]:
-    """Returns the inverse prior covariance of a camera's correction: from the camera's own covariance if it has one,
-    else from ``error_px`` in the image.
+    """Returns the inverse prior covariance of a camera's correction (rad, mm): from the camera's own covariance if it
+    has one, else from an error of ``error_px`` in the image.
 
-    A correction of the default prior moves a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS, half of it (in
-    variance) by rotation and half by translation, which a head cannot tell apart.
+    The default prior moves the image of a head of 100 mm radius at ``depth_mm`` by ``error_px`` RMS. Half of that
+    variance is due to rotation and half to translation, whose effects on a head look the same.
     """
     if camera.covariance is not None:
         return np.linalg.inv(camera.covariance + 1e-12 * np.eye(6))
@@ -232,7 +251,8 @@ def camera_information(camera: Camera, depth_mm: float, error_px: float) -> Floa
 def pack_features(
     model: HeadModel, names: tuple[str, ...], features: Mapping[str, Mapping[str, np.ndarray]]
 ) -> Observed | None:
-    """Packs the feature points (px) of the model's landmarks into arrays; returns None if no camera has one."""
+    """Packs the feature points (px) that belong to the model's landmarks into arrays. Returns None if there are
+    none."""
     found = [
         (model.landmarks[landmark], names.index(camera), pixel)
         for landmark, views in sorted(features.items())
@@ -257,7 +277,8 @@ def landmark_basis(
 def blended_basis(
     model: HeadModel, corner: Int[np.ndarray, "n 3"], blend: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float32[np.ndarray, "m n 3"]]:
-    """Returns the mean and all modes of the model at places inside triangles of the full level, head frame, mm."""
+    """Returns the model's mean and all its modes (head frame, mm) at points inside triangles of the full level. A point
+    is the mean of three vertices (``corner``) with weights (``blend``)."""
     rows, inverse = np.unique(corner, return_inverse=True)
     mean, basis = landmark_basis(model, rows)
     at = inverse.reshape(corner.shape)
@@ -266,8 +287,8 @@ def blended_basis(
 
 
 def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) -> ContourProblem:
-    """Returns the problem with its model replaced by ``model``, which has the same mesh and more modes, on the given
-    ``levels``."""
+    """Returns the problem for another ``model`` with the same mesh and more modes. Only the mesh levels named in
+    ``levels`` are kept."""
     features = problem.features
     if features is not None:
         mean, basis = landmark_basis(model, features.vertex)
@@ -281,12 +302,12 @@ def widened(problem: ContourProblem, model: HeadModel, levels: tuple[str, ...]) 
 
 
 def start_state(problem: ContourProblem, world_from_head: Similarity) -> State:
-    """Returns the start of a fit: the mean head at the given pose, with all cameras as calibrated."""
+    """Returns the state at which a fit starts: the mean head at the given pose, and every camera as calibrated."""
     return State(np.zeros(0), world_from_head, np.zeros((len(problem.views.names), PER_CAMERA)))
 
 
 def moved_views(problem: ContourProblem, state: State) -> Views:
-    """Returns the views with the state's corrections applied to the cameras."""
+    """Returns the problem's views with the state's corrections applied to their cameras."""
     if not state.camera_shift.any():
         return problem.views
     turn = rotation_from_vector(state.camera_shift[:, :3])

@@ -44,7 +44,7 @@ STEPS_OUT_PX = (0.3, 2.5)  # both must leave the mask: the second drops samples 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """Holds the faces, edges and regions of a mesh level that the search for the rim needs."""
+    """Holds the faces, edges and regions of a mesh level, as the search for its rim needs them."""
 
     faces: Int32[np.ndarray, "f 3"]
     edges: Int32[np.ndarray, "e 4"]  # from, to (as in face one), face one, face two or -1
@@ -54,7 +54,8 @@ class Topology:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Holds the cameras and the silhouettes' signed distances (px), packed for compiled loops."""
+    """Holds the cameras and the signed distances (px) to their silhouettes, packed in flat arrays for compiled
+    loops."""
 
     names: tuple[str, ...]
     rotation: Float[np.ndarray, "k 3 3"]
@@ -65,13 +66,15 @@ class Views:
     offset: Int[np.ndarray, " k"]
 
     def packed(self) -> Float[np.ndarray, "k 22"]:
-        """Returns one row for each camera: rotation (9), translation (3) and lens (10)."""
+        """Returns one row for each camera: rotation (9) and translation (3, mm) of ``camera_from_world``, then lens
+        (10)."""
         return np.concatenate([self.rotation.reshape(-1, 9), self.translation, self.lens], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rim:
-    """Holds samples of the outer outline, all views together."""
+    """Holds samples of a head's rim: the points where the rim crosses edges of the mesh, as far as they lie on the
+    outer outline. All views follow one another."""
 
     view: Int32[np.ndarray, " s"]
     corner: Int32[np.ndarray, "s 2"]  # the edge's two vertices
@@ -89,8 +92,8 @@ def make_topology(
     face_region: Bool[np.ndarray, " v"],
     head_region: Bool[np.ndarray, " v"] | None = None,
 ) -> Topology:
-    """Builds the topology of a mesh: its edges, each with its two faces, and the faces of both regions. ``head_region``
-    is the whole mesh if None. Raises ValueError if more than two faces share an edge."""
+    """Builds the topology of a mesh: its edges, each with its two faces, and the faces of both regions. If
+    ``head_region`` is None, the head is the whole mesh. Raises ValueError if more than two faces share an edge."""
     faces = np.ascontiguousarray(faces, np.int32)
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     owner = np.tile(np.arange(len(faces), dtype=np.int32), 3)
@@ -133,9 +136,12 @@ def find_rim(
     whole_head: bool = False,
     averaged: bool = False,
 ) -> Rim:
-    """Finds samples of a mesh's outer outline in every view, with the silhouette's signed distance (px) at each. If
-    ``averaged``, that distance is a mean half way to the neighbouring samples, for a mesh as fine as the outline (2 to
-    6 px)."""
+    """Finds samples of a mesh's outer outline in every view, and reads the silhouette's signed distance (px) at each.
+
+    ``whole_head`` also searches cranium and ears, else only the face region. If ``averaged``, the distance is the mean
+    over the outline half way to both neighbouring samples; meant for a mesh whose edges are only 2 to 6 px long in the
+    image.
+    """
     faces = topology.head if whole_head else topology.face
     vertices = np.ascontiguousarray(vertices_world)
     normals, planes = normals_and_planes(vertices, topology.faces)
@@ -181,6 +187,6 @@ def _outlines(
 def project_with_slopes(
     points_world: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"], views: Views
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 3"]]:
-    """Returns the pixel of every point in the view of the same row in ``view``, and the derivative d(pixel) / d(point),
-    px per mm."""
+    """Projects each point into one view: the one of the same row in ``view``. Returns the pixels and the derivatives
+    d(pixel) / d(point), px per mm."""
     return projected_with_slopes(points_world, view, views.packed())

@@ -1,4 +1,4 @@
-"""The compiled inner loop of the rim's Jacobian: a row a sample, written in place."""
+"""Compiled inner loop of the rim's Jacobian: one row for each rim sample, written in place."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,8 @@ POSE = 7  # rotation, translation, log scale
 
 
 class Level(NamedTuple):
-    """A mesh level's operator from the cage (compressed sparse rows), and the modes of the cage."""
+    """Holds a mesh level's operator from the cage (compressed sparse rows: ``indptr``, ``indices``, ``data``), and the
+    modes of the cage (v0, 3, m; head frame, mm)."""
 
     indptr: np.ndarray
     indices: np.ndarray
@@ -20,7 +21,7 @@ class Level(NamedTuple):
 
 
 class RimSamples(NamedTuple):
-    """The columns of ``rim.Rim`` that its rows follow from."""
+    """Holds the columns of ``rim.Rim`` that its Jacobian needs, one row each for a sample."""
 
     view: np.ndarray
     corner: np.ndarray
@@ -31,8 +32,14 @@ class RimSamples(NamedTuple):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def fill_rows(first, last, level, count, turn, place, cameras, rim, out):
-    """``turn`` and ``place``: of the head in the world. Modes: the sum over the cage of (gradient . mode),
-    through the level's operator and the edge's blend."""
+    """Fills the Jacobian rows ``out[first:last]`` of rim samples: the derivative of the residual (px) by ``count``
+    coefficients, by pose (rotation, translation, log scale) and by the correction of the camera that sees the sample
+    (rotation, translation). The equations are in ``rim_term``.
+
+    ``turn`` is scale times rotation (3, 3) and ``place`` the translation (3, mm) of world_from_head; ``cameras`` has
+    the rows of ``Views.packed``. By the coefficients the derivative is gradient . mode, summed over the cage with the
+    weights of the level's operator and of the sample on its edge.
+    """
     indptr, indices, data, modes = level
     view, corner, blend, point, gradient = rim
     for s in range(first, last):

@@ -1,7 +1,5 @@
-"""The compiled inner loops of the rim: sweeps over the mesh for all views at once, then one view at a time.
-
-Plain loops over arrays; the views are shared out to threads. ``rim`` says what they are for.
-"""
+"""Compiled inner loops of ``rim``: sweeps over the mesh for all views at once, then one view at a time, shared by
+threads."""
 
 from typing import NamedTuple
 
@@ -20,7 +18,7 @@ LONGEST_PX = 16.0  # between neighbours on the rim; farther apart, or turned by 
 
 
 class Surface(NamedTuple):
-    """A mesh level in the world; ``edges``: from, to (as in face one), face one, face two or -1."""
+    """Holds a mesh level (world, mm); an edge is from, to (as in its first face), first face, second face or -1."""
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -29,7 +27,7 @@ class Surface(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """What all views say of faces, edges and vertices: a word each, with a bit a view."""
+    """Holds how faces, edges and vertices lie towards at most 64 views: a word each, whose bit k is view k's."""
 
     facing: np.ndarray  # of all faces: that look to the view
     outline: np.ndarray  # edges where the number of layers changes in some view,
@@ -40,7 +38,8 @@ class Sweep(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """The views: cameras as ``packed_camera`` has them, their centres, and their signed distances one after another."""
+    """Holds the views: camera rows (``packed_camera``), centres (world, mm), and signed distances (px), one view after
+    another."""
 
     cameras: np.ndarray
     centres: np.ndarray
@@ -51,7 +50,8 @@ class Pictures(NamedTuple):
 
 @njit(cache=True, fastmath=True)
 def projected_with_slopes(points, view, cameras):
-    """Pixels (n, 2) of points (n, 3; mm, world), each in its own view, and their slopes (n, 2, 3), px a mm."""
+    """Projects each point (n, 3; world, mm) into its own ``view`` (n). Returns the pixels (n, 2) and their derivatives
+    by the point (n, 2, 3; px per mm)."""
     pixels, slopes = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
     for n in range(len(points)):
         camera = cameras[view[n]]
@@ -65,7 +65,8 @@ def projected_with_slopes(points, view, cameras):
 
 @njit(cache=True, fastmath=True)
 def normals_and_planes(vertices, faces):
-    """Unit vertex normals; and by face its normal n and n . a: a centre C is in front of it where n . C > n . a."""
+    """Returns unit vertex normals (v, 3), and each face's normal n and n . a (4, f): C is in front where n . C > n .
+    a."""
     normals = np.zeros_like(vertices)
     planes = np.empty((4, len(faces)))
     for f in range(len(faces)):
@@ -377,7 +378,8 @@ def _average(segments, place, kept, pictures, k, samples):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def sweep_views(surface, planes, active, centres):
-    """A ``Sweep`` of at most 64 views, of whose rim the ``active`` faces may speak."""
+    """Computes the ``Sweep`` of at most 64 views with these ``centres`` (k, 3; world, mm). ``active`` are the faces
+    whose rim is searched."""
     facing = _facing(planes, centres)
     outline, outline_words = _silhouette_edges(surface.edges, facing)
     behind = _back_facing(surface.vertices, surface.normals, centres)
@@ -387,7 +389,12 @@ def sweep_views(surface, planes, active, centres):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def find_rim_samples(first, last, surface, sweep, pictures, steps, averaged, counts, corners, samples):
-    """Of views ``first`` to ``last``: fills ``counts``, ``corners`` (the edge's two vertices) and ``samples``."""
+    """Finds the rim samples of views ``first`` to ``last`` and fills, for each view k, ``counts[k]``, ``corners[k]``
+    (the two vertices of each sample's edge) and ``samples[k]`` (columns as named above).
+
+    ``steps`` are distances (px) outside the outline that must be free of the model; ``averaged`` is that of
+    ``find_rim``.
+    """
     for k in range(first, last):
         bit = np.uint64(1) << np.uint64(k)
         counts[k] = _view(k, surface, sweep, bit, pictures, steps, averaged, corners[k], samples[k])

@@ -33,7 +33,8 @@ OUTSIDE_SCALE = 2.0  # robust scale where the model sticks out of the input, by 
 
 
 def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State, stage: Stage) -> Rim:
-    """Returns the rim of the head at ``state``; samples in clutter have length 0."""
+    """Returns the rim of the head at ``state``, with the weight of each sample that ``stage`` and ``evidence`` give it;
+    samples in clutter have length 0."""
     vertices = state.world_from_head.apply(problem.bases[stage.level].vertices(state.coefficients))
     # On a decimated mesh a sample's share of the outline is long enough to be half clutter: it would hide what is not.
     fine, whole = stage.level == "full", stage.whole_head or stage.contained
@@ -47,8 +48,8 @@ def observed_rim(problem: ContourProblem, evidence: StageEvidence, state: State,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RimTerm:
-    """Computes the cost of the outlines. ``reference_px``: the outline length (px) that the cost is scaled to, so that
-    hiding part of the rim gains nothing; None for no scaling."""
+    """Computes the cost of the silhouettes' outlines. ``scale_px`` is the robust scale. The cost is scaled as if the
+    rim had ``reference_px`` of outline, so that hiding a part of it gains nothing; None for no scaling."""
 
     problem: ContourProblem
     evidence: StageEvidence
@@ -57,12 +58,13 @@ class RimTerm:
     reference_px: float | None = None
 
     def at(self, state: State) -> "LinearisedRimTerm":
+        """Finds the rim at ``state`` and returns the term linearised there."""
         return LinearisedRimTerm(self, state, observed_rim(self.problem, self.evidence, state, self.stage))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedRimTerm:
-    """Holds the rim term linearised at one state."""
+    """Holds the rim term linearised at one state, with the rim samples there."""
 
     term: RimTerm
     state: State
@@ -70,14 +72,16 @@ class LinearisedRimTerm:
 
     @property
     def cost(self) -> float:
+        """Returns the robust cost of all samples, each weighted with its length of outline, in squared standard
+        deviations."""
         rho = _loss(self.rim.residual, self.term.scale_px).cost(self.rim.residual**2)
         total = float(self.rim.length.sum())
         share = (self.term.reference_px or total) / max(total, 1.0)
         return float((self.rim.length * rho).sum()) / self.term.evidence.noise.unit * share
 
     def add_to(self, equations: NormalEquations) -> None:
-        """Adds the rim's part to the normal equations, camera by camera: a sample depends on shape, pose and the camera
-        that sees it."""
+        """Adds the rim's part to the normal equations in place, camera by camera: a sample depends on shape, pose and
+        the camera that sees it."""
         stage, rim = self.term.stage, active_samples(self.rim)
         rows = rim_rows(self.term.problem, self.state, rim, stage)
         weight = _loss(rim.residual, self.term.scale_px).weight(rim.residual**2)
@@ -107,13 +111,14 @@ def _loss(residual_px: Float[np.ndarray, " s"], scale_px: float) -> GemanMcClure
 
 
 def active_samples(rim: Rim) -> Rim:
-    """Returns the samples whose length is above 0."""
+    """Returns the samples that count: those whose length is above 0."""
     kept = rim.length > 0
     return rim if kept.all() else Rim(*(getattr(rim, name)[kept] for name in Rim.__dataclass_fields__))
 
 
 def rim_rows(problem: ContourProblem, state: State, rim: Rim, stage: Stage) -> Float32[np.ndarray, "s q"]:
-    """Returns d(residual) / d(coefficients, pose, camera correction) of each sample, for the camera that sees it."""
+    """Returns the derivative of each sample's residual (px) by the coefficients, the pose and the correction of the
+    camera that sees it, in columns of this order."""
     pose, views = state.world_from_head, moved_views(problem, state)
     basis = problem.bases[stage.level]
     operator = basis.operator

@@ -1,8 +1,9 @@
-"""What a fit to the eigenheads leaves out: most heads are none of the span, and its own covariance does not say so.
+"""Estimates how far a fit to the eigenheads alone may be off because the head is not in their span. Most heads are not,
+and the fit's own covariance does not include that.
 
-Between outlines the error of such a fit is several times what it leaves at them, where it was made to agree. So the
-same outlines are asked once more in a basis that need not contain the head in a population (``gaussian_process``): how
-far the two heads are apart, and what the wider one leaves open, is what the narrower one may be off by.
+The fit agrees with the outlines, where it was made to; between them its error is several times larger. So the same
+outlines are fitted once more in a wider basis that can leave the span (``gaussian_process``). The distance between both
+heads, and the wider fit's own uncertainty, are the misfit of the narrower one.
 """
 
 from dataclasses import replace
@@ -20,12 +21,12 @@ LEVEL, STEPS = "p95", 4  # as the contour solver's own stage with more modes
 
 
 def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_mm: float) -> Fit:
-    """Returns the fit of a solution, with a misfit that covers what the eigenheads cannot represent.
+    """Returns the fit of a solution with its misfit set to what the eigenheads cannot represent.
 
     Args:
-        solved: to the outlines, with the eigenheads alone.
+        solved: solution with the eigenheads alone.
         wider_model: the same mesh and eigenheads, followed by the kernel's modes.
-        relief_mm: of ``with_estimated_prior``.
+        relief_mm: as of ``with_estimated_prior``.
     """
     fit, eigenheads = finish(solved), len(solved.state.coefficients)
     problem = widened(solved.problem, wider_model, (LEVEL,))
@@ -42,8 +43,9 @@ def with_span_misfit(solved: ContourSolution, wider_model: HeadModel, *, relief_
 
 
 def judged_by(wider_model: HeadModel, wider: Fit, model: HeadModel, fit: Fit) -> Fit:
-    """Returns ``fit`` with its misfit (mm, along the normals) set from ``wider``, a fit of more modes to the same
-    outlines: from their distance and the variance that only the wider one has. Both need a covariance."""
+    """Returns ``fit`` with its misfit (mm, along the normals) set by comparison with ``wider``, a fit of more modes to
+    the same outlines. The misfit's square is their squared distance plus the variance that only the wider fit has. Both
+    fits must have a covariance."""
     cage = fit.world_from_head.apply(model.cage(fit.coefficients))
     normals = vertex_normals(cage, model.levels["cage"].faces)
     apart = ((wider.world_from_head.apply(wider_model.cage(wider.coefficients)) - cage) * normals).sum(axis=1)

@@ -32,8 +32,8 @@ def surface_residual(
     world_from_head: Similarity,
     camera_shift: Float[np.ndarray, "k 6"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Returns the residual e (mm) of each observation, 0 for a bound that is kept, and the current positions of the
-    vertices (world, mm)."""
+    """Returns the residual e (mm) of each observation, as the module defines it, and the current positions of the
+    vertices (world, mm). An observation that is only a bound (of hair) has the residual 0 if the head keeps it."""
     count = len(coefficients)
     moved = (coefficients.astype(np.float32) @ seen.basis[:count].reshape(count, -1)).reshape(-1, 3)
     points = world_from_head.apply(seen.mean + moved)
@@ -44,13 +44,14 @@ def surface_residual(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceTerm:
-    """Computes the cost of surface observations as a function of coefficients, pose and, in stages that solve for them,
-    cameras."""
+    """Computes the cost of the surface observations as a function of shape, pose and, in stages that solve for them,
+    camera corrections."""
 
     seen: SurfaceObservations
     stage: Stage
 
     def at(self, state: State) -> "LinearisedSurfaceTerm":
+        """Returns the term linearised at ``state``."""
         residual, points = surface_residual(self.seen, state.coefficients, state.world_from_head, state.camera_shift)
         return LinearisedSurfaceTerm(self, state, residual, points)
 
@@ -67,20 +68,25 @@ class LinearisedSurfaceTerm:
 
     @property
     def squares(self) -> Float[np.ndarray, " n"]:
+        """Returns the squared residual of each observation, in squared standard deviations."""
         return self.term.seen.information * self.residual**2
 
     @property
     def cameras(self) -> LinearisedQuadratic:
-        """Returns the quadratic cost of the cameras' corrections alone, as measured from the images."""
+        """Returns the cost of the cameras' corrections alone: a quadratic form that was measured when the surface was
+        observed."""
         seen = self.term.seen
         form = Quadratic(seen.camera_matrix, seen.camera_shift.ravel(), seen.camera_gradient)
         return form.at(self.state.camera_shift.ravel())
 
     @property
     def cost(self) -> float:
+        """Returns the robust cost of all observations plus the cost of the cameras' corrections, in squared standard
+        deviations."""
         return float(LOSS.cost(self.squares).sum()) + self.cameras.cost
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the term's part to the normal equations in place. Bounds that are kept add nothing."""
         seen, stage, state = self.term.seen, self.term.stage, self.state
         rows = surface_rows(seen, stage.modes, state.world_from_head, self.points, cameras=stage.cameras)
         counts = ~seen.bound | (self.residual > 0.0)
@@ -101,8 +107,9 @@ def surface_rows(
     *,
     cameras: bool,
 ) -> Float32[np.ndarray, "n p"]:
-    """Returns the derivatives of the residual e by coefficients, rotation, translation, log scale and, if ``cameras``,
-    the cameras' corrections."""
+    """Returns the derivative of each residual e (mm) by the first ``count`` coefficients, rotation, translation, log
+    scale and, if ``cameras``, the cameras' corrections, in columns of this order. ``points`` are the current vertices
+    (world, mm)."""
     turned = (world_from_head.scale * (seen.normal @ world_from_head.rotation)).astype(np.float32)
     shape = np.einsum("nc,mnc->nm", turned, seen.basis[:count], optimize=True)
     arm = points - world_from_head.translation

@@ -1,5 +1,5 @@
-"""Deforms the fitted head to the dense surface (level ``fine``), lids and ears included.
+"""Deforms the fitted head to the surface that dense matching measured (level ``fine``), lids and ears included.
 
-Enters: the fit, depth of every view, what shows of the eyes. Leaves: vertices of the model's full level (world, mm) and
-their deviation.
+Enters: the fit, depth of every view, and what the photographs show between the lids. Leaves: vertices of the model's
+full level (world, mm) and their standard deviation.
 """

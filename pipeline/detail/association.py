@@ -1,7 +1,7 @@
-"""Which place of the head each point of the dense surface shows: the closest one whose side agrees.
+"""Finds which point of the head each measured surface point shows: the closest one that faces the same way.
 
-From the points to the head, and not the other way: a place of the head that no point shows stays silent by itself, at
-the rim of a hole as well as in its middle.
+The search goes from the points to the head, and not the other way. So a part of the head that no point shows gets no
+observation, at the rim of a hole as well as in its middle.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,8 @@ CANDIDATES = 4  # vertices whose triangles are tried
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Associated:
-    """Holds the n points that lie near a head, and the place on the head's mesh that each one shows."""
+    """Holds the n surface points that lie near a head, by their indices, and the point of the head's mesh that each one
+    shows."""
 
     row: Int[np.ndarray, " n"]  # of the points asked for
     triangle: Int[np.ndarray, " n"]
@@ -30,8 +31,8 @@ class Associated:
 def faces_at_vertices(
     faces: Int[np.ndarray, "f 3"], count: int
 ) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
-    """Returns the faces at each vertex in compressed rows: where the row of each vertex begins (one entry more than
-    there are vertices), and the face numbers, row after row."""
+    """Returns the faces at each vertex as compressed rows, ``start`` and ``members``: those of vertex i are
+    ``members[start[i]:start[i + 1]]``."""
     corner = np.argsort(faces.ravel(), kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
     return start.astype(np.int64), (corner // 3).astype(np.int64)
@@ -39,7 +40,7 @@ def faces_at_vertices(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """Holds a head's mesh with the search tree that finds the closest place on it."""
+    """Holds a head's mesh with a search tree for the closest point on it."""
 
     head: FannedMesh
     tree: KDTree
@@ -62,16 +63,16 @@ class Target:
         reach_mm: float,
         least_agreement: float,
     ) -> Associated:
-        """Returns the closest place on the head of every point that has one within reach.
+        """Finds the closest point on the head for every surface point that has one within reach.
 
         Args:
-            points: of the dense surface, mm, in the head's frame.
+            points: measured surface points, mm, in the head's frame.
             normals: unit, outwards.
-            reach_mm: farther points have no place on it, and cost next to nothing.
-            least_agreement: cosine between a point's normal and the head's.
+            reach_mm: points farther away are left out.
+            least_agreement: smallest cosine between a point's normal and the head's.
 
         Returns:
-            The points that have a place, in their order.
+            The points that have a counterpart, in their order.
         """
         count = min(CANDIDATES, len(self.head.vertices))
         within = reach_mm + self.corner_mm
@@ -98,13 +99,13 @@ def associate(
     reach_mm: float,
     least_agreement: float,
 ) -> Associated:
-    """Returns the closest place on a head for every point within reach, as ``Target.closest`` does, for a head that is
-    searched only once. Points and head are in one frame, mm."""
+    """Finds the closest point on a head for every surface point within reach, as ``Target.closest`` does, for a head
+    that is searched only once. Points and head are in one frame, mm."""
     target = Target.of(vertices, vertex_normals, faces)
     return target.closest(points, normals, reach_mm=reach_mm, least_agreement=least_agreement)
 
 
 def interpolated(corners: Float[np.ndarray, "n 3 3"], blend: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the value at each of n places inside triangles: the sum of the values at the three corners, weighted by
-    the barycentric weights ``blend``."""
+    """Returns the values at n points inside triangles: the sum of the values at the three corners, weighted with the
+    barycentric coordinates ``blend``."""
     return np.einsum("nk,nkc->nc", blend, corners)

@@ -1,8 +1,8 @@
-"""How far lids are closed, as the dense surface tells it.
+"""Estimates how far the eyelids are closed, from the measured surface.
 
-Patches of a few millimetres do not follow a lid, so that the photographs' own fit leaves lids open; and what shows
-between them (``eyelids``) misjudges eyes without a white. So each eye's blink is tried at a few weights, and the lids
-whose surface lies nearest to the points about the eye, robustly, are the ones that are there.
+Patches of a few millimetres do not follow a lid, so that the fit to photographs leaves lids open; and what is seen
+between the lids (``eyelids``) is misleading for eyes whose white does not show. So a few weights of each eye's blink
+are tried, and the one is taken whose lids lie nearest to the surface points around the eye, robustly.
 """
 
 from collections.abc import Mapping
@@ -54,11 +54,12 @@ def estimate_eyelid_closure(
     lids must be bridged instead: they look closed, but no blink of the model brings its lids nearer to the points.
 
     Args:
-        fit: of the photographs.
+        fit: to the photographs.
         model: with the modes that the fit has.
-        base: the fit's head with plain lids (``with_plain_lids``), full level, world.
-        surface: the dense points, world frame.
-        eyes: what shows between the lids; an eye that shows none is closed unless the points say that it is open.
+        base: the fit's head with plain lids (``with_plain_lids``), full level, world, mm.
+        surface: the measured surface points, world frame.
+        eyes: what the photographs show between the lids. An eye that shows neither white nor iris counts as closed
+            unless the points say otherwise.
     """
     found, unexplained = {}, set[str]()
     for side, place in blinks_of(model).items():

@@ -1,4 +1,5 @@
-"""The dense stage's depth maps as one cloud of oriented points, each with what it shows."""
+"""Converts the depth maps to one cloud of surface points with normals, each with the part of the subject that it
+shows."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,17 +29,17 @@ TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage com
 def dense_points(
     depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh, settings: FineSettings
 ) -> SurfacePoints:
-    """Returns the places that enough views agree on as one cloud of points, at most one for each cell of a grid, part
-    of the head and side of a sheet.
+    """Returns the surface points on which enough views agree. They are thinned to at most one for each cell of a grid,
+    part of the head, and side of a thin sheet.
 
     Args:
-        depth_maps: one a view.
-        votes: what the places show.
+        depth_maps: one for each view.
+        votes: which part each point shows.
         head_world: the fitted head.
         settings: how many views must agree, and how frontally.
 
     Returns:
-        The points, in the order of their cells; none where there are no maps or no votes.
+        The points, in the order of their cells; none without depth maps or votes.
     """
     views_needed = count_views_needed([each.camera for each in depth_maps], head_world.vertices.mean(axis=0), settings)
     clouds = map_in_threads(lambda k: _cloud(depth_maps[k], views_needed, settings), len(depth_maps))
@@ -58,13 +59,13 @@ def dense_points(
 
 
 def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"], settings: FineSettings) -> int:
-    """Returns how many views must agree on a point: half of those that can, where most can, but two at least and
-    ``settings.views_least`` at most.
+    """Returns how many views must agree on a point near the head: half of the cameras that stand within
+    ``TOGETHER_DEG`` of each other where they are densest, but at least two and at most ``settings.views_least``.
 
     Args:
         cameras: of the depth maps.
         at_world: about the middle of the head, mm.
-        settings: for the number that suffices.
+        settings: has the largest number required.
     """
     towards = np.array([camera.centre_world for camera in cameras]).reshape(-1, 3) - at_world
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)

@@ -1,8 +1,9 @@
-"""How much windows of dense matching bias depth (``pipeline.stereo.window_bias``), as the fitted face of the very
-capture tells: its cameras and shape were solved together, by patches that follow the surface.
+"""Measures the bias of depth that comes from matching windows (``pipeline.stereo.window_bias``), on the fitted face of
+each capture. The face can serve as the reference: its cameras and shape were solved together, by patches that follow
+the surface.
 
-Seen on captures of two renderers: 0.0 to 0.15 mm too deep, and a share of 0.7 to 1.5, within 0.1 the same from the
-fitted face as from the true one.
+On captures of two renderers the surface was 0.0 to 0.15 mm too deep, and the share was 0.7 to 1.5, within 0.1 the same
+from the fitted face as from the true one.
 """
 
 from dataclasses import dataclass, replace
@@ -25,8 +26,8 @@ MAX_MM, MAX_SHARE = 0.3, 2.0  # of the common offset, and of the share: beyond, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnFace:
-    """Holds points of skin and the places of the fitted face that they show: how far (mm, along the ``normal`` there)
-    they lie off it, and how far its windowed mean does."""
+    """Holds points of skin, the points of the fitted face that they show, how far (mm, along the ``normal`` there) they
+    lie off the face, and the face's ``windowed_height`` there."""
 
     row: Int[np.ndarray, " n"]  # of the points
     normal: Float[np.ndarray, "n 3"]
@@ -36,8 +37,8 @@ class OnFace:
 
 @traced
 def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
-    """Returns the points of skin whose closest place on the fitted head (world frame, mm) lies on a triangle with all
-    its corners in ``face``."""
+    """Returns the points of skin whose closest point on the fitted head (world frame, mm) is in a triangle with all
+    corners in ``face``."""
     vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()
     skin = np.flatnonzero(surface.part == Part.SKIN)
     if not len(skin):
@@ -52,9 +53,9 @@ def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarr
 
 
 def measure_bias(seen: OnFace) -> WindowBias:
-    """Fits a robust straight line to the offset of the points from the fitted face over the windowed height: its
-    intercept is the common bias (mm), its slope the share. Returns no bias if there are fewer than ``MIN_POINTS``
-    points."""
+    """Measures the bias of the matching windows: fits a robust straight line to the points' offsets from the fitted
+    face as a function of its windowed height. The intercept is the common bias (mm), the slope is the share. Returns no
+    bias for fewer than ``MIN_POINTS`` points."""
     if len(seen.row) < MIN_POINTS:
         return WindowBias()
     columns = np.stack([np.ones(len(seen.row)), seen.windowed_mm], axis=1)
@@ -66,8 +67,8 @@ def measure_bias(seen: OnFace) -> WindowBias:
 
 
 def without_window_bias(surface: SurfacePoints, seen: OnFace, bias: WindowBias) -> SurfacePoints:
-    """Returns the points corrected for the bias of the matching windows. Every point moves back along its normal by the
-    common bias; points on the face, the only place where the windowed height is known, also lose the share of it."""
+    """Returns the points with the bias of the matching windows removed. Every point moves along its normal by the
+    common bias. Points on the face also move by their share of the windowed height, which is known only there."""
     points = surface.points - bias.common_mm * surface.normals
     points[seen.row] = (
         surface.points[seen.row] - (bias.common_mm + bias.share * seen.windowed_mm)[:, None] * seen.normal

@@ -1,8 +1,8 @@
-"""Ears brought in place as a whole, before anything bends.
+"""Moves each ear into place as a whole, before the head is deformed.
 
-An ear may sit a centimetre off where the face says it should, with a shell of folds: the closest point of another fold
-is no help. So each ear first moves as a similarity, from several starts, to where the dense points about it agree with
-it best (iterated closest points along the normals; Chen and Medioni 1992), and its surroundings follow smoothly.
+An ear may be a centimetre off where the face suggests, and it has many folds, so that the closest point may be on
+another fold. So each ear first moves by a similarity, from several starts, to where it agrees best with the surface
+points around it (iterated closest points along the normals; Chen and Medioni 1992). Its surroundings follow smoothly.
 """
 
 from dataclasses import dataclass
@@ -46,13 +46,13 @@ class Motion:
 def with_ears_in_place(
     vertices: Float[np.ndarray, "v 3"], model: HeadModel, surface: SurfacePoints
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the head with each ear moved to where the points of skin show it. An ear with too few points about it
-    stays where it is.
+    """Returns the head with each ear moved to where the points of skin show it. An ear with too few points around it
+    stays.
 
     Args:
         vertices: full level, world frame, mm.
-        model: the topology.
-        surface: points of the dense stage; thin, 1.5 to 3 mm apart.
+        model: the head model.
+        surface: the surface points, thinned to a spacing of 1.5 to 3 mm.
     """
     faces, ears = model.levels["full"].faces, head_regions(model)["ears"]
     middle = model.vertices(np.zeros(0))[:, 0] < 0

@@ -1,17 +1,17 @@
-"""What face a head makes, read from the surface that it was drawn to.
+"""Reads the expression of a face from the head as it was deformed to the surface.
 
-Enters: the displaced head (``refine``). Leaves: the weights of its expressions with their deviations. The fit decides
-them where the surface is still known to half a millimetre, and with the eigenheads that it uses alone: what a head has
-of the others looks like an expression, a brow or the wing of a nose above all. So here they are estimated once more,
-from the final surface and with the whole population. With X a place of the head, Y its place on the displaced one and n
-the normal there, n . (X - Y) is noise, robustly:
+Enters: the deformed head (``refine``). Leaves: the weights of its expressions with their standard deviations. The fit
+determines these with few eigenheads and while the surface is known to half a millimetre only. Whatever the eigenheads
+lack then looks like an expression, above all at the brows and the wings of the nose. So the weights are estimated once
+more, from the final surface and with all eigenheads of the population. With X a point of the head, Y the same point on
+the deformed head and n the normal there,
 
-    n . (mean + sum_m z_m modes_m + sum_e w_e shapes_e + pose - Y) = noise,
+    n . (mean + sum_m z_m modes_m + sum_e w_e shapes_e + pose - Y) = noise,    z ~ N(0, 1),
 
-z ~ N(0, 1); the kernel's modes have a variance that is estimated here, since all eigenheads leave little to them; the
-weights have the prior and the bounds that they have in the fit (``prior_term``). Sliding along the surface is free: the
-places are found again on the displaced head. The head stays what it is, and where it is none of its population, whose
-eigenheads would then ask for expressions to explain it, its weights do, too.
+robustly. The variance of the kernel's modes is estimated here, since all eigenheads leave little for them; the
+expression weights have the prior and bounds of the fit (``prior_term``). Sliding along the surface is free: the points
+are found anew on the deformed head. Only the weights change, not the head. If the head does not belong to the
+population, whose eigenheads would then need expressions to explain it, the weights of the fit are kept.
 """
 
 from dataclasses import dataclass, replace
@@ -45,8 +45,8 @@ FIRST = 0.1  # weight at which the prior's tangent is taken first
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingBasis:
-    """Holds sample places of the mean head's face (head frame, mm) and the modes that move them; the last of the modes
-    are the expressions."""
+    """Holds sample points of the mean head's face (head frame, mm) and the modes that move them; the last modes are the
+    expressions."""
 
     vertex: Int[np.ndarray, " n"]  # of the full level
     mean: Float[np.ndarray, "n 3"]
@@ -85,17 +85,17 @@ def with_read_expression(
     eigenheads: int,
     median: float,
 ) -> Fit:
-    """Returns the fit with expression weights, and their deviations, estimated anew from the displaced head. Returns
-    the fit unchanged if the model has no expressions, or if the population does not explain the head.
+    """Returns the fit with expression weights, and their deviations, estimated anew from the deformed head. Returns the
+    fit unchanged if the model has no expressions, or if the population does not explain the head.
 
     Args:
-        fit: of the photographs.
+        fit: to the photographs.
         model: with the modes that the fit has.
         population: the model with all its eigenheads.
-        vertices_world: the displaced head, full level, mm.
-        observed: which of its vertices a point of skin showed.
-        eigenheads: how many of the fit's modes are a population's.
-        median: of the prior of a weight.
+        vertices_world: the deformed head, full level, mm.
+        observed: which of its vertices a point of skin shows.
+        eigenheads: how many of the fit's modes are eigenheads.
+        median: of the prior of an expression weight.
     """
     if not len(model.posed):
         return fit

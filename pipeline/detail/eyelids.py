@@ -1,11 +1,10 @@
-"""Eyes that are open in the model and closed in the photographs.
+"""Closes eyes that are open in the model and closed in the photographs.
 
-Both are told apart by what shows between the lids: the white of an eye has no colour of its own, iris and pupil are
-darker than skin; a closed lid is skin with a thin line of lashes. Where the model blinks, that closes the lids; where
-it has no such expression, they bridge the opening: what lies between them, and the margins that stand about it, become
-the smoothest surface that continues the skin around (biharmonic, Botsch and Kobbelt 2004, *An intuitive framework for
-real-time freeform modeling*), which the dense surface then draws to the lids themselves. The eyeball's part of a model
-lies behind and stays unseen.
+What is seen between the lids decides: the white of an eye has no colour, iris and pupil are darker than skin; a closed
+lid is skin with a thin line of lashes. If the model has a blink expression, that closes the lids. If not, they bridge
+the opening: the surface between the lids, with their margins, is replaced by the smoothest one that continues the skin
+around it (biharmonic; Botsch and Kobbelt 2004, *An intuitive framework for real-time freeform modeling*), which the
+measured surface then deforms to the lids themselves. The eyeball of a model lies behind it and stays hidden.
 """
 
 from collections.abc import Mapping
@@ -40,7 +39,7 @@ MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.07, 0.1  # of lids that are half closed
 @dataclass(frozen=True, slots=True)
 class EyeEvidence:
     """Holds what the photographs show between an eye's lids: the shares (0 to 1) of the opening that are white and
-    dark, and the opening of the lids where a face was found (``faces.eyes.eye_openings``)."""
+    dark, and how far the lids stand apart if a face was found (``faces.eyes.eye_openings``)."""
 
     white: float
     dark: float
@@ -102,14 +101,14 @@ def measure_eye_appearance(
     rig: Rig,
     openings: Mapping[str, float],
 ) -> dict[str, EyeEvidence]:
-    """Returns what shows between the lids of each eye (``right``, ``left``).
+    """Measures what the photographs show between the lids of each eye (``right``, ``left``).
 
     Args:
-        model: the topology.
+        model: the head model.
         vertices: the fitted head, full level, world frame, mm.
         images: photographs by camera, sRGB.
         rig: the cameras.
-        openings: of the lids of the found face, by side, where there is one.
+        openings: how far the lids of the found face stand apart, by side; empty without a face.
     """
     normals = vertex_normals(vertices, model.levels["full"].faces)
     found = {}
@@ -202,13 +201,8 @@ def with_plain_lids(
 def bridge_eyelids(
     vertices: Float[np.ndarray, "v 3"], model: HeadModel, closed: frozenset[str]
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the head with the lids of the named eyes closed.
-
-    Args:
-        vertices: full level, any frame, mm.
-        model: the topology.
-        closed: of ``right`` and ``left``.
-    """
+    """Returns the head with the lids of the eyes ``closed`` (``right``, ``left``) bridged. ``vertices`` are the full
+    level, in any frame, mm."""
     out, faces = vertices.copy(), model.levels["full"].faces
     for side in sorted(closed):
         rows = _lids(eye_fissure(model, side))

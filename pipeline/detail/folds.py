@@ -1,4 +1,4 @@
-"""No triangle may turn over: where a displacement folds the surface, it gives way to its neighbours'."""
+"""Removes folds from a displaced surface: where a triangle would turn over, the displacement is smoothed."""
 
 import numpy as np
 import scipy.sparse as sparse
@@ -15,7 +15,7 @@ GIVING_WAY = 0.8  # what a sweep leaves of a displacement, in the second half of
 def folded(
     before: Float[np.ndarray, "v 3"], after: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles a displacement turns over or squeezes to almost no area."""
+    """Tells which triangles a displacement turns over, or squeezes to almost no area."""
     old, new = face_normals(before, faces), face_normals(after, faces)
     size, length = np.linalg.norm(old, axis=1), np.linalg.norm(new, axis=1)
     return ((old * new).sum(axis=1) <= MAX_TURN * size * length) | (length < MIN_AREA * size)
@@ -24,12 +24,9 @@ def folded(
 def unfolded(
     before: Float[np.ndarray, "v 3"], after: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices ``after`` a displacement, with folds removed: about each fold the displacement is smoothed
-    until no triangle is turned over.
-
-    In the second half of the sweeps the displacement there also shrinks, so that the vertices go back towards
-    ``before``.
-    """
+    """Returns the displaced vertices ``after`` without folds. Around each fold the displacement from ``before`` is
+    smoothed until no triangle is turned over. In the second half of the sweeps it also shrinks there, so that the
+    vertices return towards ``before``."""
     bad = faces[folded(before, after, faces)]
     if not len(bad):
         return after

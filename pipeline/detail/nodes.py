@@ -1,8 +1,9 @@
-"""The meshes that a displacement is solved on: fine enough for what photographs resolve, and no finer.
+"""Provides the meshes of control points on which a displacement is solved: as fine as photographs resolve, and no
+finer.
 
-A model that refines its cage by subdivision gives both: its cage, and one step before its full level (edges of 1.7 mm
-in the face, where the windows of dense matching are 2.6 mm wide). Their vertices are control points, and the full level
-follows them smoothly. A model with no subdivision is solved on its own vertices, with a decimated level before it.
+A model that refines its cage by subdivision has both: its cage, and the mesh one step before its full level (edges of
+1.7 mm in the face, where the windows of dense matching are 2.6 mm wide). The full level follows these smoothly. A model
+without subdivision is solved on its own vertices, and before that on a decimated level.
 """
 
 from dataclasses import dataclass

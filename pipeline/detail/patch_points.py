@@ -1,9 +1,10 @@
-"""The photographs once more, on the displaced head: what windows of dense matching flatten, patches of the surface say.
+"""Measures the deformed head once more with patches of its own surface, where the windows of dense matching flatten it.
 
-Dense windows are planes; they see curved skin too flat and too deep (``pipeline.stereo.window_bias``). A patch of the
-displaced head itself (``pipeline.photometric_fit.patches``) has its shape already, so that all its views are warped
-rightly, and so are the cameras' corrections that the fit found. So patches say the last tenths of a millimetre,
-narrower ones than those that the fit was solved with, wherever they match; dense points carry on beside them."""
+Dense windows are planes; they make curved skin too flat and too deep (``pipeline.stereo.window_bias``). A patch of the
+deformed head (``pipeline.photometric_fit.patches``) has its shape already, so that it is warped rightly into all its
+views, with the cameras' corrections that the fit found. Patches narrower than those of the fit determine the last
+tenths of a millimetre where they match. Elsewhere the dense points are used.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -42,8 +43,8 @@ class PatchPlaces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchSearch:
-    """Holds what a search with patches needs: the photographs, the cameras with the fit's corrections, and the patches
-    of a model."""
+    """Holds what a search with patches needs: the photographs, the cameras with the fit's corrections, and a model's
+    patches."""
 
     model: HeadModel
     patches: Patches
@@ -54,8 +55,8 @@ class PatchSearch:
     settings: PhotoSettings
 
     def places(self, vertices: Float[np.ndarray, "v 3"]) -> PatchPlaces:
-        """Finds where the photographs see the surface near a head (world frame, mm). Keeps the patches with a clear
-        match in several views that hair does not cover."""
+        """Measures where the photographs show the surface near a head (world frame, mm). Patches without a clear match
+        in several views, and those under hair, are left out."""
         level, coarse = self.model.levels["full"], self.model.levels[DEPTH_LEVEL]
         head, hiding = Mesh(vertices, level.faces), Mesh(vertices[coarse.rows], coarse.faces)
         speaks = self.photographs.speaks
@@ -82,14 +83,14 @@ def patch_search(
     *,
     settings: PhotoSettings,
 ) -> PatchSearch:
-    """Prepares the search: lays patches on ``model`` and loads the photographs of the views that have a silhouette.
+    """Prepares the search: chooses patches on ``model``, and loads the photographs of the views that have a silhouette.
 
     Args:
-        model: whose full level the patches lie on.
-        fit: for the cameras' corrections.
+        model: the patches lie on its full level.
+        fit: has the cameras' corrections.
         images: sRGB photographs by camera.
-        distances: signed distances of the silhouettes (px), by camera.
-        hair: how probably each pixel shows hair, by camera.
+        distances: signed distances to the silhouettes (px), by camera.
+        hair: for each camera, the probability that a pixel shows hair.
         rig: the cameras as calibrated.
         settings: thresholds.
     """

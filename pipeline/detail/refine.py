@@ -1,13 +1,13 @@
-"""The fitted head drawn to the dense surface.
+"""Deforms the fitted head to the measured surface.
 
-Enters: a fit with its posterior, and the dense stage's oriented points. Leaves: every vertex of the model's full level
-displaced (same vertices, same order), and its deviation. The displacement is a smooth field (``smooth_field``) whose
-amplitude is what the fit itself says that it may be off; each point of skin pulls the place of the head that it shows
-along their normals (``association``), robustly; where no point speaks the fit's own shape carries on. Coarse to fine:
-first every node moves in three dimensions, with a long reach, which brings ears and jaw in place and slides smoothly;
-then the vertices move along their normals alone, so that a vertex stays the same place on every subject.
+Enters: a fit with its covariance, and the surface points of the depth maps with normals. Leaves: every vertex of the
+model's full level displaced (same vertices, same order), and its standard deviation. The displacement is a smooth field
+(``smooth_field``) whose amplitude is the uncertainty of the fit. Each point of skin pulls the point of the head that it
+shows along their normals (``association``), robustly; where there are no points the shape of the fit is kept.
 
-Hair bounds and does not pull: a point of hair or clothes says that the skin does not stand out of it.
+It goes from coarse to fine. First every node moves in three dimensions, over a long range, which brings ears and jaw
+into place. Then the vertices move along their normals alone, so that a vertex remains the same point on every subject.
+Points of hair and clothes do not pull; they only say that the skin does not reach beyond them.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,8 +49,8 @@ SEED = 16
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds the limits of one round, which finds the places of the points and then solves for the displacement.
-    ``agreement`` is the least cosine between a point's normal and the head's."""
+    """Holds the limits of one round, which first associates the points with the head and then solves for the
+    displacement. ``agreement`` is the smallest cosine between a point's normal and the head's."""
 
     reach_mm: float
     loose_reach_mm: float
@@ -66,8 +66,8 @@ PATCH_REACH_MM = 4.0  # about a patch no dense point is asked: a window reaches 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shown:
-    """Holds what points say of the head, and the n of skin among them: their triangles' corners, their places there and
-    their deviations."""
+    """Holds the observations of the head that surface points give; for the n points of skin among them, also the
+    triangles that they show (corners and barycentric coordinates) and their deviations."""
 
     observed: Observed
     corner: Int[np.ndarray, "n 3"]
@@ -77,7 +77,8 @@ class Shown:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeformedSurface:
-    """Holds the displaced head (world frame, mm), the deviation of each vertex, and how far its eyes are closed."""
+    """Holds the deformed head (world frame, mm), the standard deviation of each vertex, whether a point of skin shows
+    it, and how far the eyes are closed."""
 
     vertices: Float[np.ndarray, "v 3"]
     deviation_mm: Float[np.ndarray, " v"]  # along the normal
@@ -99,23 +100,23 @@ def refine_to_surface(
     patches: PatchSearch | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
-    """Displaces the fitted head to the dense surface.
+    """Deforms the fitted head to the measured surface.
 
     Args:
-        fit: with its posterior.
+        fit: with its covariance.
         model: with the modes that the fit has.
-        surface: what the dense stage knows, world frame.
-        settings: lengths and floors.
-        eigenheads: how many of the modes are a population's; the rest, expressions apart, are smooth deformations along
-            the normals.
-        deviation_mm: what the fit says of every vertex (``vertex_deviation_mm``).
-        eyes: what photographs show between the lids (``measure_eye_appearance``); without it they stay as the model has
+        surface: the measured surface points, world frame.
+        settings: lengths and lower limits.
+        eigenheads: how many of the modes are eigenheads; the rest, expressions apart, are smooth deformations along the
+            normals.
+        deviation_mm: standard deviation of every vertex in the fit (``vertex_deviation_mm``).
+        eyes: what photographs show between the lids (``measure_eye_appearance``); None keeps the lids as the model has
             them.
-        patches: the photographs, to be asked once more on the displaced head.
-        report: told the share done.
+        patches: measures the deformed head once more with the photographs; None leaves that out.
+        report: called with the share that is done.
 
     Returns:
-        The displaced head, without spoilt triangles (``untangling``), and what was decided about the eyes.
+        The deformed head, without degenerate triangles (``untangling``), and the state of the eyes.
     """
     faces = model.levels["full"].faces
     fitted = fit.world_from_head.apply(model.vertices(fit.coefficients))
@@ -157,21 +158,21 @@ def deform_to_points(
     look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
-    """Displaces a surface to points that another surface shows, where there are points near it.
+    """Deforms a surface to measured points, where there are points near it.
 
     Args:
         vertices: of the surface, mm.
         deviation_mm: how far they may be off, along their normals.
         faces: its triangles.
-        nodes: the meshes that the displacement is solved on.
-        surface: the points, same frame.
-        settings: lengths and floors.
+        nodes: the meshes on which the displacement is solved.
+        surface: the points, in the same frame.
+        settings: lengths and lower limits.
         loose: vertices that may be farther off than the others.
-        look: asks the photographs about the surface as it stands.
-        report: told the share done.
+        look: measures the surface once more with the photographs; None leaves that out.
+        report: called with the share that is done.
 
     Returns:
-        The same vertices displaced; where no point is near, as they were.
+        The same vertices displaced; far from all points they are unchanged.
     """
     amplitude = np.maximum(deviation_mm, settings.least_amplitude_mm)
     informative = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
@@ -222,11 +223,11 @@ def observe(
     settings: FineSettings,
     floor_mm: float,
 ) -> Shown:
-    """Returns what the points say of the head at ``now``: their offsets (mm) from ``base``. Points of hair count only
-    where the head stands out of them.
+    """Returns the observations that the points give of the head at ``now``: their offsets (mm) from ``base``. Points of
+    hair count only where the head reaches beyond them.
 
-    A normal is half the point's, half the head's (Rusinkiewicz 2019, *A symmetric objective function for ICP*): exact
-    to second order where both are curved.
+    The normal of an observation is half the point's and half the head's (Rusinkiewicz 2019, *A symmetric objective
+    function for ICP*), which is exact to second order where both are curved.
     """
     normals = vertex_normals(now, faces)
     found = associate(
@@ -268,8 +269,8 @@ def with_patches(
     faces: Int[np.ndarray, "f 3"],
     robust_mm: float,
 ) -> Observed:
-    """Returns the observations of the patches, measured on the head at ``now``, with the dense observations farther
-    than ``PATCH_REACH_MM`` from every patch."""
+    """Replaces observations by those of the patches near them: adds the patches' measurements on the head at ``now``,
+    and drops the dense observations within ``PATCH_REACH_MM`` of a patch."""
     vertex, normals = found.vertex, vertex_normals(now, faces)[found.vertex]
     if not len(vertex):
         return observed
@@ -289,7 +290,8 @@ def with_patches(
 
 
 def typical_deviation(shown: Shown, faces: Int[np.ndarray, "f 3"], count: int) -> Float[np.ndarray, " v"]:
-    """Returns the mean deviation (mm) of the points of skin about each of ``count`` vertices; 0 without any."""
+    """Returns the mean standard deviation (mm) of the points of skin around each of ``count`` vertices; 0 where there
+    are none."""
     if not len(shown.corner):
         return np.zeros(count)
     known = np.bincount(shown.corner.ravel(), shown.blend.ravel(), count)
@@ -331,8 +333,8 @@ def field_deviation(
     *,
     common_mm: Float[np.ndarray, " v"],
 ) -> Float[np.ndarray, " v"]:
-    """Returns the standard deviation (mm) of every vertex along its normal. Near observed vertices it comes from draws
-    of the posterior and from the error ``common_mm`` that points share; far from them it is at least
+    """Returns the standard deviation (mm) of every vertex along its normal. Near observed vertices it comes from random
+    draws of the posterior and from the error ``common_mm`` that all points share; far from them it is at least
     ``deviation_mm``."""
     draws = posterior.draws(np.random.default_rng(SEED), settings.draws)
     square = common_mm**2

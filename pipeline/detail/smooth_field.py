@@ -1,14 +1,15 @@
-"""A displacement of a head that varies smoothly along its surface, as a Gaussian field with a sparse precision.
+"""Defines a displacement that varies smoothly along a head's surface: a Gaussian random field with a sparse precision
+matrix.
 
 Lindgren, Rue and Lindstroem (2011), *An explicit link between Gaussian fields and Gaussian Markov random fields*
 (https://doi.org/10.1111/j.1467-9868.2011.00777.x): the solution of ``(kappa^2 - Laplace) tau x = white noise`` on a
-surface is a Matern field with nu = 1, standard deviation ``1 / (sqrt(4 pi) kappa tau)`` and a correlation that has
-fallen to 0.14 at ``sqrt(8) / kappa``. In linear finite elements, with lumped masses M and stiffness S,
+surface is a Matern field with nu = 1, standard deviation ``1 / (sqrt(4 pi) kappa tau)``, and a correlation that falls
+to 0.14 at ``sqrt(8) / kappa``. With linear finite elements, lumped masses M and stiffness S,
 
-    precision = tau^2 K M^-1 K,   K = kappa^2 M + S.
+    precision = tau^2 K M^-1 K,    K = kappa^2 M + S.
 
-Here the field has unit deviation; the displacement is it times an amplitude, vertex by vertex. Where nothing is
-observed it carries on from what is, and fades to nothing over ``length_mm = 1 / kappa``.
+The field here has unit deviation; the displacement is the field times an amplitude at each vertex. Where nothing is
+observed it continues the observed displacement, and fades to nothing over ``length_mm = 1 / kappa``.
 """
 
 from dataclasses import dataclass
@@ -35,19 +36,20 @@ class SmoothField:
         return self.length_mm**2 / (4.0 * np.pi)
 
     def draw(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "v n"]:
-        """Returns ``n`` draws with the precision as their covariance: of ``tau K M^-1/2`` times white noise."""
+        """Returns ``count`` random draws of the field, one in each column."""
         noise = rng.standard_normal((len(self.mass), count)) / np.sqrt(self.mass)[:, None]
         return np.sqrt(self.precision_scale) * (self.operator @ noise)
 
     def precision(self) -> sparse.csr_array:
-        """Returns (v, v), tau^2 K M^-1 K."""
+        """Returns the precision matrix (v, v) of the field, tau^2 K M^-1 K."""
         return sparse.csr_array(
             self.precision_scale * (self.operator @ sparse.diags_array(1.0 / self.mass) @ self.operator)
         )
 
 
 def smooth_field(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], length_mm: float) -> SmoothField:
-    """Returns the field on a mesh of the given shape (mm). Cotangents are held in bounds, so that it stays definite."""
+    """Returns the field on a mesh of the given shape (mm). The cotangents of its angles are limited, so that the
+    precision matrix stays positive definite."""
     count = len(vertices)
     stiffness, mass = sparse.csr_array((count, count)), np.zeros(count)
     corners = vertices[faces]

@@ -1,12 +1,10 @@
-"""The displacement that the field's prior and point-to-plane observations agree on, and what they leave open.
+"""Solves for the displacement on which the field's prior and point-to-plane observations agree, and for its
+uncertainty.
 
-Unknown: a unit field w on the nodes, in ``d`` directions each (three, or one along the normals); the head moves by
-``operator @ (amplitude w direction)``. With K observations ``n . X = e`` of information q between three vertices each,
-
-    tr(w^T Q w) + sum q (n . dX(w) - e)^2
-
-is a sparse linear problem, solved exactly; draws of its posterior cost one more solution each (Papandreou and Yuille
-2010, *Gaussian sampling by local perturbations*).
+Unknown is a unit field w on the nodes, in ``d`` directions each (three, or one along the normals); the head moves by
+``operator @ (amplitude w direction)``. With K observations ``n . X = e`` of information q, each at a point inside a
+triangle, tr(w^T Q w) + sum q (n . dX(w) - e)^2 is a sparse linear problem, solved exactly. Each random draw of its
+posterior takes one more solution (Papandreou and Yuille 2010, *Gaussian sampling by local perturbations*).
 """
 
 from dataclasses import dataclass
@@ -25,7 +23,8 @@ from pipeline.head_model.subdivision import row_count
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Holds n observations of the surface, each between the three vertices of a triangle of the full level."""
+    """Holds n observations of the surface: offsets (mm) along normals at points inside triangles of the full level,
+    with their information (mm^-2)."""
 
     corner: Int[np.ndarray, "n 3"]
     blend: Float[np.ndarray, "n 3"]
@@ -36,8 +35,8 @@ class Observed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directions:
-    """Holds the matrix (3 v, d n) that turns the field into displacements: rows are the coordinates of the v vertices,
-    columns the d directions of the n nodes."""
+    """Holds the matrix (3 v, d n) that turns the solver's unknowns, d at each of n nodes, into displacements (mm) of
+    the head's v vertices: x, y and z of each vertex are three rows."""
 
     matrix: sparse.csr_array
     count: int  # d

@@ -1,4 +1,4 @@
-"""What the dense stage knows of the surface, as oriented points."""
+"""Holds the measured surface as points with normals."""
 
 from dataclasses import dataclass, replace
 
@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePoints:
-    """Holds n points of the visible surface in the world frame, each with its normal, its deviation and the part of the
-    head that it shows."""
+    """Holds n points of the visible surface in the world frame, each with its normal, its standard deviation, and the
+    part of the subject that it shows."""
 
     points: Float[np.ndarray, "n 3"]  # mm
     normals: Float[np.ndarray, "n 3"]  # unit, outwards
@@ -27,17 +27,18 @@ def with_scaled_deviation(surface: SurfacePoints, factor: float | Float[np.ndarr
 
 
 def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
-    """Returns at most one point for each cell of a grid, part of the head and main direction of the normal: the mean of
-    the points there, weighted by their information.
+    """Thins out points: returns the mean, weighted by information, of the points in each cell of a grid, for each part
+    of the subject and main direction of the normal.
 
-    The deviation stays that of a single point: neighbours err alike, since their windows overlap.
+    The deviation remains that of a single point: neighbouring points have nearly the same error, since their windows
+    overlap.
 
     Args:
         surface: points, mm.
         cell_mm: edge of a cell.
 
     Returns:
-        The means; order is that of the cells, the same for the same input.
+        The means, in the order of the cells.
     """
     if not len(surface.points):
         return surface

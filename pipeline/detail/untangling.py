@@ -1,11 +1,10 @@
-"""A head's mesh that no triangle spoils: none turned over, none folded onto its neighbour, none through another.
+"""Repairs a head's mesh so that no triangle is turned over, folded onto its neighbour, or passes through another.
 
-Expressions, kernel modes and displacements move vertices one by one and know nothing of the surface: lips that are
-pressed together pass through each other, lids that close fold behind the brow, an ear sinks into the head. Each such
-spot becomes the membrane through what is about it (every vertex the mean of its neighbours): loops shrink to nothing,
-and of two sheets that went through each other each stays on its side, as their borders do. A spot that is not clean
-then takes more rings of triangles along; all other vertices stay where they are, so that the mesh is the nearest clean
-one but for the spots themselves, most of which lie in slits that nobody sees.
+Expressions, kernel modes and displacements move vertices one by one, regardless of the surface: closed lips pass
+through each other, lids that close fold behind the brow, an ear sinks into the head. Each such spot is replaced by the
+membrane through its surroundings (every vertex the mean of its neighbours): loops shrink to nothing, and two sheets
+that went through each other separate, as their borders are separate. If a spot is not clean then, it is enlarged by
+rings of triangles. All other vertices stay where they are; most of these spots lie in slits that nobody sees.
 """
 
 from dataclasses import dataclass
@@ -29,8 +28,8 @@ ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Topology:
-    """Holds a mesh's triangles, the pairs of triangles that share an edge, and a matrix with 1 for every two vertices
-    joined by an edge (``beside``)."""
+    """Holds a mesh's triangles, the pairs of triangles that share an edge (``pairs``), and a sparse matrix with 1 for
+    every two vertices joined by an edge (``beside``)."""
 
     faces: Int[np.ndarray, "f 3"]
     pairs: Int[np.ndarray, "e 2"]
@@ -58,11 +57,11 @@ def head_topology(model: HeadModel) -> Topology:
 def untangled_head(
     model: HeadModel, vertices: Float[np.ndarray, "v 3"], deviation_mm: Float[np.ndarray, " v"]
 ) -> tuple[Mesh, Float[np.ndarray, " v"]]:
-    """Returns the head without spoilt triangles, and the deviation of each vertex enlarged by the distance that it
-    moved.
+    """Returns the head without degenerate triangles, and the standard deviation of each vertex enlarged by the distance
+    that it was moved.
 
     Args:
-        model: the topology.
+        model: the head model.
         vertices: full level, mm.
         deviation_mm: standard deviation of each vertex.
     """
@@ -72,8 +71,8 @@ def untangled_head(
 
 
 def untangled(vertices: Float[np.ndarray, "v 3"], topology: Topology) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices with every spoilt spot smoothed. The result is tested in single precision, as files store
-    it."""
+    """Returns the vertices with every degenerate spot smoothed. The result is tested in single precision, as files
+    store it."""
     out, faces = vertices.astype(np.float32, order="C").astype(float), topology.faces
     times, touched = np.zeros(len(out), int), np.zeros(len(out), bool)
     spoilt = spoilt_faces(out, topology)
@@ -92,8 +91,8 @@ def untangled(vertices: Float[np.ndarray, "v 3"], topology: Topology) -> Float[n
 def spoilt_faces(
     vertices: Float[np.ndarray, "v 3"], topology: Topology, within: Bool[np.ndarray, " v"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles are turned over, folded onto a neighbour or crossing another one. With ``within``, looks
-    only at triangles with a corner among those vertices, and at what they touch or cross."""
+    """Tells which triangles are turned over, folded onto a neighbour, or crossing another one. If ``within`` is not
+    None, only triangles with a corner among those vertices, and those that they touch or cross, are tested."""
     active = None if within is None else _any_corner(within, topology.faces)
     return turned_faces(vertices, topology, active) | crossing_faces(vertices, topology.faces, active)
 
@@ -102,7 +101,7 @@ def turned_faces(
     vertices: Float[np.ndarray, "v 3"], topology: Topology, active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
     """Tells which triangles face against the mean normal of their corners, or are folded by more than ``MAX_FOLD_DEG``
-    against a triangle across an edge. With ``active``, looks only at those triangles and their neighbours."""
+    against a neighbour. If ``active`` is not None, only those triangles and their neighbours are tested."""
     faces, count = topology.faces, len(vertices)
     near = np.ones(len(faces), bool) if active is None else _around(_around(active, faces, count), faces, count)
     rows, pairs = np.flatnonzero(near), topology.pairs

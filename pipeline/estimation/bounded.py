@@ -15,11 +15,12 @@ def least_within(
     lower: Float[np.ndarray, " p"],
     upper: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " p"]:
-    """Returns the x that minimises ``x^T M x / 2 + g^T x`` with ``lower <= x <= upper``, M symmetric and positive
-    definite.
+    """Returns the x that minimises ``x^T M x / 2 + g^T x`` subject to ``lower <= x <= upper``, where ``matrix`` M is
+    symmetric and positive definite and ``gradient`` is g.
 
-    The unknowns without a bound are eliminated: with them first, the last corner of M's root is the root of their
-    Schur complement.
+    Bounds may be infinite. The unknowns without any bound are eliminated first, so that only the few bounded ones need
+    a search: with the unbounded ones in front, the last corner of M's Cholesky factor is the factor of their Schur
+    complement.
     """
     tied = np.isfinite(lower) | np.isfinite(upper)
     order = np.concatenate([np.flatnonzero(~tied), np.flatnonzero(tied)])

@@ -32,8 +32,8 @@ Solve = Callable[[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]], Float[np.n
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Holds the stopping rule and the first damping of a search. ``tolerance``: the least predicted fall of the cost
-    (squared standard deviations) that is worth another step."""
+    """Holds the rule by which a search stops, and its first damping. ``tolerance`` is in squared standard deviations: a
+    step whose predicted fall of the cost is smaller is not worth taking."""
 
     steps: int = 50
     tolerance: float = 1e-6
@@ -56,8 +56,8 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution(Generic[Value]):
-    """Holds the best value of a search, the problem linearised there (for its normal equations), and how the search
-    ended."""
+    """Holds the result of a search: the best value, the problem linearised there (from which a covariance can be
+    computed), and how the search ended."""
 
     value: Value
     at: Linearised
@@ -83,12 +83,13 @@ def minimise(
     """Searches for a local minimum of the problem's cost by Levenberg-Marquardt.
 
     Args:
-        problem: terms, unknowns, and how a step moves a value.
-        start: a value where all terms are finite.
+        problem: terms, number of unknowns, and how a step changes a value.
+        start: a value at which all terms are finite.
         limits: when to stop.
-        solve: of symmetric positive definite systems; raises LinAlgError where one is not, which costs a try.
-        at_start: the problem at ``start`` where the caller has it already.
-        watch: called before every step; what it raises ends the search.
+        solve: solves a symmetric positive definite system. Where the matrix is not definite it raises LinAlgError; the
+            step is then tried again with more damping.
+        at_start: the problem linearised at ``start``, if the caller has it already.
+        watch: called before every step; an exception that it raises ends the search.
     """
     here = at_start or problem.at(start)
     now = best = _Place(start, here, here.cost)

@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 
 def inverse(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Returns M^-1, exactly symmetric."""
+    """Returns the inverse of a symmetric positive definite matrix, exactly symmetric. Raises LinAlgError if it is not
+    definite."""
     root = _root(matrix)
     (invert,) = scipy.linalg.get_lapack_funcs(("potri",), (root,))
     found, fault = invert(root, lower=1)
@@ -16,7 +17,11 @@ def inverse(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
 
 
 def inverse_diagonal(matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"]:
-    """Returns the diagonal of M^-1: with M = L L^T the squares of L^-1, column by column."""
+    """Returns the diagonal of the inverse of a symmetric positive definite matrix M. Raises LinAlgError if it is not
+    definite.
+
+    With M = L L^T, the diagonal is the sum of squares of each column of L^-1.
+    """
     root = _root(matrix)
     (invert,) = scipy.linalg.get_lapack_funcs(("trtri",), (root,))
     found, fault = invert(root, lower=1)

@@ -13,66 +13,77 @@ from jaxtyping import Float
 
 @runtime_checkable
 class Loss(Protocol):
-    """Describes a robust loss; both methods take squared residuals, without unit, and keep their shape."""
+    """Describes a robust loss rho. Both methods take squared residuals s, in squared standard deviations, and return an
+    array of the same shape."""
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Returns rho(s)."""
         ...
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Returns rho'(s): 1 at 0, less for residuals that the loss forgives."""
+        """Returns rho'(s), the weight of each residual: 1 at s = 0, and less the larger the residual, down to almost 0
+        for gross errors."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class LeastSquares:
-    """Computes the loss rho(s) = s of Gaussian errors."""
+    """Computes the loss rho(s) = s, which suits Gaussian errors: every residual has full weight."""
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Returns the squares themselves."""
         return squares
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Returns 1 for every residual."""
         return np.ones_like(squares)
 
 
 @dataclass(frozen=True, slots=True)
 class GemanMcClure:
-    """Computes the loss rho(s) = s / (1 + s / c^2), at most c^2, so that residuals of many c have almost no weight.
-    Geman and McClure 1987.
+    """Computes Geman and McClure's loss (1987), rho(s) = s / (1 + s / c^2). It never exceeds c^2, so that residuals of
+    many c have almost no weight.
 
-    ``scale``: c, in the unit of the unsquared residual; an array sets it for each residual.
+    ``scale`` is c, in the unit of the unsquared residual; an array gives each residual its own scale.
     """
 
     scale: float | Float[np.ndarray, "*n"]
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Returns s / (1 + s / c^2) for each squared residual s."""
         return squares / (1.0 + squares / self.scale**2)
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Returns 1 / (1 + s / c^2)^2 for each squared residual s."""
         return 1.0 / (1.0 + squares / self.scale**2) ** 2
 
 
 @dataclass(frozen=True, slots=True)
 class Cauchy:
-    """Computes the loss rho(s) = c^2 log(1 + s / c^2), where ``scale`` is c."""
+    """Computes the loss rho(s) = c^2 log(1 + s / c^2), where ``scale`` is c, in the unit of the unsquared residual."""
 
     scale: float
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Returns c^2 log(1 + s / c^2) for each squared residual s."""
         return self.scale**2 * np.log1p(squares / self.scale**2)
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Returns 1 / (1 + s / c^2) for each squared residual s."""
         return 1.0 / (1.0 + squares / self.scale**2)
 
 
 @dataclass(frozen=True, slots=True)
 class Huber:
-    """Computes the loss rho(s) = s up to c^2, 2 c sqrt(s) - c^2 beyond, where ``scale`` is c. Huber 1964."""
+    """Computes Huber's loss (1964): rho(s) = s up to c^2, and 2 c sqrt(s) - c^2 beyond, where ``scale`` is c, in the
+    unit of the unsquared residual."""
 
     scale: float
 
     def cost(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Returns rho(s) for each squared residual s."""
         return np.where(squares < self.scale**2, squares, 2.0 * self.scale * np.sqrt(squares) - self.scale**2)
 
     def weight(self, squares: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Returns 1 for residuals of up to c, and c / sqrt(s) for larger ones."""
         return np.minimum(1.0, self.scale / np.sqrt(np.maximum(squares, 1e-12)))

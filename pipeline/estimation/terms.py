@@ -27,6 +27,7 @@ class NormalEquations:
 
     @classmethod
     def empty(cls, size: int) -> "NormalEquations":
+        """Returns equations of ``size`` unknowns to which no term has been added: all zeros."""
         return cls(np.zeros((size, size)), np.zeros(size))
 
 
@@ -36,10 +37,13 @@ ValueIn = TypeVar("ValueIn", contravariant=True)
 
 @runtime_checkable
 class Linearised(Protocol):
-    """Describes a term at one value: its cost, and a method that adds its normal equations to others."""
+    """Describes a term of the cost at one value of the unknowns: its cost there, and its part of the normal
+    equations."""
 
     @property
-    def cost(self) -> float: ...
+    def cost(self) -> float:
+        """Returns the term's cost at this value, in squared standard deviations."""
+        ...
 
     def add_to(self, equations: NormalEquations) -> None:
         """Adds the term's matrix and gradient to ``equations`` in place, since matrices of a thousand unknowns take 8
@@ -49,9 +53,12 @@ class Linearised(Protocol):
 
 @runtime_checkable
 class Term(Protocol[ValueIn]):
-    """Describes one part of a cost."""
+    """Describes one part of a cost, such as a prior or the fit to feature points, as a function of the value to
+    estimate."""
 
-    def at(self, value: ValueIn, /) -> Linearised: ...
+    def at(self, value: ValueIn, /) -> Linearised:
+        """Returns the term evaluated at ``value`` and made linear there."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,13 +75,16 @@ class Residuals:
 
     @property
     def squares(self) -> Float[np.ndarray, " n"]:
+        """Returns the squared norm of each residual, in squared standard deviations."""
         return (self.residual**2).sum(axis=1)
 
     @property
     def cost(self) -> float:
+        """Returns the sum of the robust loss over all residuals."""
         return float(self.loss.cost(self.squares).sum())
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds J^T W J and J^T W r in place, where W holds the loss's weight of each residual."""
         root = np.repeat(np.sqrt(self.loss.weight(self.squares)), self.residual.shape[1])
         rows = self.jacobian().reshape(self.residual.size, -1) * root[:, None]
         equations.matrix[...] += rows.T @ rows  # A^T A: half the work of A^T B
@@ -97,21 +107,25 @@ class Quadratic:
         return cls(information, mean, np.zeros(len(mean)))
 
     def at(self, value: Float[np.ndarray, " p"]) -> "LinearisedQuadratic":
+        """Returns the form at the vector ``value``."""
         return LinearisedQuadratic(self, value - self.centre)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedQuadratic:
-    """Holds the form ``term`` at the distance ``away`` from its centre."""
+    """Holds the quadratic form ``term`` at a vector x, where ``away`` is x - c, the vector's offset from the form's
+    centre."""
 
     term: Quadratic
     away: Float[np.ndarray, " p"]
 
     @property
     def cost(self) -> float:
+        """Returns the value of the form; below zero where its linear part outweighs its quadratic part."""
         return float(self.away @ self.term.matrix @ self.away - 2.0 * self.term.pull @ self.away)
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the form's matrix M, and half of its gradient, M (x - c) - g, in place."""
         equations.matrix[...] += self.term.matrix
         equations.gradient[...] += self.term.matrix @ self.away - self.term.pull
 
@@ -124,25 +138,31 @@ class Sum:
 
     @property
     def cost(self) -> float:
+        """Returns the sum of the parts' costs."""
         return sum(part.cost for part in self.parts)
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the normal equations of every part in place."""
         for part in self.parts:
             part.add_to(equations)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeOnly:
-    """Holds a term restricted to the unknowns that are ``free`` (one flag for each of all q); the others stay fixed."""
+    """Holds a term restricted to the unknowns that may move. ``free`` has one flag for each of all q unknowns; those
+    whose flag is False stay fixed."""
 
     whole: Linearised
     free: Bool[np.ndarray, " q"]
 
     @property
     def cost(self) -> float:
+        """Returns the cost of the whole term, which the restriction does not change."""
         return self.whole.cost
 
     def add_to(self, equations: NormalEquations) -> None:
+        """Adds the rows and columns of the free unknowns alone, in place. ``equations`` has the size of the free
+        unknowns."""
         everything = NormalEquations.empty(len(self.free))
         self.whole.add_to(everything)
         equations.matrix[...] += everything.matrix[np.ix_(self.free, self.free)]
@@ -151,10 +171,12 @@ class FreeOnly:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem(Generic[Value]):
-    """Holds a complete problem: its terms, the number of unknowns, and the function that applies a step to a value.
+    """Holds a complete least-squares problem: its terms, the number of unknowns, and the function that applies a step
+    to a value.
 
-    ``free``: which of the unknowns move, all by default. ``moved(value, step)`` receives steps of all unknowns.
-    ``room(value)``: the least and the largest step of each free unknown, infinite where it has no bound.
+    ``free`` flags the unknowns that may move; None lets all of them move. ``moved(value, step)`` receives a step of all
+    unknowns and returns the new value. ``room(value)`` returns the smallest and the largest step that each free unknown
+    may take from there, infinite where it has no bound.
     """
 
     terms: tuple[Term[Value], ...]
@@ -169,11 +191,12 @@ class Problem(Generic[Value]):
         return self.unknowns if self.free is None else int(np.count_nonzero(self.free))
 
     def at(self, value: Value) -> Linearised:
+        """Returns the sum of all terms at ``value``, restricted to the free unknowns."""
         terms = Sum(tuple(term.at(value) for term in self.terms))
         return terms if self.free is None else FreeOnly(terms, self.free)
 
     def equations(self, here: Linearised) -> NormalEquations:
-        """Returns the normal equations of the free unknowns."""
+        """Returns the normal equations of the free unknowns for the linearised problem ``here``."""
         equations = NormalEquations.empty(self.size)
         here.add_to(equations)
         return equations

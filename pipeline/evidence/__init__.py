@@ -1,1 +1,1 @@
-"""What is measured on a finished head and what speaks against it: by camera, by length, by plausibility."""
+"""Measures a finished head and judges it: by camera, by length, by plausibility."""

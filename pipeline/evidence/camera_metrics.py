@@ -1,4 +1,4 @@
-"""How well a fitted head explains every camera: the figures of the report."""
+"""Measures how well a fitted head explains every camera: the figures of the report."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,11 +31,11 @@ Masks = Mapping[str, Bool[np.ndarray, "h w"]]
 class CameraFigures:
     """Holds how well the fitted head explains one camera's silhouette.
 
-    ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none trimmed; ``excluded_share`` is the
-    part of them (0 to 1) whose residual is too large for the fit to use. ``xor_cost`` is eq. (5) of the fitted head,
-    ``xor_cost_start`` of the head that the fit started from. ``outside_rms_px`` counts only how far the head reaches
-    beyond the mask: what lies inside it may be hidden by hair, hands or shoulders. A figure that a view cannot have (no
-    rim sample in it) is None.
+    ``iou`` and ``contour_rms_px`` are over all rim samples of the face region, none left out; ``excluded_share`` is the
+    part of them (0 to 1) whose residual is too large for the fit to use. ``xor_cost`` is eq. (5) for the fitted head,
+    ``xor_cost_start`` for the head at the start of the fit. ``outside_rms_px`` counts only how far the head reaches
+    beyond the mask: what lies inside it may be hidden by hair, hands or shoulders. A figure is None if it cannot be
+    computed for the view (no rim sample in it).
     """
 
     used: bool
@@ -56,8 +56,8 @@ def camera_figures(
     fitted: Masks,
     started: Masks,
 ) -> dict[str, CameraFigures]:
-    """Computes the figures of every camera, in the rig's order, with the cameras as calibrated rather than as the fit
-    corrected them."""
+    """Computes the figures of every camera, in the order of the rig. The cameras are those of the calibration, without
+    the corrections of the fit."""
     level = model.levels["full"]
     vertices = fit.world_from_head.apply(model.vertices(fit.coefficients))
     views = pack_views(rig, {camera.name: silhouettes[camera.name].distance for camera in rig})

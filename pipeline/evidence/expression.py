@@ -1,4 +1,5 @@
-"""What face a fitted head makes, the same head without it, and its shapes under Apple's names for animation."""
+"""Describes the expression of a fitted head, removes it, and provides morph targets under Apple's names for
+animation."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -29,13 +30,14 @@ class Found:
 
     @property
     def words(self) -> str:
+        """Returns the expression's name in plain words."""
         return words(self.name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlendshapeRig:
-    """Holds a neutral head, the morphs that animate it, and their weights on the photographed head. ``missing``:
-    Apple's names without a counterpart in the model; their morphs move nothing."""
+    """Holds a neutral head, the morph targets that animate it, and their weights on the photographed head. ``missing``
+    are those of Apple's names that have no counterpart in the model; their morph targets move nothing."""
 
     neutral_world: Mesh
     morphs: Mapping[str, Float[np.ndarray, "v 3"]]  # mm, head frame, at weight 1
@@ -50,8 +52,8 @@ def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
 
 
 def found_expressions(model: HeadModel, fit: Fit, least_sigma: float = MIN_SIGMA) -> tuple[Found, ...]:
-    """Returns the expressions whose weight is at least ``TOLD`` and more than ``least_sigma`` standard deviations, the
-    strongest first."""
+    """Returns the expressions of the head, the strongest first: those whose weight is at least ``TOLD`` and more than
+    ``least_sigma`` standard deviations."""
     weights = fitted_weights(model, fit)
     spread = None if fit.covariance is None else np.sqrt(np.diag(fit.covariance))[np.asarray(model.posed, int)]
     found = []
@@ -68,7 +70,7 @@ def shut_eyes(model: HeadModel, fit: Fit) -> frozenset[str]:
 
 
 def neutral_mesh(model: HeadModel, place: Similarity, mesh_world: Mesh, found: Collection[Found]) -> Mesh:
-    """Returns the head with the displacement of its expressions subtracted; all other detail stays."""
+    """Returns the head without the displacement of its expressions; all other detail is kept."""
     moved = model.levels["full"].operator @ model.expressions.moved({each.name: each.weight for each in found})
     back = place.scale * moved @ place.rotation.T
     return Mesh(mesh_world.vertices - back, mesh_world.faces, mesh_world.colours)

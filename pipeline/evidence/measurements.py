@@ -1,18 +1,19 @@
-"""Anthropometric landmarks and distances of a fitted head, with standard deviations by linear propagation.
+"""Measures anthropometric landmarks and distances of a fitted head, with standard deviations by linear propagation.
 
-What enters is a model, a fit and its covariance; what leaves is in the world frame, mm. A landmark is a vertex of the
-model's full level, so with ``x = s R (h0 + sum_m z_m h_m) + t`` (eq. 1 and the paper's T) its derivatives are exact:
-``s R h_m`` by a coefficient, ``-[x - t]x`` by a left rotation about the head's place, the identity by the translation
-and ``x - t`` by log scale. A distance has ``var = g C g^T``; its rotation and translation parts cancel by themselves.
+Enters: a model, a fit and its covariance. Leaves: landmarks and lengths in the world frame, mm. A landmark is a vertex
+of the model's full level. With ``x = s R (h0 + sum_m z_m h_m) + t`` (eq. 1 and the paper's T) its derivatives are
+exact: ``s R h_m`` by a coefficient, ``-[x - t]x`` by a rotation about the head's origin, the identity by the
+translation, and ``x - t`` by log scale. A distance has ``var = g C g^T``; its rotation and translation parts cancel.
 
-Where on the surface a landmark lies hardly shows in outlines or in photographs of skin; the eigenheads say it, and a
-head that strays from them strays along the surface, too. A landmark is unsure by ``Fit.sliding_mm`` in every direction
-of its tangent plane; two landmarks slide alike as far as the kernel of ``gaussian_process`` says for their distance.
+Outlines and photographs of skin hardly show where on the surface a landmark lies. The eigenheads determine it, and a
+head that deviates from them deviates along the surface, too. So a landmark is uncertain by ``Fit.sliding_mm`` in every
+direction of its tangent plane; two landmarks slide together as far as the kernel of ``gaussian_process`` says for their
+distance.
 
 Definitions follow Farkas, *Anthropometry of the Head and Face* (1994). Head length and breadth need three points that
-are not among the 26 landmarks: the farthest point of the back of the head from the glabella in the midsagittal plane
-(opisthocranion) and the most lateral points of the skull above the ears (euryon). They are found on the fitted head;
-the distance is stationary in their choice, so that its first-order variance does not see the choice. Heads without a
+are not among the 26 landmarks: the point of the back of the head farthest from the glabella in the midsagittal plane
+(opisthocranion), and the most lateral points of the skull above the ears (euryon). They are found on the fitted head.
+The distance is stationary in their choice, so that its first-order variance does not depend on it. Heads without a
 cranium (face-only models) have no such measurement.
 """
 
@@ -69,11 +70,8 @@ class Measurement:
 
 
 def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None) -> dict[str, Landmark]:
-    """Returns the model's landmarks on the fitted head, world frame, mm.
-
-    ``vertices``: the head as delivered (full level, world, mm) if it was refined beyond the fit; deviations stay the
-    fit's.
-    """
+    """Returns the model's landmarks on the fitted head, world frame, mm. If the head was refined beyond the fit,
+    ``vertices`` is the delivered head (full level, world, mm); the standard deviations remain those of the fit."""
     names = list(model.landmarks)
     index = np.array([model.landmarks[name] for name in names])
     points, jacobian = _points(model, fit, index)
@@ -90,7 +88,8 @@ def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | N
 def measurements(
     model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None
 ) -> dict[str, Measurement]:
-    """Returns every distance of ``DISTANCES`` whose end points the model has; ``vertices`` as for ``landmarks``."""
+    """Returns every distance of ``DISTANCES`` (mm) whose end points the model has, with its standard deviation. If the
+    head was refined beyond the fit, ``vertices`` is the delivered head (full level, world, mm)."""
     rows = dict(model.landmarks) | _cranial_points(model, fit)
     found = {name: ends for name, ends in DISTANCES.items() if ends[0] in rows and ends[1] in rows}
     index = np.array([[rows[a], rows[b]] for a, b in found.values()], int).reshape(-1)

@@ -1,10 +1,9 @@
-"""Is the result believable? Checks of a finished fit against what heads, rigs and masks are, each with its own code.
+"""Checks whether a finished fit is plausible, given what heads, rigs and masks are like. Each check has its own code.
 
-Enters: a fit and the figures of its cameras. Leaves: warnings. Nothing here changes a result;
-``settings.fail_on`` turns codes into failures.
-
-Thresholds stand beside what good captures gave at the deepest level: eyes closed and hair in a real scan (largest
-coefficient 3.5 standard deviations, scale 1.024), a draw of another population (4.3, 1.053).
+Enters: a fit and the figures of its cameras. Leaves: warnings. Nothing here changes a result; ``settings.fail_on``
+turns codes into failures. Thresholds are given together with what good captures had at the deepest level of detail: a
+real scan with closed eyes and hair (largest coefficient 3.5 standard deviations, scale 1.024), and a random head of
+another population (4.3, 1.053).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -51,10 +50,10 @@ class ImplausibleResult(EigenheadError):
 def plausibility_warnings(
     fit: Fit, model: HeadModel, cameras: Mapping[str, CameraFigures], widths_px: Mapping[str, int]
 ) -> list[ReportWarning]:
-    """Returns the warnings against a result: an unlikely shape, scale or size, or a poor contour.
+    """Returns the warnings about a result: an unlikely shape, scale or size, or a poor contour.
 
     Args:
-        fit: coefficients in standard deviations; scale against the model's own size.
+        fit: coefficients in standard deviations; scale relative to the model's own size.
         model: with the modes that the fit has.
         cameras: contour residuals of every camera.
         widths_px: of the pictures, by camera.
@@ -71,7 +70,7 @@ def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mappin
 
     Args:
         cameras: contour residuals of every camera.
-        pixels_mm: what a pixel shows at the head, by camera.
+        pixels_mm: width of a pixel at the head, by camera.
     """
     spoke = {name: of for name, of in cameras.items() if of.used and of.excluded_share is not None}
     misses_mm = [of.contour_rms_px * pixels_mm[name] for name, of in spoke.items() if of.contour_rms_px is not None]

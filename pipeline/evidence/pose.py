@@ -1,8 +1,8 @@
-"""Is the head where the photographs show the face? The pose judged against what was found, and against its rivals.
+"""Judges the pose: whether the head lies where the photographs show the face, and how much worse other poses are.
 
-Enters: the delivered head, the faces that were found in the photographs, and what the pose came from. Leaves:
-``PoseEvidence`` and warnings. A face that lies elsewhere in most of the views that show one is never passed over;
-where nobody found a face, outlines alone decided, and say so.
+Enters: the delivered head, the faces found in the photographs, and how the pose was found. Leaves: ``PoseEvidence`` and
+warnings. A face that lies elsewhere in most of the views that show one always gives a warning. If no face was found,
+the pose rests on outlines alone, and a warning says so.
 """
 
 from collections.abc import Mapping
@@ -64,10 +64,10 @@ def judge_pose(
         head_world: full level, mm.
         world_from_head: its pose.
         rig: the cameras as calibrated.
-        subject: the faces; None where nobody looked for any.
-        places: where on the head the landmarks are; None likewise.
-        method: what the pose came from: features, landmarks or silhouettes.
-        rival: of the search about silhouettes.
+        subject: the faces; None if they were not searched for.
+        places: where on the head the landmarks are; None if there is no face.
+        method: how the pose was found: features, landmarks or silhouettes.
+        rival: how much more the best other pose costs (``FoundPose.rival``).
     """
     warnings: list[ReportWarning] = []
     off: dict[str, float] = {}

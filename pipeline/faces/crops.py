@@ -1,6 +1,7 @@
-"""Crops: squares of a picture, level with a face, sampled to the size of a network's input.
+"""Cuts squares out of a picture, turned so that a face is upright in them, and resamples them to the size of a
+network's input.
 
-A picture is kept at full size and at halves, so that a crop of a large face is a mean over pixels and no single ones.
+A picture is kept at full size and repeatedly halved, so that a small sample of a large face averages over its pixels.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
-"""Faces in one picture, with 468 points on each.
+"""Finds faces in one picture, with 468 points on each.
 
-Enters: a picture as it was taken, turned as it may be. Leaves: ``FaceDetection``. The finder proposes faces in the
-picture turned by each quarter (it bears 45 degrees either way); a proposal is a face where the landmark network, whose
-crop then follows the points, says so. It looks at the face and at its mirror image, and the points are the means.
+Enters: a picture as it was taken, in whatever orientation. Leaves: ``FaceDetection``. The detector proposes faces in
+the picture turned by each quarter (it tolerates 45 degrees either way). A proposal counts as a face if the landmark
+network confirms it, in a crop that follows the points. The network is given the face and its mirror image; the points
+are the means of both.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,11 +41,10 @@ class FaceDetection:
     """Holds one face that was found in one picture.
 
     All positions are pixels of the picture as it was taken, lens distortion included; (0, 0) is the centre of the
-    top-left pixel. ``landmarks_px`` are the 468 points of the face mesh. ``roll_deg`` says how far the face's upright
-    is turned clockwise in the picture. ``irises_px`` holds five points of the subject's right eye, then five of the
-    left one: the centre of the iris, then its edge towards the nose, above, away from the nose and below. ``lids_px``
-    holds 16 points on the edges of the right eye's lids, in the order of ``points.RIGHT_EYE_OUTLINE``, then 16 of the
-    left.
+    top-left pixel. ``landmarks_px`` are the 468 points of the face mesh. ``roll_deg`` says how far the face is turned
+    clockwise in the picture. ``irises_px`` holds five points of the subject's right eye, then five of the left one: the
+    centre of the iris, then its edge towards the nose, above, away from the nose, and below. ``lids_px`` holds 16
+    points on the edges of the right eye's lids, in the order of ``points.RIGHT_EYE_OUTLINE``, then 16 of the left.
     """
 
     landmarks_px: Float[np.ndarray, "468 2"]
@@ -62,29 +62,28 @@ class FaceDetection:
 
 
 def find_faces(image: ImageRgb, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Finds the faces in a picture and returns them, best score first. Faces of an eighth of the picture's longer side
-    or more are searched first; faces down to half of that only where there are none."""
+    """Finds the faces in a picture, the best score first. Faces larger than an eighth of the picture's longer side are
+    searched first; smaller ones, down to half of that, only if there are none."""
     pyramid = make_pyramid(image)
     return find_large_faces(pyramid, networks) or find_small_faces(pyramid, networks)
 
 
 def find_large_faces(pyramid: Pyramid, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Finds the faces that are large enough to be seen in the picture as a whole. Takes 0.03 s where a face is upright,
-    else 0.06 s."""
+    """Finds the faces that are large enough to be detected in the whole picture. Takes 0.03 s for an upright face, else
+    0.06 s."""
     return _find(pyramid, _whole(pyramid), networks)
 
 
 def find_small_faces(pyramid: Pyramid, networks: FaceNetworks) -> tuple[FaceDetection, ...]:
-    """Finds smaller faces, in nine overlapping parts of the picture that are each searched at twice the size. Takes
-    0.35 s."""
+    """Finds smaller faces, in nine overlapping parts of the picture, each searched at twice the size. Takes 0.35 s."""
     return _find(pyramid, _parts(pyramid), networks)
 
 
 def find_face_at(
     pyramid: Pyramid, crop: Crop, networks: FaceNetworks, *, min_rounds: int = MIN_ROUNDS
 ) -> FaceDetection:
-    """Places the 468 points on the face in a crop. The crop is moved to the points until it settles; whether it held a
-    face is told by the result's score."""
+    """Places the 468 points on the face in a crop. The crop follows the points until they no longer change; the
+    result's score says whether it holds a face."""
     for count in range(MAX_ROUNDS):
         points, _, _ = _place(pyramid, crop, networks)
         before, crop = crop, crop_around(points)

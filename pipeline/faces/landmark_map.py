@@ -1,12 +1,13 @@
-"""Which surface point of a head model each of the finder's 468 points is, and how far it errs.
+"""Says which surface point of a head model each of the face detector's 468 points is, and how large the detector's
+error is.
 
-Both were measured on renders of heads of the model's own population (``python -m tests.support.landmark_map``) for the
-two models that are built in: MakeHuman's and ICT-FaceKit, known by their triangles. To any other model the points are
-carried from the first's mean head, by the landmarks that the models share, and what that costs is added to the noise.
+Both were measured on renders of heads of the model's own population (``python -m tests.support.landmark_map``), for the
+two models whose triangles are known: MakeHuman's and ICT-FaceKit. To any other model the points are transferred from
+the first one's mean head, by the landmarks that both have, and the error of that is added.
 
-A point that the finder puts at x (triangulated, without its biases) is ``map.points(vertices) + e``: e has mean
-``offset_mm``, a part of each point by its own (``deviation_mm``) and a part in which all move together (``shared_mm``),
-since the finder has an idea of a face and keeps to it.
+A point that the detector puts at x (triangulated, without its biases) is ``map.points(vertices) + e``. The error e has
+the mean ``offset_mm``, a part that is independent for each point (``deviation_mm``), and a part in which all points
+move together (``shared_mm``), since the detector has learned an average face and tends towards it.
 """
 
 import hashlib
@@ -42,8 +43,9 @@ class NoLandmarkMap(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:
-    """Holds the points on a head model's surface that the finder's 468 points stand for, and the finder's error at each
-    (mm, head frame). Arrays are read-only."""
+    """Holds the points on a head model's surface that the detector's 468 points stand for, and the detector's error at
+    each (mm, head frame). ``slides`` marks points that slide along the skin (jaw line, forehead). Arrays are
+    read-only."""
 
     rows: Int[np.ndarray, "468 3"]  # vertices of the full level
     weights: Float[np.ndarray, "468 3"]  # of them; each row sums to 1
@@ -58,23 +60,21 @@ class LandmarkMap:
         return (vertices[self.rows] * self.weights[..., None]).sum(axis=1)
 
     def expected(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "468 3"]:
-        """Returns where the finder puts the 468 points on average: the surface points with the finder's mean error
-        added (mm, head frame)."""
+        """Returns where the detector puts the 468 points on average: the surface points plus its mean error (mm, head
+        frame)."""
         return self.points(vertices) + self.offset_mm
 
     def covariance(self, which: Int[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
-        """Returns the covariance of the finder's errors at the named points (mm^2, head frame), ordered x y z of the
-        first point, x y z of the second and so on."""
+        """Returns the covariance of the detector's errors at the points ``which`` (mm^2, head frame), ordered x y z of
+        the first point, x y z of the second and so on."""
         modes = self.shared_mm[:, which].reshape(len(self.shared_mm), -1)
         return modes.T @ modes + np.diag(self.deviation_mm[which].ravel() ** 2)
 
 
 def landmark_map(model: HeadModel) -> LandmarkMap:
-    """Returns the landmark map of a head model. A built-in model, known by its triangles, has a measured one; for any
-    other the points are carried over from the default model's mean head.
-
-    Raises NoLandmarkMap where the model names too few landmarks.
-    """
+    """Returns the landmark map of a head model. Models whose triangles are known have a measured one; for any other,
+    the points are transferred from the default model's mean head. Raises NoLandmarkMap if the model names too few
+    landmarks."""
     digest = faces_digest(model)
     for name in BUILT_IN:
         if str(_table()[f"{name}_faces"]) == digest:

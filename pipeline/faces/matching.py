@@ -1,10 +1,9 @@
-"""Which faces in several pictures are one subject's.
+"""Finds which faces in several pictures are the same subject's.
 
-Enters: the faces found in each view. Leaves: ``MatchedFaces``, or None where no two views show one face. Two
-detections that may be one face are triangulated; what comes out must be of a face's size (mm), have a face's relief
-(a poster is flat), and look towards its cameras; other views join where their points project (epipolar consistency).
-Of several faces that the rig sees the one is taken that is large in the pictures and near to their middles: others
-stand behind.
+Enters: the faces found in each view. Leaves: ``MatchedFaces``, or None if no two views show one face. Every two
+detections that may be one face are triangulated. The result must have the size (mm) and the relief of a face (a poster
+is flat), and look towards its cameras. Further views are added if the points project onto their detections. Of several
+faces, the one is taken that is large in the pictures and near their middles: others stand behind.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,8 +45,8 @@ class MatchedFaces:
     """Holds one person's face as found in several views, and its 468 points in the world frame (mm).
 
     The error of a point is the sum of three: the point's own, independent of all others (``covariances``); the view's,
-    common to all points that the view shows (``shared_mm``: each mode times a standard normal number); and the
-    network's idea of a face, common to all views (the model's ``landmark_map.LandmarkMap``).
+    common to all points in a view (``shared_mm``: each row times a standard normal number); and the network's, which
+    tends towards an average face in all views (the model's ``landmark_map.LandmarkMap``).
     """
 
     detections: Mapping[str, FaceDetection]  # by view
@@ -79,13 +78,13 @@ def match_faces(
     *,
     eye_distance_mm: tuple[float, float] | None = EYE_DISTANCE_MM,
 ) -> MatchedFaces | None:
-    """Finds the subject's face among all faces that the views show, and triangulates its 468 points. Returns None where
-    no two views show one face.
+    """Finds the subject's face among all faces in the views, and triangulates its 468 points. Returns None if no two
+    views show one face.
 
     Args:
-        candidates: the faces found in each view, best first.
-        rig: holds the views' cameras.
-        eye_distance_mm: limits of a face's size; None where the rig's scale is not known.
+        candidates: the faces found in each view, the best first.
+        rig: the views' cameras.
+        eye_distance_mm: limits of a face's size; None if the rig's scale is not known.
     """
     best = find_subject_face(candidates, rig, eye_distance_mm)
     return best and complete_match(best, candidates, rig)
@@ -103,8 +102,7 @@ def find_subject_face(
 def complete_match(
     face: TriangulatedFace, candidates: Mapping[str, Sequence[FaceDetection]], rig: Rig
 ) -> MatchedFaces | None:
-    """Triangulates all 468 points of a face that was found. Returns None where its views do not
-    determine every point."""
+    """Triangulates all 468 points of a face that was found. Returns None if its views do not determine every point."""
     whole = triangulate_face(face.detections, rig)
     return whole and _matched(whole, rig, _outliers(face, candidates, rig))
 

@@ -55,11 +55,11 @@ class FaceNetworks:
     _lock: Any = field(default_factory=threading.Lock, repr=False)
 
     def find(self, crop: UInt8[np.ndarray, "192 192 3"]) -> tuple[Float[np.ndarray, "n 8 2"], Float[np.ndarray, " n"]]:
-        """Proposes a face for every cell of the 192 x 192 crop; most proposals are none, as their scores say.
+        """Proposes a face for every cell of the 192 x 192 crop. Most proposals are no faces, as their scores show.
 
         Returns:
             For each cell a face's centre, width and height, right eye, left eye, tip of the nose, mouth, right and left
-            tragion (the subject's right and left; px of the crop), and its score before the sigmoid.
+                tragion (the subject's right and left; px of the crop), and its score before the sigmoid.
         """
         names = ("reshaped_regressor_face_4", "reshaped_classifier_face_4")
         boxes, scores = self._run(self.finder, 2.0 * _blob(crop) - 1.0, names)

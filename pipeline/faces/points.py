@@ -1,7 +1,8 @@
-"""The 468 points of the landmark network: which are each other's mirror image, and the few that others lean on.
+"""Provides measured properties of the landmark network's 468 points: which are each other's mirror image, their mean
+shape, and their bias and noise. ``right`` and ``left`` are the subject's.
 
-``right`` and ``left`` are the subject's. The mirror images were measured: the network was run on faces and on their
-mirror images, and each point paired with the one that comes nearest (``python -m tests.support.landmark_map``).
+The network was run on faces and on their mirror images; each point was paired with the one that comes nearest (``python
+-m tests.support.landmark_map``).
 """
 
 from dataclasses import dataclass
@@ -23,10 +24,11 @@ inner one, then along the upper lid."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTable:
-    """Holds what was measured of the network's 468 points. Arrays are read-only. Face frame: x to the subject's left, y
-    up, z out of the face.
+    """Holds what was measured of the landmark network's 468 points. Arrays are read-only.
 
-    Noise is a share of the face's size in the picture. Its logarithm grows with ``1 - cos`` of the angle to the camera.
+    Face frame: x to the subject's left, y up, z out of the face. Noise is relative to the face's size in the picture.
+    Its logarithm grows linearly with ``1 - cos`` of the angle between the point's normal and the direction to the
+    camera.
     """
 
     mirror_images: Int[np.ndarray, " 468"]  # of each point; those of the midline are their own
@@ -39,7 +41,8 @@ class PointTable:
 
 @cache
 def point_table() -> PointTable:
-    """Returns the table of measurements that ships with the networks, read once."""
+    """Returns the ``PointTable`` that is shipped with the networks: mirror images, mean shape, bias and noise of their
+    468 points. It is read once."""
     with np.load(Path(__file__).parent / "packs" / "points.npz", allow_pickle=False) as table:
         arrays = {name: table[name].astype(int if name == "mirror_images" else float) for name in table.files}
     for array in arrays.values():
@@ -48,9 +51,9 @@ def point_table() -> PointTable:
 
 
 def view_terms(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 8"]:
-    """Returns the eight polynomial terms, up to third order, that the network's bias is a sum of. ``direction`` is the
-    unit vector from the face to the camera (face frame); times ``VIEW_TERMS_MIRRORED`` the terms are those of the
-    mirror image."""
+    """Returns the eight polynomial terms, up to third order, of which the network's bias is a weighted sum.
+    ``direction`` is the unit vector from the face to the camera (face frame). Multiplied by ``VIEW_TERMS_MIRRORED``,
+    the terms are those of the mirror image."""
     x, y, _ = direction
     return np.array([1.0, x, y, x * x, x * y, y * y, x**3, x * x * y])
 
@@ -60,14 +63,17 @@ VIEW_TERMS_MIRRORED = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
 
 def view_bias(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "468 2"]:
     """Returns by how much the network misplaces each point of a face seen from ``direction`` (unit, face frame): to the
-    right and down in a picture level with the face, as a share of the face's size."""
+    right and down in a picture in which the face is upright, relative to the face's size."""
     return np.tensordot(view_terms(direction), point_table().view_bias, axes=1)
 
 
 def place_face(points_world: Float[np.ndarray, "n 3"], which: slice = slice(None)) -> tuple[Similarity, float]:
-    """Returns the pose and scale (world_from_face) at which a mean face fits some of the points best, and the relief.
-    The scale follows from breadth and height; the relief is the points' depth over the mean face's, 1 for a mean face
-    and 0 for a flat one."""
+    """Fits a mean face to some of the points, the indices ``which``. Returns its pose and scale (world_from_face), and
+    the relief.
+
+    The scale follows from breadth and height. The relief is the points' depth divided by the mean face's: 1 for a mean
+    face, 0 for a flat picture.
+    """
     shape = point_table().shape_mm[which]
     mean, middle = shape.mean(axis=0), points_world.mean(axis=0)
     rotation = rigid_fit(shape, points_world).rotation

@@ -1,7 +1,7 @@
-"""The subject's face at a glance, for the verdict on a shot: which pictures lack it, and where it looks.
+"""Searches the subject's face quickly, for the verdict on a shot: which pictures lack it, and where it looks.
 
-Enters: small pictures (``reduce_picture``) and their cameras. Leaves: ``FaceSighting``. The search is a short one: it
-ends after a few views without a face, and asks those cameras alone that must show it.
+Enters: small pictures (``reduce_picture``) and their cameras. Leaves: ``FaceSighting``. The search is short: it ends
+after a few views without a face, and then tests only those cameras that must show it.
 """
 
 from collections.abc import Mapping
@@ -29,8 +29,8 @@ MIN_WITNESSES = 2  # other cameras that show the face, before one is blamed that
 
 
 def reduce_picture(image: ImageRgb, camera: Camera, longest_px: int) -> tuple[UInt8[np.ndarray, "_ _ 3"], Camera]:
-    """Returns a picture and its camera reduced so that the picture's longer side is ``longest_px``; both unchanged
-    where it is no longer than that."""
+    """Returns a picture and its camera reduced so that the picture's longer side is ``longest_px``; both unchanged if
+    it is not longer than that."""
     factor = longest_px / max(image.shape[:2])
     if factor >= 1.0:
         return image, camera
@@ -90,7 +90,7 @@ def _fan(rig: Rig) -> Float[np.ndarray, " 3"]:
 
 
 def gaze_from(face: MatchedFaces, axis_world: Float[np.ndarray, " 3"]) -> tuple[float, float]:
-    """Returns by how many degrees a face is turned from an axis of view: to the subject's left, and up."""
+    """Returns by how many degrees a face is turned away from an axis of view: to the subject's left, and up."""
     towards = -axis_world / np.linalg.norm(axis_world)
     across, upwards, ahead = towards @ face.world_from_face.rotation
     return float(-np.degrees(np.arctan2(across, ahead))), float(-np.degrees(np.arcsin(np.clip(upwards, -1.0, 1.0))))
@@ -104,7 +104,7 @@ def _missing(subject: SubjectFaces, face: MatchedFaces) -> tuple[str, ...]:
 
 
 def file_pixels(pixels: Float[np.ndarray, "n 2"], read_by: Camera, recorded_by: Camera) -> Float[np.ndarray, "n 2"]:
-    """Returns where pixels of a picture that was reduced and undistorted on reading lie in the picture's file."""
+    """Converts pixels of a picture that was reduced and undistorted when it was read to pixels of its file."""
     small, full = read_by.intrinsics, recorded_by.intrinsics
     scaled = (pixels + 0.5) * (full.width / small.width, full.height / small.height) - 0.5
     lens = recorded_by.recorded

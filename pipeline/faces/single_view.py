@@ -1,9 +1,9 @@
-"""How a face lies that one view alone shows, by the mean adult's points.
+"""Estimates the pose of a face that only one view shows, from the mean adult's points.
 
-Enters: a detection and its camera. Leaves: world_from_face, and the points with what one view leaves open of them. On
-rendered captures it is turned by 5 degrees against what all views say (median, to 75 degrees from the camera; 17 in
-profiles). Its distance follows from its size: 9 % off (RMS), 24 % in profiles, and as much as a head differs from the
-mean adult's.
+Enters: a detection and its camera. Leaves: world_from_face, and the points with the uncertainty that one view leaves.
+On rendered captures the face is turned by 5 degrees against the result of all views (median, up to 75 degrees from the
+camera; 17 for profiles). Its distance follows from its size: 9 % off (RMS), 24 % for profiles, plus the difference
+between the subject's and the mean adult's head.
 """
 
 import cv2
@@ -25,7 +25,7 @@ MIN_COSINE = 0.2  # of the angle from a point's normal to the camera: those that
 
 def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | None:
     """Returns the pose (world_from_face, scale 1) in which a mean adult's points project to where one camera found
-    them. Returns None where no pose explains the points or where they lie outside the lens."""
+    them. Returns None if no pose explains the points, or if they lie outside the lens."""
     shape, pixels = point_table().shape_mm, face.landmarks_px
     seen = np.ones(len(shape), bool)
     placed: Similarity | None = None
@@ -42,11 +42,11 @@ def place_from_one_view(face: FaceDetection, camera: Camera) -> Similarity | Non
 
 
 def match_alone(name: str, face: FaceDetection, camera: Camera) -> MatchedFaces | None:
-    """Returns a face that only one view shows in the form that ``matching`` returns, its points being a mean adult's.
-    Returns None where ``place_from_one_view`` does.
+    """Returns a face that only one view shows in the form of ``matching``, with a mean adult's points. Returns None
+    where ``place_from_one_view`` does.
 
-    The pixels say where the points are across the line of sight. What they leave open moves all points together: along
-    their rays, and about the face's middle.
+    The pixels determine the points across the line of sight. What they leave open moves all points together: along
+    their rays, and about the middle of the face.
     """
     placed = place_from_one_view(face, camera)
     if placed is None:

@@ -1,7 +1,8 @@
-"""The subject's face in all views of a rig: searched for in a few, then looked for where it must be.
+"""Finds the subject's face in all views of a rig: searches a few views, then looks in the others where the face must
+be.
 
-Enters: pictures and rig. Leaves: ``SubjectFaces``. Searching a picture takes 0.06 s, looking at a known place 0.01 s.
-Views far apart are searched until two or more agree on a face; it is then projected to all others.
+Enters: pictures and rig. Leaves: ``SubjectFaces``. To search a picture takes 0.06 s, to look at a known place 0.01 s.
+Views far apart are searched until two or more agree on a face; it is then projected into all others.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,11 +42,15 @@ MIN_INSIDE = 0.6  # share of a face's points within a picture
 
 @dataclass(frozen=True, slots=True)
 class SearchEffort:
-    """Holds how thoroughly the subject's face is searched for.
+    """Holds how thoroughly the subject's face is searched.
 
-    ``max_fruitless``: the search ends after this many views without a face; with None all views are searched, and then
-    small faces. ``min_facing``: least cosine between where the face looks and the direction to a camera whose picture
-    is looked at again; ``rounds``: how often that is repeated as views join.
+    Attributes:
+        max_fruitless: the search ends after this many views without a face; None searches all views, and then for small
+            faces.
+        min_facing: a known face is looked for in cameras to which it turns; the smallest cosine between both
+            directions.
+        rounds: how often that is repeated, as more views have the face.
+        with_eyes: whether irises and lids are found, too.
     """
 
     max_fruitless: int | None = None
@@ -59,10 +64,8 @@ THOROUGH = SearchEffort()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubjectFaces:
-    """Holds the faces found in each view that was searched, best first, and which of them are the subject's.
-
-    Where a single view shows a face, and beyond doubt, the points are a mean adult's (``single_view``).
-    """
+    """Holds the faces found in each view that was searched, the best first, and which of them are the subject's. If a
+    single view shows a face, and without doubt, its points are a mean adult's (``single_view``)."""
 
     found: Mapping[str, tuple[FaceDetection, ...]]
     matched: MatchedFaces | None  # None where views that show faces do not agree on one
@@ -81,12 +84,12 @@ def find_subject(
     """Finds the subject's face in the views of one shot.
 
     Args:
-        images: by camera; those of cameras that the rig lacks are passed over.
+        images: by camera; those of cameras that the rig lacks are ignored.
         rig: the cameras.
-        networks: as ``load_networks`` loads them.
-        eye_distance_mm: limits of a face's size; None where the rig's scale is not known.
-        effort: how far the search goes.
-        report: is told the share that is done.
+        networks: the result of ``load_networks``.
+        eye_distance_mm: limits of a face's size; None if the rig's scale is not known.
+        effort: how thorough the search is.
+        report: called with the share that is done.
     """
     views = rig.subset(name for name in rig.names if name in images)
     if not len(views):
@@ -123,7 +126,7 @@ class _Scene:
     effort: SearchEffort
 
     def match(self, found: Mapping[str, tuple[FaceDetection, ...]]) -> TriangulatedFace | None:
-        """The subject among the faces of all views."""
+        """Finds the subject among the faces of all views."""
         return find_subject_face(found, self.rig, self.eye_distance_mm)
 
 
@@ -143,10 +146,10 @@ def _search(
         found[name] = find(scene.pyramids[name], scene.networks)
         if found[name] and (face := scene.match(found)) is not None:
             for _ in range(scene.effort.rounds):
-                looked = {} if face is None else _look(scene, face, found)
-                if not looked:
+                added = {} if face is None else _search_missing(scene, face, found)
+                if not added:
                     break
-                found |= looked
+                found |= added
                 face = scene.match(found)
             if face is not None and len(face.detections) >= CONFIRMING_VIEWS:
                 break
@@ -180,11 +183,11 @@ def _matched_alone(found: Mapping[str, tuple[FaceDetection, ...]], rig: Rig) -> 
     return match_alone(name, face, rig[name])
 
 
-def _look(
+def _search_missing(
     scene: _Scene, face: TriangulatedFace, found: Mapping[str, tuple[FaceDetection, ...]]
 ) -> dict[str, tuple[FaceDetection, ...]]:
     """Looks for a face in the views in which it must be and was not found; what was found there comes after it."""
-    looked = {}
+    added = {}
     points = face.world_from_face.apply(point_table().shape_mm)
     for name in _expected(face.world_from_face, scene.rig, scene.effort.min_facing):
         if name in face.detections:
@@ -192,8 +195,8 @@ def _look(
         crop = crop_around(scene.rig[name].project(points))
         seen = find_face_at(scene.pyramids[name], crop, scene.networks, min_rounds=LOOKING_ROUNDS)
         if seen.score >= MIN_SCORE:
-            looked[name] = (seen, *found.get(name, ()))
-    return looked
+            added[name] = (seen, *found.get(name, ()))
+    return added
 
 
 def _expected(world_from_face: Similarity, rig: Rig, min_facing: float) -> Iterator[str]:

@@ -1,8 +1,8 @@
-"""A face's points in the world, from its detections in several views.
+"""Triangulates a face's points from its detections in several views.
 
-Enters: one detection a view. Leaves: ``TriangulatedFace``. The network errs in ways that depend on where it looks from
-(``points.view_bias``), which is taken off once it is known how the face lies; and the more a point turns away from a
-camera, the worse it is placed.
+Enters: one detection for each view. Leaves: ``TriangulatedFace``. The network has a bias that depends on the direction
+from which it sees the face (``points.view_bias``); it is subtracted once the face's pose is known. The more a point
+turns away from a camera, the larger is its noise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,8 +28,8 @@ ROUNDS = 2  # of how the face lies, and what follows from it
 class TriangulatedFace:
     """Holds points of one face in the world frame, with each view's pixels and noise in the order of ``detections``.
 
-    Noise is independent from point to point in ``noise_px`` and ``points.covariances``; ``view_noise_px`` moves all
-    points of a view together.
+    ``noise_px`` and ``points.covariances`` are independent from point to point; ``view_noise_px`` moves all points of a
+    view together.
     """
 
     detections: Mapping[str, FaceDetection]
@@ -51,8 +51,8 @@ class TriangulatedFace:
 def triangulate_face(
     detections: Mapping[str, FaceDetection], rig: Rig, which: slice = ALL_POINTS
 ) -> TriangulatedFace | None:
-    """Triangulates the points ``which`` of a face from its detections by view, and places a mean face on them. Returns
-    None where the views do not determine the points."""
+    """Triangulates the points ``which`` of a face from its detections by view, and fits a mean face to them. Returns
+    None if the views do not determine the points."""
     cameras, faces = [rig[name] for name in detections], list(detections.values())
     pixels = np.stack([face.landmarks_px[which] for face in faces])
     sizes = np.array([face.size_px for face in faces])
@@ -74,8 +74,7 @@ def triangulate_face(
 
 
 def unbiased_px(face: FaceDetection, world_from_face: Similarity, camera: Camera) -> Float[np.ndarray, "468 2"]:
-    """Returns a detection's 468 points (px of the picture) with the network's bias for this pose of
-    the face taken off."""
+    """Returns a detection's 468 points (px of the picture) without the network's bias for this pose of the face."""
     bias = face.size_px * view_bias(direction_from_face(world_from_face, camera))
     roll = np.deg2rad(face.roll_deg)
     picture_from_level = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])

@@ -1,9 +1,10 @@
-"""Outlines that the depth of other views contradicts: a mask that leaves out what two of them see solid is wrong there.
+"""Removes outlines that the depth of other views contradicts: a mask is wrong where it lacks what two other views
+measure.
 
-A surface lies inside every silhouette, hidden or not. Where points of two views fall outside a third one's, that one's
-outline says nothing any more, so that one bad mask cuts no hole through what the others know. Near an outline it is the
-depth that errs: matching windows make what is thin (frames of glasses, a collar's edge) wider by their own size, in
-every view alike.
+A surface lies inside every silhouette, hidden or not. Where points of two views fall outside a third one's silhouette,
+that outline is ignored, so that one bad mask cuts no hole into the surface. Close to an outline it is the depth that is
+wrong: matching windows make thin things (frames of glasses, the edge of a collar) wider by their own size, in every
+view alike.
 """
 
 import cv2

@@ -1,4 +1,4 @@
-"""The compiled loop that finds what other views see outside of a view's outline."""
+"""Compiled loop that finds where other views see the subject outside of a view's outline."""
 
 import numpy as np
 
@@ -22,7 +22,12 @@ def mark_contradicted(
     blocks: np.ndarray,
     width: int,
 ) -> None:
-    """Sets the bit of each view that has a sure point in a block outside of the target's outline."""
+    """Marks blocks of the view ``target`` in which other views have a precise surface point outside of its outline:
+    sets bit v % 64 of ``blocks`` (rows, columns; words of 64 bits, changed in place) for each such view v.
+
+    ``cameras``, ``sizes``, ``starts`` and ``pixels`` are those of ``view_stack.ViewStack``; ``width`` is the target's
+    width in pixels. A block is ``BLOCK`` pixels wide.
+    """
     place = np.empty(3)
     for v in range(len(cameras)):
         if v == target:

@@ -1,8 +1,8 @@
-"""Triangles of a mesh that cross each other (compiled).
+"""Compiled loops that find triangles of a mesh that cross each other.
 
-Triangles are sorted into cubic cells by the middles of their boxes; a cell is as wide as the widest box, so that those
-which meet lie in neighbouring cells. Two cross if an edge of one goes through the other (strictly: touching is no
-crossing).
+Triangles are sorted into cubic cells by the middles of their boxes. A cell is as wide as the widest box, so that
+triangles that meet lie in neighbouring cells. Two triangles cross if an edge of one passes through the other; merely
+touching does not count.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from pipeline.geometry.cell_kernels import COLUMNS, columns_about
 
 @njit(cache=True, nogil=True)
 def triangle_boxes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Lowest and highest corner of the box about each triangle, (f, 6)."""
+    """Returns the lowest and the highest corner of the box around each triangle, (f, 6)."""
     boxes = np.empty((len(faces), 6))
     for f in range(len(faces)):
         for axis in range(3):
@@ -35,11 +35,11 @@ def crossing_triangles(
     first: int,
     last: int,
 ) -> None:
-    """Marks triangles that cross another, for pairs of which one is ``active`` and stands from ``first`` to ``last`` in
-    the order; threads that mark one triangle write the same.
+    """Marks triangles that cross another one, in ``crossing`` (f), in place. Considered are pairs with an ``active``
+    triangle at the positions ``first`` to ``last`` of ``order``. Threads may run at once: both write True.
 
-    ``order`` sorts the triangles by ``keys`` (given sorted): the rank of their cell in a box of ``spans`` cells, whose
-    outermost cells are empty.
+    ``order`` sorts the triangles by ``keys`` (already sorted) and ``spans`` is the number of cells, all as in
+    ``cells.Cells``; ``boxes`` (f, 6) is in that order.
     """
     ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
     for position in range(first, last):

@@ -1,4 +1,5 @@
-"""A mesh that does not cross itself: vertices go back, where it does, towards places where it cannot."""
+"""Removes self-intersections of a mesh: where it crosses itself, vertices move back towards positions at which it
+cannot."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,8 +20,8 @@ HALVINGS = 6  # rounds in which vertices go half their way; later ones go all of
 def crossing_faces(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], active: Bool[np.ndarray, " f"] | None = None
 ) -> Bool[np.ndarray, " f"]:
-    """Tells which triangles cross another one. With ``active``, only pairs with at least one active triangle are
-    tested."""
+    """Tells which triangles cross another one. If ``active`` is not None, only pairs with at least one active triangle
+    are tested."""
     faces = faces.astype(np.int32)  # a copy: a model's own are read-only, which is another type
     if active is None:
         return _crossing_by_size(vertices, faces)

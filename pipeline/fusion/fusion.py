@@ -1,9 +1,9 @@
-"""All that the cameras see, as one closed surface.
+"""Fuses all that the cameras see to one closed surface.
 
 Enters: depth maps, silhouettes and the fitted head. Leaves: a two-manifold mesh with a standard deviation and a part
-for each vertex. A signed distance is found on a grid (``signed_distance``), its zero level made a mesh
-(``pipeline.geometry.surface_nets``), the vertices are drawn to the depth maps themselves (``refinement``) and taken
-back where the mesh would cross itself (``crossings``).
+for each vertex. A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh
+(``pipeline.geometry.surface_nets``); the vertices are moved to the depth maps (``refinement``), and back where the mesh
+would cross itself (``crossings``).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,7 +43,7 @@ CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BustSurface:
-    """Holds the whole visible surface: closed, two-manifold, wound outwards, one piece, without self-intersections."""
+    """Holds the whole visible surface: one closed two-manifold piece, facing outwards, without self-intersections."""
 
     mesh_world: Mesh
     deviation_mm: Float[np.ndarray, " v"]  # standard deviation along the normal
@@ -53,13 +53,13 @@ class BustSurface:
 
     @property
     def seen(self) -> Bool[np.ndarray, " v"]:
-        """Tells which vertices some photograph measures."""
+        """Tells which vertices a photograph shows."""
         return self.views > 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthSurface:
-    """Holds the surface as the depth maps have it: of one piece, the windows' bias taken off; it may still cross
+    """Holds the surface as the depth maps show it, in one piece and without the windows' bias; it may still cross
     itself."""
 
     mesh_world: Mesh
@@ -78,19 +78,19 @@ def fuse(
     settings: BustSettings,
     report: Progress,
 ) -> DepthSurface:
-    """Returns the closed surface that the views agree on.
+    """Fuses the depth maps to one closed surface.
 
     Args:
-        depth_maps: one a view; those that know nothing are left out.
+        depth_maps: one for each view; those without any known depth are left out.
         silhouettes: by camera, at least of the depth maps' cameras.
         rig: the cameras as calibrated, world frame.
-        head_world: the fitted head, closed but for its neck (mm); None where there is none.
-        bias: what the depth maps' windows err.
+        head_world: the fitted head, closed except at its neck (mm); None if there is none.
+        bias: of the matching windows.
         settings: spacing of the vertices.
         report: called with the stage's progress.
 
     Raises:
-        NoSurface: fewer than three views know any depth, or they contradict each other.
+        NoSurface: fewer than three views have any depth, or they contradict each other.
     """
     maps = [depth_map for depth_map in depth_maps if depth_map.known.any()]
     if len(maps) < MIN_VIEWS:
@@ -110,12 +110,12 @@ def fuse(
 
 @traced
 def finished(surface: DepthSurface, votes: PartVotes | None, head_skin_world: Mesh | None) -> BustSurface:
-    """Returns the surface in agreement with the head, without self-intersections, and what it shows.
+    """Makes the surface agree with the head, removes self-intersections, and determines what it shows.
 
     Args:
-        surface: as the depth maps have it.
-        votes: what the places show; without them all that is seen counts as skin.
-        head_skin_world: what of the fitted head the photographs measured, where they did; seen skin agrees with it.
+        surface: from the depth maps.
+        votes: which part each point shows; None counts all that is seen as skin.
+        head_skin_world: the part of the fitted head that photographs measured; None if there is none.
     """
     mesh, measured = surface.mesh_world, surface.measured
     seen = measured.views > 0
@@ -138,7 +138,7 @@ def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) 
 @traced
 def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
     """Returns the mesh of the zero level, only the piece that is the subject, and safe positions of its vertices (mm,
-    world frame): with every vertex at the middle of its cell the mesh cannot cross itself."""
+    world frame): with every vertex in the middle of its cell the mesh cannot cross itself."""
     grid, field = level.grid, level.field.copy()
     compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
     net = surface_net(field, grid.index, grid.neighbours)

@@ -1,7 +1,7 @@
-"""A sparse grid of nodes about a surface, refined by halves from a coarse box that holds everything.
+"""Defines a sparse grid of nodes around a surface, refined by halving from a coarse box around everything.
 
-Nodes are kept in the order of their keys ``(i * ny + j) * nz + k``, so that a neighbour at a fixed step in the key is
-found by walking two lists at once: no hash table and no index volume, whatever the spacing.
+Nodes are kept in the order of their keys ``(i * ny + j) * nz + k``. A neighbour at a fixed difference of keys is then
+found by walking two lists at once, without a hash table or a full volume.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from pipeline.geometry.surface_nets import link_nodes
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
     """Holds the nodes of a sparse grid; node i lies at ``corner + step_mm * index[i]``, world frame. ``neighbours`` are
-    the rows of the nodes towards -x +x -y +y -z +z, -1 where there is none; ``outer`` nodes lack one of their 26
+    the rows of the nodes towards -x +x -y +y -z +z, -1 if there is none; ``outer`` nodes lack one of their 26
     neighbours."""
 
     corner: Float[np.ndarray, " 3"]
@@ -48,7 +48,7 @@ def refined(coarse: Grid, wanted: Bool[np.ndarray, "nx ny nz"]) -> Grid:
 
 
 def everywhere(grid: Grid, values: Float32[np.ndarray, " n"], box: Float32[np.ndarray, "_ _ _"]) -> np.ndarray:
-    """Returns a volume of values over the grid's whole box: at the grid's nodes their ``values``, elsewhere values
+    """Returns a volume of values over the grid's whole box: ``values`` at the grid's nodes, and elsewhere values
     interpolated from ``box``, a volume of twice the step."""
     fine = kernels.doubled(box)
     fine[tuple(grid.index.T)] = values

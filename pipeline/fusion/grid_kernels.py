@@ -8,7 +8,9 @@ from pipeline.geometry.surface_nets_kernels import corners_of
 
 @njit(cache=True, nogil=True)
 def halved(wanted: np.ndarray) -> np.ndarray:
-    """Indices (n, 3) int32, in the order of their keys, of the nodes of half the step that the wanted nodes open."""
+    """Returns the nodes of a grid with half the step, as positions (n, 3) int32 in the order of their keys. Each
+    ``wanted`` node (i, j, k) becomes up to eight nodes: (2 i, 2 j, 2 k), and those one further along x, y and z that
+    are inside the grid."""
     nx, ny, nz = wanted.shape
     count = 0
     for i in range(nx):
@@ -31,7 +33,8 @@ def halved(wanted: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def outermost(neighbours: np.ndarray) -> np.ndarray:
-    """Nodes that lack one of their 26 neighbours."""
+    """Tells which nodes (n) of a sparse grid lack one of their 26 neighbours. ``neighbours`` (n, 6) has the rows of the
+    six nearest ones, -1 for none."""
     count = len(neighbours)
     full = np.ones(count, np.bool_)
     for axis in range(3):  # a node has all 3^d neighbours of d axes if it and both next to it have those of d - 1
@@ -44,7 +47,8 @@ def outermost(neighbours: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def interpolated(box: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Values of a coarse box at nodes of half its step: the mean of the two, four or eight around, or the same."""
+    """Interpolates a coarse volume to nodes (n, 3) of half its step: the mean of the two, four or eight nodes around,
+    or the value of the same node."""
     out = np.empty(len(index), np.float32)
     for n in range(len(index)):
         i, j, k = index[n, 0], index[n, 1], index[n, 2]
@@ -59,7 +63,7 @@ def interpolated(box: np.ndarray, index: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def doubled(box: np.ndarray) -> np.ndarray:
-    """A volume at half its step, linear between its nodes."""
+    """Returns a volume interpolated linearly to half its step: (2 nx - 1, 2 ny - 1, 2 nz - 1)."""
     nx, ny, nz = box.shape
     out = np.empty((2 * nx - 1, 2 * ny - 1, 2 * nz - 1), np.float32)
     for i in range(2 * nx - 1):
@@ -76,7 +80,7 @@ def doubled(box: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def grown(marked: np.ndarray) -> np.ndarray:
-    """The marked nodes of a volume and their 26 neighbours."""
+    """Returns the marked nodes of a volume together with their 26 neighbours."""
     nx, ny, nz = marked.shape
     out = marked.copy()
     for i in range(nx):
@@ -89,7 +93,8 @@ def grown(marked: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def crossed(values: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Lowest nodes of the cells that have corners of both signs."""
+    """Tells which nodes (n) are the lowest corner of a cell that has corners of both signs, so that the surface crosses
+    it."""
     out = np.zeros(len(values), np.bool_)
     corners = np.empty(8, np.int64)
     for n in range(len(values)):
@@ -103,7 +108,8 @@ def crossed(values: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def crossed_at_rim(values: np.ndarray, neighbours: np.ndarray, outer: np.ndarray) -> bool:
-    """Whether the sign changes between two outer nodes: the surface leaves the grid there."""
+    """Tells whether the sign of ``values`` changes between two neighbouring ``outer`` nodes: the surface leaves the
+    grid there."""
     for n in range(len(values)):
         for axis in range(3):
             other = neighbours[n, 2 * axis + 1]

@@ -1,8 +1,9 @@
-"""Signs of a sparse grid's nodes whose surface net is a two-manifold, and its connected pieces (compiled).
+"""Compiled loops that make the surface net of a sparse grid a two-manifold, and find its connected pieces.
 
 A net (``pipeline.geometry.surface_nets``) is a manifold exactly if the set of inside nodes is well composed (Latecki,
-*3D well-composed pictures*, 1997): no square of four nodes has its diagonals of opposite kind, and no cell has two
-opposite corners alone of one kind. Nodes are turned over until that holds.
+*3D well-composed pictures*, 1997): no square of four nodes has inside nodes on one diagonal and outside nodes on the
+other, and no cell has two opposite corners that differ from its six others. The signs of single nodes are changed until
+that holds.
 """
 
 import numpy as np
@@ -18,8 +19,12 @@ ROUNDS = 12  # in which the node nearest to the surface is turned over; later on
 
 @njit(cache=True, nogil=True)
 def compose_well(field: np.ndarray, neighbours: np.ndarray, outer: np.ndarray, least: float) -> int:
-    """Turns nodes of ``field`` over (to +-``least``) until the inside is well composed; returns how many. ``outer``
-    nodes stay: the surface would lie in cells that the grid does not have."""
+    """Changes the signs of nodes of ``field`` (n; mm, negative inside), in place, until its inside is well composed.
+    Such a node gets the value ``least`` or -``least``. Returns how often a sign was changed.
+
+    ``neighbours`` (n, 6) has the rows of adjacent nodes, -1 for none. ``outer`` nodes (n) are never changed, since the
+    surface would then lie in cells that the grid does not have.
+    """
     corners = np.empty(8, np.int64)
     turned, changes, rounds = 0, 1, 0
     while changes:
@@ -67,7 +72,7 @@ def _culprit(field, outer, corners, inside, fill):
 
 @njit(cache=True, nogil=True)
 def component_of(faces: np.ndarray, count: int) -> np.ndarray:
-    """The lowest vertex of the connected piece that each vertex belongs to."""
+    """Returns, for each of ``count`` vertices, the lowest vertex of its connected piece of the mesh, int32."""
     root = np.arange(count).astype(np.int32)
     for f in range(len(faces)):
         for k in range(2):

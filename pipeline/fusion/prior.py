@@ -1,4 +1,4 @@
-"""Where the surface may be that nobody sees: the fitted head, as thick with hair as it is where that is seen."""
+"""Guesses the surface where no camera sees it: the fitted head, with hair as thick as where it is seen."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,12 +17,9 @@ NEAREST, EVEN_MM = 64, 5.0  # vertices that a mean is taken of, and the distance
 def distance_to_head(
     places: Float[np.ndarray, "n 3"], head_world: Mesh, seen: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the signed distance (mm, positive outside) of places to the outside of the head's hair; -inf near the
-    open rim where the model ends.
-
-    The thickness of the hair over each vertex is measured from the ``seen`` points of the surface, and interpolated
-    where there are none.
-    """
+    """Returns the signed distance (mm, positive outside) of points to the outside of the head's hair; -inf near the
+    open border where the model ends. The thickness of the hair above each vertex is measured from the ``seen`` points
+    of the surface, and interpolated where there are none."""
     vertices, normals = head_world.vertices[::EVERY], head_world.normals()[::EVERY]
     tree = KDTree(vertices, balanced_tree=False, compact_nodes=False)
     thickness = _thickness(tree, normals, seen)
@@ -54,7 +51,7 @@ def _thickness(
 
 
 def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Tells which places lie within ``RIM_MM`` of the open rim of the head."""
+    """Tells which points lie within ``RIM_MM`` of the head's open border, at the neck."""
     rim = np.unique(boundary_edges(head_world.faces))
     if not len(rim):
         return np.zeros(len(places), bool)

@@ -1,4 +1,4 @@
-"""What of the visible surface is measured, and how far each vertex may be off."""
+"""Determines which part of the visible surface is measured, and the standard deviation of each vertex."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
-"""Vertices drawn to the depth maps: what a grid's interpolation loses below its step comes back, and each vertex gets
-the deviation that the views which see it leave."""
+"""Moves the vertices to the depth maps, which restores detail below the grid's step, and measures the uncertainty of
+each."""
 
 from dataclasses import dataclass
 

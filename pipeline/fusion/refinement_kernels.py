@@ -1,4 +1,5 @@
-"""How far the vertices of a surface are from what the views see there (compiled)."""
+"""Compiled loops that measure how far the vertices of a surface are from what the views see there, and smooth these
+offsets."""
 
 import numpy as np
 
@@ -36,10 +37,13 @@ def measure(
     first: int,
     last: int,
 ) -> None:
-    """Fills, a vertex: ``offset`` (mm along the normal) to the surface seen, its ``information`` (1/mm2, views taken as
-    independent), ``scatter`` (weighted mean square of the views about it, mm2) and the number of ``views``.
+    """Measures the offset of vertices ``first`` to ``last`` (world, mm) from the surface that the views see, and fills
+    arrays with one entry for each vertex.
 
-    ``limits``: distance (mm) beyond which a view shows another surface, agreement (mm) and floor of a deviation (mm).
+    ``offset`` is the distance (mm along the vertex normal); ``information`` its inverse variance (mm^-2, views taken as
+    independent); ``scatter`` the weighted mean square of the views about it (mm^2); ``views`` the number of views that
+    agree. ``limits`` are the distance (mm) beyond which a view shows another surface, the largest difference (mm) of
+    agreeing views, and a lower limit of a view's standard deviation (mm).
     """
     cameras, sizes, starts, pixels = seen
     gate, agreement, floor = limits
@@ -80,7 +84,9 @@ def measure(
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def depth_between(pixels: np.ndarray, start: int, size: np.ndarray, column: float, row: float, near: int) -> float:
-    """Depth between four pixels where they know one surface, else that of the nearest."""
+    """Returns the depth (mm) at a point between four pixels: interpolated if all four know the depth of one surface,
+    else that of the nearest pixel, whose row in ``pixels`` is ``near``. ``start`` is the row of the view's first
+    pixel."""
     c, r = min(int(column), size[1] - 2), min(int(row), size[0] - 2)
     a = start + r * size[1] + c
     b, d, e = a + 1, a + size[1], a + size[1] + 1
@@ -101,8 +107,9 @@ def smooth_offsets(
     stiffness: float,
     sweeps: int,
 ) -> np.ndarray:
-    """Offsets that differ little between neighbours: Gauss-Seidel on ``sum information (d - offset)^2 + stiffness sum
-    over edges (d - d')^2``."""
+    """Returns offsets (n) smoothed over the mesh: by ``sweeps`` of Gauss-Seidel it minimises ``sum information (d -
+    offset)^2 + stiffness sum over edges (d - d')^2``. The neighbours of vertex v are ``indices[starts[v]:starts[v +
+    1]]``."""
     out = offset.copy()
     for _ in range(sweeps):
         for v in range(len(out)):

@@ -1,5 +1,8 @@
-"""The membrane through what is known of a field: over-relaxed Gauss-Seidel on a sparse grid, one colour at a time, so
-that threads never meet and the order of work does not show (compiled)."""
+"""Compiled loop that continues a field smoothly where it is unknown: a membrane through the known values.
+
+It is over-relaxed Gauss-Seidel on a sparse grid whose nodes are coloured like a chequerboard. Nodes of one colour are
+not neighbours, so that threads do not disturb each other and the result does not depend on their order.
+"""
 
 from typing import NamedTuple
 
@@ -9,7 +12,8 @@ from pipeline.compute.jit import njit
 
 
 class Membrane(NamedTuple):
-    """What holds the field: where it is drawn to and how much, what it may not go below, and where it stays."""
+    """Holds what determines the field at each of n nodes: the value that it is drawn to and with which weight, a lower
+    bound, and whether it is fixed."""
 
     target: np.ndarray
     weight: np.ndarray
@@ -28,7 +32,12 @@ def relax(
     first: int,
     last: int,
 ) -> None:
-    """One half sweep towards the least of ``sum w (u - target)^2 + sum over edges (u - u')^2`` with ``u >= bound``."""
+    """Updates ``field`` (n) at the nodes ``first`` to ``last`` of one ``colour`` (0 or 1), in place: one step towards
+    the minimum of ``sum w (u - target)^2 + sum over edges (u - u')^2`` subject to ``u >= bound``.
+
+    ``index`` (n, 3) is the grid position of each node, ``neighbours`` (n, 6) the rows of adjacent nodes, -1 for none,
+    and ``factor`` the over-relaxation (1: none, below 2).
+    """
     target, weight, bound, fixed = membrane
     for n in range(first, last):
         if fixed[n] or (index[n, 0] + index[n, 1] + index[n, 2]) & 1 != colour:

@@ -1,14 +1,15 @@
-"""The signed distance to all that the cameras see, on a sparse grid: depth, silhouettes and the fitted head together.
+"""Computes the signed distance to everything that the cameras see, on a sparse grid, from depth, silhouettes and the
+fitted head.
 
-It is sought from a coarse box that holds the subject down to the spacing asked for. Every view votes at every node
-(``vote_kernels``): the distance to the surface that it sees there, free space before that surface, nothing behind it.
-Silhouettes bound the body from outside. Between votes a membrane fills in (``relaxation_kernels``), drawn to the fitted
-head with its hair, or to the visual hull, where nobody looks. The coarsest level decides what is inside; each finer one
-is solved about the surface of the one before.
+It goes from a coarse box around the subject down to the requested spacing. Every view votes at every node
+(``vote_kernels``): with the distance to the surface that it sees there, and free space in front of it; it says nothing
+of what lies behind. Silhouettes bound the body from outside. Between votes a membrane interpolates
+(``relaxation_kernels``); what no camera sees is drawn to the fitted head with its hair, or to the visual hull. The
+coarsest level decides what is inside; each finer level is solved around the surface of the one before.
 
 Volumetric fusion with free space: Curless and Levoy, *A volumetric method for building complex models from range
-images*, SIGGRAPH 1996. Departures: votes are robust (a median, and what agrees with it), silhouettes are inequalities,
-and holes are filled by the membrane.
+images*, SIGGRAPH 1996. Departures: votes are combined robustly (the median, and those that agree with it), silhouettes
+are inequalities, and the membrane fills holes.
 """
 
 from collections.abc import Sequence
@@ -52,14 +53,14 @@ UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
 
 
 class NoSurface(EigenheadError):
-    """Reports that the photographs do not determine a surface: depth is known in too few views, or is contradictory."""
+    """Reports that the photographs determine no surface: too few views have depth, or they contradict each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Votes:
-    """Holds for every node of a grid what all views together say: the signed distance to the surface (mm), its weight
-    (above 0 only where a view sees the place), and the least distance (mm) by which the node lies outside the outlines.
-    See ``vote_kernels.vote``."""
+    """Holds what all views together say of every node of a grid: the signed distance to the surface (mm), its weight
+    (above 0 only if a view sees the node), and the smallest distance (mm) by which the node lies outside the
+    silhouettes. See ``vote_kernels.vote``."""
 
     value: Field
     weight: Field
@@ -78,7 +79,8 @@ class Level:
 
 def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
     """Computes the signed distance on one grid. It follows the votes where there are some, stays outside the
-    silhouettes, and is drawn to ``start`` where no view sees the place."""
+    silhouettes, and is drawn to ``start`` at nodes that no view sees. ``sweeps`` and ``factor`` are those of the
+    relaxation."""
     reach = np.float32(REACH * grid.step_mm)
     start = np.clip(start, -reach, reach)
     unseen = votes.weight <= 0
@@ -98,7 +100,7 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
 
 
 def votes_at(grid: Grid, views: ViewStack) -> Votes:
-    """Computes what the views together say of every node of the grid."""
+    """Combines the views at every node of the grid."""
     value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
     step = grid.step_mm
     limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
@@ -173,9 +175,9 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> F
 
 
 def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
-    """Returns the guess (mm, negative inside) on a whole box without thin fins and horns: parts into which no ball of
-    radius ``HORN_MM`` fits. They arise where no outline bounds the cones of sight. Within ``AWAY_MM`` of seen places
-    the guess stays."""
+    """Removes thin fins and horns, into which no ball of radius ``HORN_MM`` fits, from the signed distance ``guess``
+    (mm, negative inside) on a whole box. They arise where no silhouette limits how far the subject may extend along the
+    lines of sight. Within ``AWAY_MM`` of points that a view sees, the guess is kept."""
     from scipy.ndimage import distance_transform_edt  # 0.05 s, and only a bust needs it
 
     radius = HORN_MM / grid.step_mm

@@ -1,10 +1,10 @@
-"""Skin that the surface and the fitted head both show is one: the head, which knows it by its own shape and by patches
-that no window flattens, is one more measurement of it.
+"""Combines the fused surface with the fitted head where both show the same skin. The head is a second measurement of
+it, from its own shape and from patches that have no window bias.
 
-Where the two lie as far apart as their errors, the vertex goes to their weighted mean. Where they lie farther apart,
-its surroundings decide: if most of them agree with the head, the vertex stands in a crater or on a speck (a chance
-match, what is left of a highlight), and goes to the head; if not, one of the two shows something else (hair, a fold
-that the head has not, a head that is wrong), and the vertex stays.
+Where the two lie as far apart as their errors, the vertex moves to their weighted mean. Where they lie farther apart,
+the surroundings decide. If most of them agree with the head, the vertex is in a crater or on a speck (a chance match,
+the rest of a highlight), and moves to the head. If not, one of the two shows something else (hair, a fold that the head
+lacks, a wrong head), and the vertex stays.
 """
 
 import numpy as np
@@ -36,14 +36,13 @@ def part_of(head_world: Mesh, measured: Bool[np.ndarray, " v"]) -> Mesh:
 def drawn_to_skin(
     mesh_world: Mesh, skin: Float[np.ndarray, " v"], head_skin_world: Mesh, deviation_mm: Float[np.ndarray, " v"]
 ) -> Mesh:
-    """Returns the surface with its vertices of skin moved towards the closest place of the fitted head, to the weighted
-    mean or farther.
+    """Moves the vertices of skin towards the closest point of the fitted head, to the weighted mean or all the way.
 
     Args:
-        mesh_world: the surface, mm.
+        mesh_world: the fused surface, mm.
         skin: probability that a vertex shows skin; 0 where no view sees it.
-        head_skin_world: what photographs measured of the head's skin, mm.
-        deviation_mm: of the surface's vertices that a view sees, along the normal.
+        head_skin_world: the part of the head's skin that photographs measured, mm.
+        deviation_mm: standard deviation along the normal of the vertices that a view sees.
     """
     vertices = mesh_world.vertices.copy()
     same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * mean_around(mesh_world.faces, deviation_mm, skin))

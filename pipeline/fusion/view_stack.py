@@ -1,4 +1,4 @@
-"""What all views say, side by side in flat arrays for compiled loops: depth, and the outline's signed distance."""
+"""Packs what all views show into flat arrays for compiled loops: depth, and the signed distance to the outline."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ ALONE_FACTOR = 3.0  # ... and has its deviation multiplied: 28 % of them are 2 m
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewStack:
-    """Holds pixels of all the views' crops, one view after the other, each with all that it says in one place.
+    """Holds the pixels of all views' crops in flat arrays, one view after the other.
 
-    ``cameras`` holds, a view: rotation (9), translation (3), fx fy cx cy, and the centre in the world frame (3).
-    ``pixels`` holds, a pixel: depth (mm), normal (3, world frame, towards the camera), standard deviation (mm; inf
-    where nothing is known), signed distance (px) to the silhouette's contour, negative inside, and to the edge of the
-    photograph, negative inside, and a spare one that makes it 32 bytes.
+    ``cameras`` has a row for each view: rotation (9), translation (3), fx fy cx cy, and the centre in the world frame
+    (3). ``pixels`` has a row for each pixel: depth (mm), normal (3, world frame, towards the camera), standard
+    deviation (mm; inf if nothing is known), signed distances (px, negative inside) to the silhouette's contour and to
+    the edge of the photograph, and a spare column that makes it 32 bytes.
     """
 
     cameras: Float[np.ndarray, "k 19"]

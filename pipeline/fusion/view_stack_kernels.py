@@ -1,4 +1,4 @@
-"""The compiled loop that reads a silhouette's signed distance at the pixels of a view's crop."""
+"""Compiled loop that reads a silhouette's signed distance at the pixels of a view's crop."""
 
 import numpy as np
 
@@ -10,9 +10,12 @@ from pipeline.imaging.sampling_kernels import held, sample
 
 @njit(cache=True, nogil=True)
 def write_outline(crop: np.ndarray, lens: np.ndarray, width: int, distance: np.ndarray, pixels: np.ndarray) -> None:
-    """Signed distances (px) to the contour and to the frame, at the pixels of an undistorted crop.
+    """Fills two columns of ``pixels``: the signed distances (px) to the silhouette's contour and to the photograph's
+    border, both negative inside, at the pixels of an undistorted crop.
 
-    Beyond the frame the contour's is the nearest pixel's of the frame: a shoulder that the edge cuts goes on there.
+    Outside the photograph the distance to the contour is that of the nearest pixel on its border, so that a shoulder
+    which the border cuts goes on. ``crop`` is fx, fy, cx, cy of the crop; ``lens`` that of the photograph
+    (``packed_lens``); ``width`` the crop's; ``distance`` (rows, columns) the silhouette's signed distance.
     """
     rows, columns = distance.shape
     for at in range(len(pixels)):

@@ -1,4 +1,5 @@
-"""What the views say of a place: how far in front of the surface it lies, and that nobody may be there (compiled)."""
+"""Compiled loops that combine the views' depths at a point: how far in front of the surface it lies, and whether
+silhouettes exclude the subject there."""
 
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ UNKNOWN_MM = 1e9  # deviations beyond are infinite
 
 
 class Pixels(NamedTuple):
-    """What the views see, as ``view_stack.ViewStack`` has it."""
+    """Holds the arrays of ``view_stack.ViewStack``, by the same names."""
 
     cameras: np.ndarray
     sizes: np.ndarray
@@ -40,14 +41,17 @@ def vote(
     first: int,
     last: int,
 ) -> None:
-    """Fills ``value`` (mm, positive outside), ``weight`` and ``bound`` (mm: the surface is at least so far inside).
+    """Combines the views at grid nodes ``first`` to ``last`` and fills, one entry for each node, ``value`` (mm,
+    positive outside), ``weight``, and ``bound`` (mm; ``value`` may not be smaller).
 
-    A view's vote is the distance to the tangent plane of the pixel that shows the place, cut off at ``reach`` in front
-    and left out ``behind`` it. Votes are put together by their weighted median and the mean of those that agree with
-    it; weight falls with the square of the share that does not. Without a vote the weight is 0 and the value that of
-    the hull, whose silhouettes go on beyond their photographs, and of the body behind a surface that is seen.
-    ``limits``: reach, behind, agreement (mm), unit and
-    floor of a vote's deviation (mm).
+    A view's vote is the distance to the tangent plane of the pixel that shows the node. It is limited to ``reach`` in
+    front of that plane, and left out if the node lies more than ``behind`` behind it. The votes are combined by their
+    weighted median and the mean of those that agree with it; the weight falls with the square of the share that agrees.
+    A node without a vote has weight 0 (or ``UNDECIDED``) and the value of the visual hull, whose silhouettes are
+    continued beyond the photographs, or of a body of limited thickness behind a surface that is seen.
+
+    ``index`` (n, 3) and ``corner`` (3, world, mm) place the nodes, ``step_mm`` apart. ``limits`` are reach, behind,
+    largest difference of agreeing votes, and the deviation (mm) at which a vote has unit weight and its lower limit.
     """
     cameras, sizes, starts, pixels = views
     reach, behind, agreement, unit, floor = limits
@@ -101,7 +105,8 @@ def vote(
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
-    """Depth (mm), column and row of a place in the world frame; see ``view_stack.ViewStack.cameras``."""
+    """Returns the depth (mm), column and row (px) of a point (world, mm) in a camera, a row of
+    ``view_stack.ViewStack.cameras``."""
     x, y, depth = placed(camera, place[0], place[1], place[2])
     column, row = pinhole(x / depth, y / depth, camera[LENS:])
     return depth, column, row
@@ -109,7 +114,8 @@ def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, float]:
-    """The pixel of an image that is nearest to a point, and how far (px) the point lies outside of the image."""
+    """Returns the number (row by row) of the pixel nearest to a point, and how far (px) the point lies outside of the
+    image. ``size`` is height and width."""
     inside_column, inside_row = min(max(column, 0.0), size[1] - 1.0), min(max(row, 0.0), size[0] - 1.0)
     beyond = np.sqrt((column - inside_column) ** 2 + (row - inside_row) ** 2)
     return int(inside_row + 0.5) * size[1] + int(inside_column + 0.5), beyond
@@ -117,14 +123,17 @@ def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, flo
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def cosine(camera: np.ndarray, place: np.ndarray, depth: float, pixel: np.ndarray) -> float:
-    """Cosine between a pixel's normal and the way to the camera, times the length of the ray a unit of depth."""
+    """Returns the cosine between a pixel's normal and the direction to the camera, times the ray's length for each mm
+    of depth. Multiplied by a difference in depth, it gives the distance to the pixel's tangent plane."""
     x, y, z = place[0] - camera[CENTRE], place[1] - camera[CENTRE + 1], place[2] - camera[CENTRE + 2]
     return -(x * pixel[NORMAL] + y * pixel[NORMAL + 1] + z * pixel[NORMAL + 2]) / depth
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def agreed(votes: np.ndarray, weights: np.ndarray, count: int, agreement: float) -> tuple[float, float]:
-    """Mean of the votes that agree with their weighted median, and their weight; both arrays are sorted."""
+    """Returns the mean of those votes that differ from the weighted median by at most ``agreement``, and their weight
+    times the square of the share of weight that they have; 0 and 0 without votes. Sorts the first ``count`` entries of
+    both arrays."""
     if count == 0:
         return 0.0, 0.0
     total = 0.0

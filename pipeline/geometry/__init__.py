@@ -1,5 +1,6 @@
-"""Geometric primitives, one of each: meshes and points in mm in whatever frame they come; knows nothing of heads.
+"""Provides geometric primitives, one implementation of each: meshes and points in mm, in any common frame. Nothing here
+knows of heads.
 
-Beside each fast one stands a naive one (``..._naive``), a few lines that are plainly right: the tests hold the fast one
-to it.
+Beside each fast function there is a naive one (``..._naive``), a few lines that are plainly right; tests compare the
+two.
 """

@@ -1,4 +1,4 @@
-"""Points sorted into cubic cells, so that compiled loops find what lies near."""
+"""Sorts points into cubic cells, so that compiled loops find neighbours quickly."""
 
 from typing import NamedTuple
 

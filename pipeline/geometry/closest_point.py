@@ -1,4 +1,4 @@
-"""The closest point of triangles to a point. Lengths are in mm, in whatever frame all share."""
+"""Finds the closest point of triangles to a point. Lengths are in mm, in any common frame."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,14 +14,14 @@ def closest_candidates(
     facing: Float[np.ndarray, "n 3"] | None = None,
     facing_mm: float = 0.0,
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Finds, for each point, the closest of its candidate triangles, and the barycentric weights of the closest place
-    on it.
+    """Finds, for each point, the closest of its candidate triangles, and the barycentric coordinates of its closest
+    point.
 
     Args:
         points: the query points.
         candidates: rows of ``corners`` for each point; of equally close ones the first is taken.
         corners: of the triangles.
-        facing: unit normals of the points; a triangle that faces the other way counts as ``facing_mm`` farther.
+        facing: unit normals of the points; a triangle that faces the opposite way counts as ``facing_mm`` farther away.
         facing_mm: that distance.
     """
     triangle, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))

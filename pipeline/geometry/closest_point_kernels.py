@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.geometry.closest_point``, and of searches that know a point's neighbourhood."""
+"""Compiled loops of ``pipeline.geometry.closest_point``, and a search among the triangles of nearby vertices."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,8 @@ from pipeline.compute.jit import njit
 
 
 class FannedMesh(NamedTuple):
-    """Vertices with their unit normals, triangles, and by vertex where its triangles begin, and those."""
+    """Holds a triangle mesh with unit vertex normals. The triangles at vertex v are ``member[start[v]:start[v +
+    1]]``."""
 
     vertices: np.ndarray
     vertex_normals: np.ndarray
@@ -19,8 +20,8 @@ class FannedMesh(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def closest_on_triangle(x, y, z, one, other, third):
-    """Barycentric weights of the second and third corner at the triangle's closest point to (x, y, z), and the squared
-    distance. After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5."""
+    """Returns the closest point of a triangle to (x, y, z), as barycentric weights of its second and third corner, and
+    the squared distance. After C. Ericson, *Real-Time Collision Detection* (2005), section 5.1.5."""
     abx, aby, abz = other[0] - one[0], other[1] - one[1], other[2] - one[2]
     acx, acy, acz = third[0] - one[0], third[1] - one[1], third[2] - one[2]
     apx, apy, apz = x - one[0], y - one[1], z - one[2]
@@ -55,8 +56,12 @@ def closest_on_triangle(x, y, z, one, other, third):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def closest_at_vertices(first, last, points, normals, near, surface, min_agreement, triangle, blend, square):
-    """For points ``first`` to ``last``: of the triangles at the vertices ``near`` whose side agrees with the point's
-    normal, the closest one, its barycentric weights, and the squared distance; triangle -1 where none agrees."""
+    """Finds the closest triangle for points ``first`` to ``last`` among those at the vertices ``near`` (n, candidates).
+    A vertex counts only if the cosine between its normal and the point's is at least ``min_agreement``.
+
+    Fills ``triangle`` (n; -1 if no vertex counts), its barycentric weights ``blend`` (n, 3), and the ``square`` of the
+    distance (n). A row of ``near`` ends at the first entry that equals the number of vertices.
+    """
     vertices, vertex_normals, faces, start, member = surface
     for p in range(first, last):
         triangle[p] = -1
@@ -87,9 +92,13 @@ def closest_at_vertices(first, last, points, normals, near, surface, min_agreeme
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def closest_of_candidates(first, last, points, candidates, corners, facing, facing_mm, triangle, weights):
-    """For points ``first`` to ``last``: the closest of their candidate triangles, and its barycentric weights. Where
-    ``facing`` has a unit normal a point, a triangle that faces the other way counts as ``facing_mm`` farther, one at a
-    right angle as half of that."""
+    """Finds the closest of the ``candidates`` (n, k; triangles) for points ``first`` to ``last``. Fills ``triangle``
+    (n) and its barycentric ``weights`` (n, 3).
+
+    If ``facing`` (n, 3; unit normals of the points) is not empty, a triangle that faces the opposite way counts as
+    ``facing_mm`` farther away, and one at a right angle as half of that. ``corners`` (t, 3, 3) are the triangles'
+    corners.
+    """
     for p in range(first, last):
         least = np.inf
         x, y, z = points[p]

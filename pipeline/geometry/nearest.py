@@ -1,4 +1,4 @@
-"""The nearest of many points, by as many threads as share a loop."""
+"""Finds the nearest of many points, with the threads that compiled loops share."""
 
 import numpy as np
 from jaxtyping import Float, Int

@@ -1,4 +1,5 @@
-"""Cameras as rows for compiled loops; ``projection_kernels`` reads them. ``rig.camera`` is the reference."""
+"""Packs cameras into rows of numbers for compiled loops, which ``projection_kernels`` reads. ``rig.camera`` is the
+reference."""
 
 import numpy as np
 from jaxtyping import Float

@@ -1,8 +1,9 @@
-"""The camera for compiled loops: world to camera to pixel, and the derivatives. ``projection`` packs the rows.
+"""Compiled camera model: world to camera to pixel, and the derivatives. ``projection`` packs its rows.
 
-A row begins with rotation (9, row by row) and translation (3), mm: with ``pose``. Where a lens follows, from entry 12
-on, it is fx fy cx cy (px), and of a lens that distorts k1 k2 p1 p2 k3 and the turning radius. The helpers are inlined:
-arithmetic is the calling loop's, fast or strict. Only ``distorted`` is always fast: strict, it cost the hull a tenth.
+A camera is a row of numbers. A row called ``pose`` begins with rotation (9, row by row) and translation (3, mm) of
+camera_from_world. If a lens follows, it begins at entry 12: fx fy cx cy (px) and, for a lens that distorts, k1 k2 p1 p2
+k3 and the largest ray radius at which distortion is valid. The helpers are inlined, so that their arithmetic is the
+calling loop's, fast or strict. Only ``distorted`` is always fast: strict, it made the visual hull a tenth slower.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ NEAREST_MM = 1.0  # nearer, or behind the camera, nothing is seen
 
 @njit(cache=True, nogil=True, inline="always")
 def turned(pose, x, y, z):
-    """A direction in the camera's frame."""
+    """Returns a direction (x, y, z) of the world in the camera's frame."""
     return (
         pose[0] * x + pose[1] * y + pose[2] * z,
         pose[3] * x + pose[4] * y + pose[5] * z,
@@ -26,20 +27,21 @@ def turned(pose, x, y, z):
 
 @njit(cache=True, nogil=True, inline="always")
 def placed(pose, x, y, z):
-    """A point in the camera's frame."""
+    """Returns a point (x, y, z) of the world in the camera's frame, mm."""
     a, b, c = turned(pose, x, y, z)
     return a + pose[9], b + pose[10], c + pose[11]
 
 
 @njit(cache=True, nogil=True, inline="always")
 def pinhole(x, y, lens):
-    """Pixel (column, row) of the ray (x, y, 1) without distortion."""
+    """Returns the pixel (column, row) of the ray (x, y, 1) in the camera's frame, without distortion."""
     return lens[0] * x + lens[2], lens[1] * y + lens[3]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def distorted(x, y, lens):
-    """Pixel (column, row) of the ray (x, y, 1); NOWHERE past the turning radius. ``rig.camera``'s equation."""
+    """Returns the pixel (column, row) of the ray (x, y, 1) in the camera's frame, with Brown-Conrady distortion as in
+    ``rig.camera``; NOWHERE beyond the radius at which that is valid."""
     r2 = x * x + y * y
     if r2 > lens[9] * lens[9]:
         return NOWHERE, NOWHERE
@@ -51,7 +53,8 @@ def distorted(x, y, lens):
 
 @njit(cache=True, nogil=True, inline="always")
 def distortion_slopes(x, y, lens):
-    """d(pixel) / d(ray) of the ray (x, y, 1): column by x and by y, row by x and by y."""
+    """Returns the derivatives of ``distorted``, px for each unit of the ray: of the column by x and by y, of the row by
+    x and by y."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
     slope = 2.0 * (lens[4] + r2 * (2.0 * lens[5] + 3.0 * r2 * lens[8]))
@@ -63,7 +66,8 @@ def distortion_slopes(x, y, lens):
 
 @njit(cache=True, nogil=True, inline="always")
 def project(camera, x, y, z):
-    """Pixel (column, row) of a world point; NOWHERE behind the camera or past the lens's turning radius."""
+    """Returns the pixel (column, row) of a world point (mm); NOWHERE behind the camera or beyond the valid radius of
+    its lens."""
     a, b, depth = placed(camera, x, y, z)
     if depth <= NEAREST_MM:
         return NOWHERE, NOWHERE
@@ -72,7 +76,8 @@ def project(camera, x, y, z):
 
 @njit(cache=True, nogil=True, inline="always")
 def projection_slopes(camera, x, y, z):
-    """d(pixel) / d(world point): of the column, and of the row."""
+    """Returns the derivatives of ``project`` by the world point (px per mm): three of the column, and three of the
+    row."""
     a, b, depth = placed(camera, x, y, z)
     per = 1.0 / depth
     a, b = a * per, b * per
@@ -88,7 +93,7 @@ def projection_slopes(camera, x, y, z):
 
 @njit(cache=True, nogil=True)
 def project_all(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Pixels (n, 2) of world points (n, 3), mm; NaN where ``project`` has NOWHERE."""
+    """Returns the pixels (n, 2) of world points (n, 3; mm); NaN where ``project`` returns NOWHERE."""
     pixels = np.empty((len(points), 2))
     for n in range(len(points)):
         column, row = project(camera, points[n, 0], points[n, 1], points[n, 2])

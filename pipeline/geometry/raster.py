@@ -1,9 +1,9 @@
-"""A compiled z-buffer on the CPU: which surface a pixel sees, and how far away.
+"""Draws depth on the processor with a compiled z-buffer: which triangle a pixel sees, and how far away.
 
-It serves visibility in the texture (section 4.5), a result's figures and its small pictures, where reading images
-back from the GL renderer costs more than drawing them here; ``rig.render`` is the reference and the tests compare the
-two. Vertices are projected exactly, lens distortion included; between them triangles are taken as straight, which on a
-head of 48,000 vertices (edges of 2 to 5 px) bends by less than 0.001 px.
+It serves visibility for the texture (section 4.5), and a result's figures and small pictures, where reading images back
+from OpenGL takes longer than drawing them here. ``rig.render`` is the reference; tests compare the two. Vertices are
+projected exactly, lens distortion included. Triangles between them are drawn with straight edges, which on a head of
+48,000 vertices (edges of 2 to 5 px) is wrong by less than 0.001 px.
 """
 
 import cv2
@@ -50,7 +50,7 @@ def picture(
     colours: UInt8[np.ndarray, "v 3"],
     background: tuple[int, int, int] = (255, 255, 255),
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Draws the mesh in its vertex colours, without light, as the camera sees it."""
+    """Draws the mesh with its vertex colours, unlit, as the camera sees it."""
     pixels, depths = camera.project(vertices_world), camera_depths(camera, vertices_world)
     _, seen = rasterise(pixels, depths, faces, camera.intrinsics.height, camera.intrinsics.width)
     image = interpolate(seen, pixels, depths, faces, colours.astype(np.float32))

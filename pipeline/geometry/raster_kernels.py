@@ -9,10 +9,11 @@ from pipeline.compute.jit import njit
 def rasterise(
     pixels: np.ndarray, depths: np.ndarray, faces: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (float32, camera z in mm, inf where nothing) and face index (int32, -1) seen at every pixel centre.
+    """Draws a mesh and returns what is seen at every pixel centre: depth (height, width; float32, camera z in mm, inf
+    where there is nothing) and face index (int32, -1 for none).
 
-    ``pixels`` (V, 2) and ``depths`` (V,) are float64; a triangle with a vertex that is not finite or not in front of
-    the camera is left out. Depth between vertices is perspective-correct: 1/z is linear in the image.
+    ``pixels`` (v, 2) and ``depths`` (v) are the projected vertices, float64. A triangle with a vertex that is not
+    finite or not in front of the camera is left out. Depth is perspective-correct: 1/z is linear in the image.
     """
     depth = np.full((height, width), np.inf, np.float32)
     seen = np.full((height, width), -1, np.int32)
@@ -48,7 +49,8 @@ def rasterise(
 def interpolate(
     seen: np.ndarray, pixels: np.ndarray, depths: np.ndarray, faces: np.ndarray, values: np.ndarray
 ) -> np.ndarray:
-    """Perspective-correct values (V, C) of the surface that every pixel sees, float32 (H, W, C); NaN where none."""
+    """Interpolates values of the vertices (v, c) at every pixel of a mesh that ``rasterise`` drew, perspective-correct.
+    Returns (height, width, c) float32; NaN where no face is ``seen``."""
     height, width = seen.shape
     out = np.full((height, width, values.shape[1]), np.nan, np.float32)
     for y in range(height):

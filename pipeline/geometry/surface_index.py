@@ -1,4 +1,4 @@
-"""Closest points on triangle surfaces, exact over the triangles around the nearest samples of them."""
+"""Finds closest points on triangle surfaces, exactly among the triangles around the nearest samples of the surface."""
 
 from dataclasses import dataclass
 
@@ -41,7 +41,8 @@ class SurfaceIndex:
         facing_mm: float = 10.0,
     ) -> Hits:
         """Finds the closest surface point of each query point. With unit normals ``facing`` of the points, a triangle
-        that faces the other way is chosen only if it is nearer by ``facing_mm``, which keeps lips that touch apart."""
+        that faces the opposite way is chosen only if it is nearer by ``facing_mm``, so that lips that touch are kept
+        apart."""
         count = min(candidates, len(self._owner))
         nearest = self._tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)
         triangle, weights = closest_candidates(points, self._owner[nearest], self.corners, facing, facing_mm)

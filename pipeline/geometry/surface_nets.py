@@ -1,9 +1,9 @@
-"""Surface nets: a mesh of the zero level between the nodes of a grid.
+"""Makes surface nets: a mesh of the zero of a field between the nodes of a grid.
 
-Gibson, *Constrained elastic surface nets*, 1998, the naive kind: a vertex in every cell with both signs, at the mean of
-the places where the cell's edges cross the level; a quadrilateral over every edge with both. Enters: a field that is
-negative inside, at the nodes of a sparse grid or of a whole volume, positive on the outermost ones. Leaves: vertices in
-steps of the grid, triangles wound outwards. The mesh is closed; it is a manifold where the signs are well composed
+Gibson, *Constrained elastic surface nets*, 1998, the naive kind: a vertex in every cell with corners of both signs, at
+the mean of the points where the cell's edges cross zero; and a quadrilateral over every edge with both signs. Enters: a
+field, negative inside, at the nodes of a sparse grid or of a whole volume, positive on the outermost ones. Leaves:
+vertices in grid steps, triangles facing outwards. The mesh is closed; it is a manifold if the signs are well composed
 (``pipeline.fusion.net_kernels``).
 """
 
@@ -33,11 +33,11 @@ def node_keys(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> I
 
 
 def link_nodes(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> Int32[np.ndarray, "n 6"]:
-    """Returns the rows of each node's neighbours towards -x +x -y +y -z +z, -1 where there is none.
+    """Returns the rows of each node's neighbours towards -x +x -y +y -z +z, -1 if there is none.
 
     Args:
         index: of the nodes, in the order of ``node_keys``.
-        shape: of the full box.
+        shape: of the full grid.
     """
     return linked(index, node_keys(index, shape), shape[1], shape[2])
 
@@ -45,12 +45,12 @@ def link_nodes(index: Int32[np.ndarray, "n 3"], shape: tuple[int, int, int]) -> 
 def surface_net(
     field: Float32[np.ndarray, " n"], index: Int32[np.ndarray, "n 3"], neighbours: Int32[np.ndarray, "n 6"]
 ) -> SurfaceNet:
-    """Builds the mesh of the zero level on a sparse grid; each quadrilateral is split along its shorter diagonal.
+    """Builds the mesh of the field's zero on a sparse grid; each quadrilateral is split along its shorter diagonal.
 
     Args:
         field: at the nodes; negative inside.
-        index: of the nodes in the full box, in the order of ``node_keys``.
-        neighbours: of ``link_nodes``; every cell with both signs must be whole.
+        index: of the nodes in the full grid, in the order of ``node_keys``.
+        neighbours: the result of ``link_nodes``; every cell with both signs must be complete.
     """
     vertices, of_cell = net_vertices(field, index, neighbours)
     return SurfaceNet(vertices, net_faces(field, neighbours, vertices, of_cell, True), of_cell)

@@ -1,4 +1,5 @@
-"""Compiled loops of ``pipeline.geometry.surface_nets``: nodes of a grid in the order of their rank in the full box."""
+"""Compiled loops of ``pipeline.geometry.surface_nets``. The nodes of a sparse grid are sorted by their rank in the full
+grid."""
 
 import numpy as np
 
@@ -11,8 +12,9 @@ EDGES = np.array(
 
 @njit(cache=True, nogil=True, inline="always")
 def corners_of(n: int, neighbours: np.ndarray, corners: np.ndarray) -> bool:
-    """Rows of the eight corners of the cell above node ``n``; False where one is missing. Corner c lies at
-    (c >> 2, (c >> 1) & 1, c & 1)."""
+    """Fills ``corners`` (8) with the rows of the corners of the cell whose lowest node is ``n``; returns False if the
+    grid lacks one of them. Corner c has the offset (c >> 2, (c >> 1) & 1, c & 1). ``neighbours`` is the result of
+    ``linked``."""
     for c in range(8):
         at = n
         if c & 4:
@@ -29,7 +31,11 @@ def corners_of(n: int, neighbours: np.ndarray, corners: np.ndarray) -> bool:
 
 @njit(cache=True, nogil=True)
 def linked(index: np.ndarray, keys: np.ndarray, ny: int, nz: int) -> np.ndarray:
-    """Rows of the six neighbours of every node, -1 where there is none; ``keys`` ascend."""
+    """Returns the rows (n, 6) of the neighbours of every node: below and above along x, then y, then z; -1 for none.
+
+    ``index`` (n, 3) are the nodes' positions, ``keys`` (n, ascending) their ranks in a full grid of ``ny`` by ``nz``
+    nodes for each x.
+    """
     count = len(keys)
     out = np.full((count, 6), -1, np.int32)
     steps = (np.int64(ny) * nz, np.int64(nz), np.int64(1))
@@ -49,7 +55,8 @@ def linked(index: np.ndarray, keys: np.ndarray, ny: int, nz: int) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def nodes_about_surface(field: np.ndarray) -> np.ndarray:
-    """Indices (n, 3) int32 of the nodes of a volume that are corners of a cell with both signs, by rank."""
+    """Returns the positions (n, 3; int32, by rank) of all corners of those cells of a volume that have corners of both
+    signs."""
     nx, ny, nz = field.shape
     wanted, count = np.zeros(field.shape, np.bool_), 0
     for i in range(nx - 1):
@@ -76,8 +83,9 @@ def nodes_about_surface(field: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def net_vertices(field: np.ndarray, index: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (float64, in steps), the mean of the places where their cells' edges cross the surface; and the vertex
-    (int32) of each node's cell, -1 where there is none."""
+    """Returns the vertices (float64, in grid steps) of the surface net: in each cell that the surface crosses, the mean
+    of the points where it crosses the cell's edges. Also returns the vertex (int32) of each node's cell, -1 for
+    none."""
     corners = np.empty(8, np.int64)
     of_cell = np.full(len(field), -1, np.int32)
     vertices = np.empty((len(field), 3))
@@ -108,8 +116,12 @@ def net_vertices(field: np.ndarray, index: np.ndarray, neighbours: np.ndarray) -
 def net_faces(
     field: np.ndarray, neighbours: np.ndarray, vertices: np.ndarray, of_cell: np.ndarray, shorter: bool
 ) -> np.ndarray:
-    """Triangles (int32), wound outwards: two for every edge with both signs, split along the ``shorter`` diagonal, else
-    always along the one from the cell that is lowest in both other axes."""
+    """Returns the triangles (int32, facing outwards) of the surface net: two for every edge of the grid whose ends
+    differ in sign, joining the vertices of the four cells around it.
+
+    The quadrilateral is split along its shorter diagonal if ``shorter``; else along the one from the cell that is
+    lowest in both other axes.
+    """
     faces = np.empty((6 * len(vertices) + 16, 3), np.int32)
     made = 0
     for n in range(len(field)):

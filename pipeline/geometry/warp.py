@@ -17,11 +17,9 @@ def landmark_warp(
     *,
     smoothing: float = 0.0,
 ) -> Float[np.ndarray, "N 3"]:
-    """Moves points by the smooth map that takes each source landmark to its target.
-
-    ``smoothing`` (mm) above 0 lets landmarks miss their targets in exchange for less bending. Needs 4 landmarks that
-    are not on a plane; raises numpy.linalg.LinAlgError otherwise.
-    """
+    """Moves points by the smooth map that takes each source landmark to its target. If ``smoothing`` (mm) is above 0,
+    landmarks may miss their targets in exchange for less bending. At least 4 landmarks that are not on a plane are
+    needed; else numpy.linalg.LinAlgError is raised."""
     count = len(source)
     affine = np.concatenate([np.ones((count, 1)), source], 1)
     system = np.zeros((count + 4, count + 4))

@@ -1,7 +1,7 @@
-"""Where a user's data and head models live: one rule for the command line, the service and its workers.
+"""Locates a user's data and head models: one rule for the command line, the service and its workers.
 
 The data folder is ``--data``, which sets EIGENHEAD_DATA, else EIGENHEAD_DATA, else ``$XDG_DATA_HOME/eigenhead``, else
-~/.local/share/eigenhead. Models lie in its ``models``, unless EIGENHEAD_MODELS names another folder.
+~/.local/share/eigenhead. Models lie in its folder ``models``, unless EIGENHEAD_MODELS names another one.
 """
 
 import os

@@ -134,12 +134,12 @@ def decimate(
     fixed: Bool[np.ndarray, " V"],
     chart: Float[np.ndarray, "V 2"] | None = None,
 ) -> list[tuple[Int[np.ndarray, " _"], Int[np.ndarray, "_ 3"]]]:
-    """Reduces a mesh to each of the falling numbers of triangles in ``targets``. Returns for each the vertices that
-    remain (indices, ascending) and the triangles among them.
+    """Reduces a mesh to each of the decreasing numbers of triangles in ``targets``. Returns, for each, the vertices
+    that remain (indices, ascending) and the triangles among them.
 
     ``importance`` multiplies the error of a vertex: where it is high the mesh stays denser. Vertices that are ``fixed``
     all remain. With a ``chart`` (texture coordinates) no triangle turns over in it. A result has more triangles than
-    its target where every further collapse would fold the surface, leave a sliver or break the manifold.
+    its target if every further collapse would fold the surface, leave a sliver, or break the manifold.
     """
     state = _Collapser(vertices, faces, importance, fixed, chart)
     out = []

@@ -1,8 +1,9 @@
-"""Expressions of a head model: displacements that a face makes beside what it is, each with a weight from 0 to 1.
+"""Defines the expressions of a head model: displacements in addition to the identity, each with a weight from 0 to 1.
 
-A head is ``mean + sum_m z_m modes_m + sum_e w_e shapes_e``: identity is Gaussian, expressions are blendshapes. Their
-names are their source's; Apple's 52 (https://developer.apple.com/documentation/arkit/arfaceanchor/blendshapelocation)
-are what programs exchange, and ``arkit_parts`` says which of a model's shapes stand for which of them.
+A head is ``mean + sum_m z_m modes_m + sum_e w_e shapes_e``: identity is Gaussian, expressions are blendshapes. They
+keep the names of their source. Programs exchange Apple's 52 names
+(https://developer.apple.com/documentation/arkit/arfaceanchor/blendshapelocation); ``arkit_parts`` says which of a
+model's shapes correspond to which of these.
 """
 
 import re
@@ -78,12 +79,9 @@ def words(name: str) -> str:
 
 
 def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    """Returns, for each of Apple's 52 names, the indices of the model's shapes that together stand for it; an empty
-    tuple where none does.
-
-    That is the shape of the same name or, where the model splits what Apple does not, the left and the right one
-    (ICT-FaceKit's cheekPuff_L and cheekPuff_R).
-    """
+    """Returns, for each of Apple's 52 names, the indices of the model's shapes that together correspond to it; empty if
+    none does. It is the shape of the same name or, if the model has two shapes for one of Apple's, the left and the
+    right one (ICT-FaceKit's cheekPuff_L and cheekPuff_R)."""
     known = {plain_name(name): k for k, name in enumerate(names)}
     found = {}
     for name in ARKIT:
@@ -93,8 +91,8 @@ def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
-    """Reads texts such as ``mouthSmile_L=0.5`` and returns the weights by the model's name of the expression; Apple's
-    names are understood, too. Raises InputError naming every fault."""
+    """Reads texts such as ``mouthSmile_L=0.5``, and returns the weights by the model's name of the expression. Apple's
+    names are accepted, too. Raises InputError that names every fault."""
     known = {plain_name(name): name for name in names} | {name: name for name in names}
     found, faults = {}, []
     for text in texts:
@@ -127,8 +125,8 @@ def closed_lids(weights: Mapping[str, float]) -> dict[str, float]:
 
 
 def packed(expressions: Expressions) -> dict[str, np.ndarray]:
-    """Packs expressions into the arrays of a model file: only the vertices that each shape moves, in float16 (0.004 mm
-    of a centimetre)."""
+    """Packs expressions into the arrays of a model file: only the vertices that each shape moves, in float16 (an error
+    of 0.004 mm in a centimetre)."""
     moved = np.abs(expressions.shapes).max(axis=2) > SPARSE_MM
     return {
         "expression_counts": moved.sum(axis=1).astype(np.int32),
@@ -138,8 +136,8 @@ def packed(expressions: Expressions) -> dict[str, np.ndarray]:
 
 
 def unpacked(names: list[str], arrays: Mapping[str, np.ndarray], vertices: int) -> Expressions:
-    """Returns the expressions that ``packed`` made arrays of, for a cage with this many vertices. Raises ValueError
-    where the arrays contradict each other."""
+    """Returns the expressions from arrays that ``packed`` made, for a cage with this many vertices. Raises ValueError
+    if the arrays contradict each other."""
     counts, rows, moves = (arrays[f"expression_{part}"] for part in ("counts", "vertices", "moves"))
     if len(counts) != len(names) or counts.sum() != len(rows) or moves.shape != (len(rows), 3):
         raise ValueError("its expressions' arrays do not fit each other")

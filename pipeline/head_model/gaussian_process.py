@@ -1,14 +1,16 @@
-"""A wider basis for the same solver: smooth deformations that no population has to contain.
+"""Adds modes with which the solver can leave the span of the eigenheads: smooth deformations that need not occur in the
+population.
 
-A Gaussian process on the mean surface, in the manner of Gaussian process morphable models (Luethi et al. 2018,
-https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's normal with covariance
+It is a Gaussian process on the mean surface, as in Gaussian process morphable models (Luethi et al. 2018,
+https://doi.org/10.1109/TPAMI.2017.2739743): displacement along the mean's normal with the covariance
 
-    k(x, y) = sum_i a_i^2 [ (1 - f) (g_i(x, y) + g_i(x, My)) + f g_i(x, y) ],   g_i(x, y) = exp(-|x - y|^2 / (2 l_i^2)),
+    k(x, y) = sum_i a_i^2 [ (1 - f) (g_i(x, y) + g_i(x, My)) + f g_i(x, y) ],
+    g_i(x, y) = exp(-|x - y|^2 / (2 l_i^2)),
 
-M the mirror through the median plane: faces deviate from a population mostly alike on both sides. Its leading
-eigenfunctions (Nystroem's method on a subset of the cage), each with its standard deviation in it, stand behind the
-eigenheads as modes with the same unit prior, orthogonal to the span of the eigenheads. Along the normal only: sliding
-along the surface changes no silhouette.
+where M mirrors at the median plane: faces deviate from a population mostly symmetrically. Its leading eigenfunctions
+(Nystroem's method on a subset of the cage), each scaled by its standard deviation, follow the eigenheads as modes with
+the same unit prior, orthogonal to the span of the eigenheads. They move along the normal only, since sliding along the
+surface changes no silhouette.
 """
 
 from dataclasses import dataclass, replace
@@ -55,7 +57,7 @@ def with_kernel(
 
 
 def with_fine_kernel(model: HeadModel, *, length_mm: float, amplitude_mm: float, most: int = 400) -> HeadModel:
-    """Returns the model with further modes of a shorter length that deform the face region only, for solvers that see
+    """Returns the model with more modes, of a shorter length, that deform the face region only, for solvers that see
     more of the face than its outline.
 
     The modes fade out over half a length beyond the region. They are not made orthogonal to the other modes: the prior
@@ -122,8 +124,8 @@ def _square_distance(x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "m 3"]) -
 
 
 def spread_nodes(points: Float[np.ndarray, "v 3"], count: int) -> Int[np.ndarray, " n"]:
-    """Returns the indices of ``count`` points that lie far from each other, by farthest-point sampling from the one
-    with the largest z. The same points give the same choice."""
+    """Chooses ``count`` points that lie far from each other, by farthest-point sampling from the one with the largest
+    z. Returns their indices."""
     nodes = np.empty(count, int)
     nodes[0] = int(np.argmax(points[:, 2]))
     distance = np.full(len(points), np.inf)

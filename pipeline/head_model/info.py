@@ -1,4 +1,4 @@
-"""What a head model is made of, as ``eigenhead model info --json`` says it."""
+"""Describes a head model, as ``eigenhead model info --json`` prints it."""
 
 from collections.abc import Mapping
 from typing import TypedDict
@@ -7,12 +7,15 @@ from pipeline.head_model.model import HeadModel
 
 
 class LevelInfo(TypedDict):
+    """Describes the size of a mesh level."""
+
     vertices: int
     faces: int
 
 
 class ModelInfo(TypedDict):
-    """Holds what is known of a model. Vertices and faces are those of the full level; what nobody measured is None."""
+    """Describes a head model. ``vertices`` and ``faces`` are those of the full level; figures that were never measured
+    are None."""
 
     name: str
     licence: str
@@ -32,7 +35,7 @@ class ModelInfo(TypedDict):
 
 
 def model_info(model: HeadModel) -> ModelInfo:
-    """Returns what a model is made of, as plain values that JSON can hold."""
+    """Returns the description of a model as JSON types."""
     full = model.levels["full"]
     return {
         "name": model.name,

@@ -56,6 +56,6 @@ def mirrored(name: str) -> str:
 
 
 def stacked(points: Mapping[str, Float[np.ndarray, " 3"]], names: Iterable[str] = NAMES) -> Float[np.ndarray, "L 3"]:
-    """Returns the positions of the landmarks ``names`` as rows of an array, in that order. Raises KeyError where one is
+    """Returns the positions of the landmarks ``names`` as rows of an array, in that order. Raises KeyError if one is
     missing."""
     return np.array([points[name] for name in names], float).reshape(-1, 3)

@@ -191,7 +191,7 @@ def with_modes(model: HeadModel, count: int) -> HeadModel:
 
 def with_expressions(model: HeadModel) -> HeadModel:
     """Returns the model with its expressions appended as modes, so that their coefficients are the expressions'
-    weights. Returns the same model where it has no expressions or they are modes already."""
+    weights. A model without expressions, or with these modes already, is returned unchanged."""
     count = len(model.expressions)
     if not count or len(model.posed):
         return model

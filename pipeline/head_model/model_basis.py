@@ -1,4 +1,4 @@
-"""The modes of a head model that a reconstruction solves for."""
+"""Chooses the modes of a head model that a reconstruction fits."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -13,8 +13,8 @@ from rig.mesh import vertex_normals
 
 
 def model_basis(model: HeadModel, settings: Settings) -> HeadModel:
-    """Returns the model with the modes that the settings ask for: eigenheads alone, or eigenheads, modes of the
-    Gaussian process and expressions where the fit may leave the span."""
+    """Returns the model with the modes that the settings require: eigenheads alone or, if the fit may leave their span,
+    eigenheads, modes of the Gaussian process, and expressions."""
     within_span = settings.detail == "span" or settings.method == "simplex"
     return basis_of(model, min(settings.fitting.modes, len(model.modes)), kernel=not within_span)
 

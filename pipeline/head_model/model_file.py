@@ -1,4 +1,4 @@
-"""Head models as files: what one holds, written and read. What it becomes in memory: ``pipeline.head_model.model``."""
+"""Reads and writes head models as files. In memory a model is a ``pipeline.head_model.model``."""
 
 import hashlib
 import json

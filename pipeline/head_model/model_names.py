@@ -1,4 +1,4 @@
-"""Which head models are at hand, and the files behind their names. Loads nothing: the command line asks it."""
+"""Lists the available head models and their files. Loads no model: the command line calls it."""
 
 import hashlib
 from functools import lru_cache
@@ -13,7 +13,7 @@ _PACK_FILES = {"default": "makehuman.npz", DEFAULT: "makehuman.npz", "makehuman"
 
 
 class UnknownModel(EigenheadError):
-    """Refuses a model name that is neither shipped nor in the user's folder, nor a file."""
+    """Reports a model name that is neither shipped, nor in the user's folder, nor a file."""
 
     def __init__(self, name: str) -> None:
         known = ", ".join(sorted(list_models()))
@@ -40,7 +40,7 @@ def list_models() -> dict[str, Path]:
 
 
 def model_path(name_or_path: str | Path) -> Path:
-    """Returns the file of the head model that is named, or that lies at a path. Raises UnknownModel."""
+    """Returns the file of a head model, from its name or its path. Raises UnknownModel."""
     name = str(name_or_path)
     if name in _PACK_FILES:
         return PACKS / _PACK_FILES[name]

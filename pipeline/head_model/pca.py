@@ -15,8 +15,8 @@ from rig.geometry import rigid_fit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Components:
-    """Holds the principal components of a set of heads: mean + scores @ modes gives the heads back. Modes are
-    orthogonal to each other, in mm per standard deviation."""
+    """Holds the principal components of a set of heads, which are mean + scores @ modes. Modes are orthogonal to each
+    other, in mm per standard deviation."""
 
     mean: Float[np.ndarray, "V 3"]
     modes: Float[np.ndarray, "M V 3"]

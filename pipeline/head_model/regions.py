@@ -1,6 +1,7 @@
-"""Regions of a head by name, for every model: what figures are reported by, and where detail differs.
+"""Defines named regions of a head for every model: figures are reported by region, and detail differs between them.
 
-Bounds are distances from the landmarks on the mean head, so that a region holds the same places whatever the mesh.
+Their borders are at distances from landmarks on the mean head, so that a region is the same part of the head for any
+mesh.
 """
 
 from functools import lru_cache

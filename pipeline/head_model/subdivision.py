@@ -45,8 +45,8 @@ def edges_of(
 
 
 def check_manifold(faces: Int[np.ndarray, "F 3"]) -> None:
-    """Raises NotAManifold where an edge has more than two triangles, or two neighbouring triangles wind in opposite
-    senses."""
+    """Raises NotAManifold if an edge has more than two triangles, or if two neighbouring triangles have opposite
+    orientation."""
     _, _, counts = edges_of(faces)
     if (counts > 2).any():
         raise NotAManifold(int((counts > 2).sum()), "are shared by more than two triangles")
@@ -57,7 +57,7 @@ def check_manifold(faces: Int[np.ndarray, "F 3"]) -> None:
 
 
 def boundary_vertices(faces: Int[np.ndarray, "F 3"], count: int) -> Bool[np.ndarray, " V"]:
-    """Returns a mask of the ``count`` vertices that is true on open edges of the mesh."""
+    """Tells which of the ``count`` vertices lie on open edges of the mesh."""
     edges, _, uses = edges_of(faces)
     flags = np.zeros(count, bool)
     flags[edges[uses == 1].ravel()] = True
@@ -71,8 +71,8 @@ def vertex_areas(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3
 
 
 def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
-    """Returns the open borders of a mesh, each as a list of vertices in the direction in which the border's triangles
-    run. Raises NotAManifold where a border touches itself."""
+    """Returns the open borders of a mesh, each as a list of vertices in the direction of its triangles. Raises
+    NotAManifold if a border touches itself."""
     after: dict[int, int] = {}
     rim = boundary_edges(faces)
     for a, b in rim.tolist():
@@ -91,11 +91,9 @@ def boundary_loops(faces: Int[np.ndarray, "F 3"]) -> list[list[int]]:
 
 
 def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.ndarray, "T 3"]:
-    """Returns triangles that close a long opening such as a mouth or an eye, from its end with the least x to the one
-    with the largest. No vertex is added.
-
-    The triangles face as the surface around the opening does if ``loop`` comes from ``boundary_loops``.
-    """
+    """Returns triangles that close a long opening such as a mouth or an eye, as a strip from its end with the smallest
+    x to that with the largest. No vertex is added. The triangles face as the surface around the opening, if ``loop`` is
+    a result of ``boundary_loops``."""
     x = vertices[loop, 0]
     start, end = int(x.argmin()), int(x.argmax())
     ring = loop[start:] + loop[:start]

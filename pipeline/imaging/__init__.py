@@ -1,1 +1,1 @@
-"""Treats images as geometry: silhouettes and their distances, masks, colour charts, highlights."""
+"""Measures images: silhouettes and distances to them, masks, colour charts, highlights."""

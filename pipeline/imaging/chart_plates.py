@@ -1,6 +1,6 @@
-"""Clean plates in which a colour chart is held up: they say what colours are, and are not of the empty studio.
+"""Handles clean plates in which a colour chart is held up: they define colours, and do not show the empty studio.
 
-Looking for a chart takes a tenth to a third of a second a plate, so that it is looked for only where it can be.
+To search a plate for a chart takes a tenth to a third of a second, so that only plates that may have one are searched.
 """
 
 import cv2
@@ -24,7 +24,7 @@ def empty_plates(plates: tuple[Plate, ...]) -> tuple[Plate, ...]:
 
 
 def charts_in(plates: tuple[Plate, ...]) -> list[Chart]:
-    """Finds the colour charts in one camera's plates; if the plates are alike, only the first is searched."""
+    """Finds the colour charts in one camera's plates. If the plates look alike, only the first is searched."""
     searched = plates if len(plates) > 1 and _differ(plates) else plates[:1]
     return [chart for chart in map(find_chart, searched) if chart is not None]
 

@@ -1,9 +1,9 @@
-"""Gain and offset of every camera's colours, from vertices that several cameras see.
+"""Estimates gain and offset of every camera's colours, from vertices that several cameras see.
 
-A matt point sends the same light everywhere, so ``g_k c_k + b_k`` should agree over the cameras k that see it. Least
-squares, channel by channel in linear light, with the point's own colour eliminated, and reweighted (Cauchy) because
-skin also shines and fits are not exact. What no data tells is fixed by the prior: gains multiply to one, offsets are
-small.
+A matt point sends the same light everywhere, so ``g_k c_k + b_k`` should agree over the cameras k that see it. The
+solution is by least squares, channel by channel in linear light, with the point's own colour eliminated, and reweighted
+(Cauchy) because skin also shines and fits are not exact. The rest is fixed by the prior: gains have the product 1,
+offsets are small.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ def balance(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Computes a gain and an offset for each camera and channel, so that ``gains * colours + offsets`` agree between
-    cameras; the gains of each channel multiply to one."""
+    cameras. The gains of each channel have the product 1."""
     cameras = len(weights)
     shared = np.flatnonzero(np.count_nonzero(weights, axis=0) >= 2)
     shared = shared[:: max(1, len(shared) // SAMPLE)]

@@ -1,8 +1,8 @@
-"""A colour chart in a photograph: the 24 patches of a ColorChecker Classic, found by OpenCV's mcc module, and what they
-say of the camera.
+"""Finds a colour chart in a photograph (the 24 patches of a ColorChecker Classic, by OpenCV's mcc module), and computes
+a camera's colour correction from it.
 
-Colours are linear light here, 0 to 1, of the picture's own channels; the patches' true ones are those that OpenCV's
-colour correction model holds (X-Rite's, in linear sRGB under D65: the white patch is 0.91).
+Colours are linear light here, 0 to 1, in the picture's own channels. The true colours of the patches are those of
+OpenCV's colour correction model (X-Rite's, in linear sRGB under D65: the white patch is 0.91).
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
-"""Signed distance to a sub-pixel contour: the level set of a smooth field on the pixel grid.
+"""Computes the signed distance to a sub-pixel contour: a level of a smooth field on the pixel grid.
 
-The contour is what marching squares draws between pixel centres. Up to ``BAND_PX`` from it every pixel takes the
-distance to the nearest contour piece, exactly. Farther out nobody needs hundredths of a pixel: there it is a 5 x 5
-chamfer transform of the mask, good to half a pixel and 2 %, blended in over the band's outer third.
+The contour is what marching squares draws between pixel centres. Up to ``BAND_PX`` from it, every pixel gets the exact
+distance to the nearest piece of the contour. Farther away, hundredths of a pixel do not matter: the distance there is a
+5 x 5 chamfer transform of the mask, exact to half a pixel and 2 %, blended in over the outer third of the band.
 """
 
 import cv2
@@ -17,7 +17,7 @@ BAND_PX = 12
 
 def distance_to_level(field: Float32[np.ndarray, "h w"], level: float = 0.5) -> Float32[np.ndarray, "h w"]:
     """Computes the signed distance (px) to the contour ``field == level``, negative where the field is above it.
-    Without a contour every distance is +-(h + w), finite so that slopes can be taken."""
+    Without a contour every distance is +-(h + w), a finite value so that slopes can be computed."""
     above = field > level
     near = box_around(above, BAND_PX + 1)
     segments = segments_of_level(field[near], level)

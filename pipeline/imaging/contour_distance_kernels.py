@@ -7,7 +7,8 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True, nogil=True)
 def segments_of_level(field: np.ndarray, level: float) -> np.ndarray:
-    """Marching squares: rows (x0, y0, x1, y1, x cell, y cell). Ambiguous cells are split by their mean."""
+    """Finds the contour of ``field`` (h, w) at ``level`` by marching squares. Returns its segments as rows (x0, y0, x1,
+    y1, x cell, y cell), px. A cell whose corners allow two ways is split according to their mean."""
     height, width = field.shape
     out = np.empty((height * width // 4 + 16, 6), np.float32)
     count = 0
@@ -51,7 +52,9 @@ def segments_of_level(field: np.ndarray, level: float) -> np.ndarray:
 
 @njit(cache=True, nogil=True, fastmath=True)
 def refine_distance(whole: np.ndarray, field: np.ndarray, level: float, segments: np.ndarray, band: int) -> None:
-    """Replaces the distances of the band in place: every contour piece is asked by all pixels within its reach."""
+    """Replaces the signed distances ``whole`` (h, w; px) near the contour, in place, by exact distances to its
+    ``segments``. Full replacement ends at two thirds of ``band`` (px) and fades out to its end. The sign is negative
+    where ``field`` is above ``level``."""
     height, width = field.shape
     best = np.full((height, width), np.float32(1e12), np.float32)
     for k in range(len(segments)):

@@ -1,16 +1,14 @@
-"""Photographs without the highlights on skin, for matching.
+"""Removes highlights on skin from photographs, for matching.
 
-A highlight moves with the camera: matched between views it lies behind the surface (for a convex one, up to half its
-radius of curvature), and on smooth skin it is all that there is to match. What a place of the fitted head shows in the
-views that see it tells highlights apart: the skin's own light is the same in all of them, a highlight adds light of the
-lamp's colour to few. So each view is lowered to the level that the darkest third of the views has, slowly along the
-surface, where it is above it by light less coloured than the skin (the dichromatic model: Shafer 1985, *Using color to
+A highlight moves with the camera. Matched between views, it lies behind a convex surface, by up to half its radius of
+curvature; and on smooth skin there is nothing else to match. Comparing the views at each point of the fitted head
+separates it: the skin's own light is the same in all of them, while a highlight adds light of the lamp's colour to a
+few. So each view is darkened to the level of the darkest third of the views, with a correction that varies slowly along
+the surface, where the excess is less coloured than the skin (the dichromatic model: Shafer 1985, *Using color to
 separate reflection components*; Lin et al. 2002, *Diffuse-specular separation and depth recovery from image sequences*,
-compare views as is done here). Skin's texture is finer and stays. Where views differ by the skin's own colour, the head
-stands in the wrong place, and nothing is taken off.
-
-Levels are taken off as they are displayed, not in linear light: what a camera's tone curve makes of a highlight, nobody
-knows.
+compare views in the same way). The skin's texture is finer and is kept. If views differ by the skin's own colour, the
+head is in the wrong place, and nothing is removed. Levels are subtracted as displayed, not in linear light, since a
+camera's tone curve for highlights is unknown.
 """
 
 from collections.abc import Mapping
@@ -66,7 +64,7 @@ class _Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excess:
-    """Holds how much brighter than the skin's own light each of k views shows each of v vertices, as far as the added
+    """Holds how much brighter than the skin's own light each of v vertices is in each of k views, as far as the added
     light is whiter than the skin."""
 
     levels: Float32[np.ndarray, "k v"]  # 0 to 255, as displayed
@@ -108,12 +106,12 @@ def without_highlights(
 
 
 def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarray, "f 3"]) -> Excess:
-    """Computes how much each view's light exceeds the skin's own light at each vertex, as far as a highlight explains
-    it.
+    """Computes how much the light in each view exceeds the skin's own light at each vertex, as far as a highlight
+    explains it.
 
     Args:
         colours: linear light of each view at each vertex of the head; NaN where the view does not see it.
-        faces: the head's, which define the neighbours of a vertex.
+        faces: of the head, which define the neighbours of a vertex.
     """
     light = colours @ LIGHT
     seen = np.isfinite(light)
@@ -149,8 +147,8 @@ def highlight_levels(colours: Float32[np.ndarray, "k v 3"], faces: Int[np.ndarra
 
 
 def local_range(values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, " v"]:
-    """Returns the difference between the highest and lowest value among each vertex and its neighbours, which are 1 mm
-    away in the face."""
+    """Returns the difference between the largest and the smallest value among each vertex and its neighbours, which are
+    about 1 mm away in the face."""
     high, low = values.copy(), values.copy()
     highest, lowest = values[faces].max(axis=1), values[faces].min(axis=1)
     for corner in faces.T:

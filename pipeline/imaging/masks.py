@@ -1,4 +1,4 @@
-"""Boxes around masks, growing and shrinking them, and carrying values out of them."""
+"""Works on masks: boxes around them, growing and shrinking, holes, and spreading values beyond them."""
 
 import cv2
 import numpy as np
@@ -36,8 +36,8 @@ def without_holes(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def spread(
     values: Float32[np.ndarray, "h w c"], weight: Float32[np.ndarray, "h w"], sigma: float
 ) -> Float32[np.ndarray, "h w c"]:
-    """Spreads values from pixels with weight to all pixels: the weighted mean in a Gaussian window or, where that is
-    empty, in a wider one."""
+    """Spreads values from pixels with weight to all pixels: the weighted mean in a Gaussian window or, if that is
+    empty, in a wider one. ``sigma`` is in pixels."""
     whole = _carried(weight, sigma)
     return cv2.merge([_carried(plane * weight, sigma) / whole for plane in cv2.split(values)])
 

@@ -1,4 +1,4 @@
-"""Silhouettes and the paper's costs (section 4.3)."""
+"""Defines silhouettes, and the paper's costs of their differences (section 4.3)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,8 +15,8 @@ CONTOUR_BLUR_PX = 1.0  # noise of a digital edge falls from 0.29 to 0.1 px; a be
 
 @dataclass(frozen=True, slots=True)
 class ViewQuality:
-    """Holds whether a view's silhouette is ``usable``, and the warnings against it. ``doubts`` are those that a clean
-    plate or a mask would settle, for views that had neither."""
+    """Holds whether a view's silhouette is usable, and the warnings about it. ``doubts`` are those that a clean plate
+    or a mask would resolve, for views that had neither."""
 
     usable: bool = True
     contrast: float = float("inf")  # subject against background, in standard deviations of the noise
@@ -39,17 +39,17 @@ class Silhouette:
 
 
 def silhouette_from_mask(mask: Bool[np.ndarray, "h w"]) -> Silhouette:
-    """Builds the silhouette of a ready binary mask."""
+    """Builds the silhouette from a given binary mask."""
     return Silhouette(mask, signed_distance(mask))
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Returns sub-pixel signed distance (px) to the contour of a binary mask, negative inside.
+    """Returns sub-pixel signed distance (px) to the contour of a binary mask, negative inside. Without a contour it is
+    +-(h + w), farther than any pixel.
 
     Far from the contour it is the Euclidean distance transform, which measures to the nearest pixel *centre* of the
-    other kind: the contour lies half a pixel before. Within two pixels that staircase would leave 0.3 px of noise;
-    there the mask is blurred by a Gaussian, which turns a straight edge at distance d into ``Phi(-d / s)``, and d is
-    read back. Without a contour it is farther than any pixel (+-(h + w)).
+    other kind, less half a pixel. Within two pixels its steps would leave 0.3 px of noise. There the mask is blurred by
+    a Gaussian, which turns a straight edge at distance d into ``Phi(-d / s)``, and d is computed from that.
     """
     inside, outside = _distance_transforms(mask)
     far = float(sum(mask.shape))
@@ -80,7 +80,7 @@ def _distance_transform(mask: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h
 
 
 def xor_cost(observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> float:
-    """Computes eq. (4): the number of pixels that differ."""
+    """Computes the paper's eq. (4): the number of pixels in which two masks differ."""
     return float(np.count_nonzero(observed ^ model))
 
 
@@ -95,5 +95,6 @@ def boundary_weights(observed: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "
 def boundary_weighted_xor(
     observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"], weights: Float[np.ndarray, "h w"]
 ) -> float:
-    """Computes eq. (5): a differing pixel costs ``1 / d^2``."""
+    """Computes the paper's eq. (5): the sum of ``weights`` over the pixels in which two masks differ; see
+    ``boundary_weights``."""
     return float(weights[observed ^ model].sum(dtype=np.float64))

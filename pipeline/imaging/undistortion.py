@@ -1,7 +1,7 @@
-"""Pictures as a pinhole would have taken them, for programs that know no lens.
+"""Undistorts pictures, for programs that know no lens distortion.
 
-Pixels are read by a spline at exact places: OpenCV's remap rounds them to 1/32 px, which moves a whole picture by up to
-0.016 px where only its middle moves.
+Pixels are read by a spline at exact positions. OpenCV's remap rounds them to 1/32 px, which would shift a picture by up
+to 0.016 px where only its principal point moves.
 """
 
 import math
@@ -16,8 +16,8 @@ SPLINE_ORDER = 3
 
 
 def pinhole_of(lens: Intrinsics, *, centred: bool = False) -> Intrinsics:
-    """Returns the same camera without distortion. ``centred``: with square pixels and the principal point in the middle
-    of the picture, all that a field of view can say."""
+    """Returns the same camera without distortion. If ``centred``, it has square pixels and the principal point in the
+    middle of the picture, as formats require that state only a field of view."""
     if not centred:
         return Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
     focal = math.sqrt(lens.fx * lens.fy)
@@ -27,7 +27,7 @@ def pinhole_of(lens: Intrinsics, *, centred: bool = False) -> Intrinsics:
 def undistorted_picture(
     picture: UInt8[np.ndarray, "h w 3"], lens: Intrinsics, pinhole: Intrinsics
 ) -> UInt8[np.ndarray, "y x 3"]:
-    """Returns what ``pinhole`` would have taken of ``picture``; black where the lens saw nothing."""
+    """Returns the picture that ``pinhole`` would have taken instead; black where the lens shows nothing."""
     if lens == pinhole:
         return picture
     places = _sampled_pixels(lens, pinhole)
@@ -41,7 +41,7 @@ def undistorted_picture(
 def undistorted_share(
     share: Float32[np.ndarray, "h w"], lens: Intrinsics, pinhole: Intrinsics
 ) -> Float32[np.ndarray, "y x"]:
-    """Returns a mask's share of the subject in every pixel (0 to 1) in the pinhole's picture; 0 where the lens saw
+    """Returns a mask's share of the subject in every pixel (0 to 1) in the pinhole's picture; 0 where the lens shows
     nothing."""
     if lens == pinhole:
         return share

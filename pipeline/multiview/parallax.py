@@ -1,7 +1,8 @@
-"""How much views shift against each other when a surface moves along its normal.
+"""Computes how much views shift against each other when a surface moves along its normal.
 
-What is wrong in an image (noise, a highlight, a calibration) is a shift of so many pixels; in depth it is that divided
-by the parallax. Lengths that were measured before one rig hold before another by the ratio of their parallaxes.
+An error in an image (noise, a highlight, the calibration) is a shift of some pixels. The error in depth is that shift
+divided by the parallax. Lengths that were measured with one rig are carried to another by the ratio of their
+parallaxes.
 """
 
 import numpy as np
@@ -18,14 +19,15 @@ def parallax(
     view: Int[np.ndarray, "n v"],
     value: Float[np.ndarray, "n v"],
 ) -> Float[np.ndarray, " n"]:
-    """Returns by how much (mm on the surface, as the views see it) two views of each point shift against each other for
-    each mm along its normal: the root mean square over two views drawn by weight, the same twice included.
+    """Returns the parallax of points on a surface: by how much two views shift against each other along the surface,
+    for each millimetre that the surface moves along its normal. It is the root mean square over all pairs of views,
+    weighted.
 
     Args:
-        points: places on a surface, mm.
-        normals: unit, of the surface there.
-        centres: of the cameras, same frame.
-        view: the cameras that compare a point; -1 for none.
+        points: on a surface, mm.
+        normals: unit normals of the surface there.
+        centres: of the cameras, in the same frame.
+        view: the cameras that compare each point; -1 for none.
         value: their weights; 0 for none.
     """
     towards = centres[np.maximum(view, 0)] - points[:, None]
@@ -38,5 +40,7 @@ def parallax(
 
 
 def depth_factor(found: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Returns how many times farther a shift in the images moves a depth than before the usual rig; at least 1."""
+    """Returns how much larger the depth error is that an error in the images causes than with the usual rig (eleven
+    cameras around a face, parallax ``USUAL``): the ratio of the parallaxes, at least 1. ``found`` is the parallax of
+    each point."""
     return USUAL / np.clip(found, MIN_PARALLAX, USUAL)

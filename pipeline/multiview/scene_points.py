@@ -1,8 +1,8 @@
-"""Points of the scene that two neighbouring views show, from cameras that are known.
+"""Finds points of the scene in two neighbouring views each, with cameras that are known.
 
-SIFT keypoints of each view are matched with those of its neighbours; what the cameras allow, by the distance of both
-pixels from the point where their rays pass each other, is kept. Points say what is near and what is far where colours
-do not; a uniform backdrop has none.
+SIFT keypoints of each view are matched with those of its neighbours. A match is kept if the cameras allow it: both
+pixels lie close to the point where their rays pass each other. The points say what is near and what is far where
+colours do not; a uniform backdrop has none.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,8 +24,8 @@ MAX_MISS_PX = 1.5  # of the reduced picture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenePoints:
-    """Holds points of the scene (world, mm) with their pixels. For each view, ``pixels`` lists where it sees points,
-    and ``rows`` which points these are."""
+    """Holds points of the scene (world, mm) with their pixels. For each view, ``pixels`` lists the pixels of the points
+    that it shows, and ``rows`` the indices of these points."""
 
     points: Float[np.ndarray, "n 3"]
     pixels: Mapping[str, Float[np.ndarray, "_ 2"]]
@@ -35,7 +35,8 @@ class ScenePoints:
 def find_scene_points(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], rig: Rig, *, report: Callable[[float], None] = lambda share: None
 ) -> ScenePoints:
-    """Finds points of the scene by matching keypoints between every two neighbouring views."""
+    """Finds points of the scene by matching keypoints between every two neighbouring views. ``images`` are RGB, by
+    camera name; ``report`` is called with the share that is done."""
     seen = {}
     for count, camera in enumerate(rig):
         report(0.5 * count / len(rig))

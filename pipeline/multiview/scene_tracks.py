@@ -1,8 +1,8 @@
-"""Points of the subject that three neighbouring views or more show, to a fraction of a pixel, from cameras that are
-nearly known.
+"""Finds points of the subject that three neighbouring views or more show, to a fraction of a pixel, with cameras that
+are nearly known.
 
-Two views say nothing of an error along the line on which the other camera sees a point; three do. SIFT keypoints are
-matched near that line only, which lets many more pass than a test of their likeness alone (``scene_points``).
+Two views cannot show an error along the epipolar line; three can. SIFT keypoints are compared near that line only, so
+that many more can be accepted than by their likeness alone (``scene_points``).
 
 Enters: photographs, silhouettes and the rig. Leaves: pixels by point and view, and by how much their rays miss.
 """
@@ -34,7 +34,8 @@ MAX_MISS = 0.005  # of the picture's width: more is a wrong match
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneTracks:
-    """Holds observations: ``pixels`` of point number ``points`` in the camera number ``cameras`` of the rig."""
+    """Holds n observations of points in several views: ``pixels[i]`` is where the camera of index ``cameras[i]`` in the
+    rig sees the point of index ``points[i]``."""
 
     points: Int[np.ndarray, " n"]
     cameras: Int[np.ndarray, " n"]
@@ -43,10 +44,12 @@ class SceneTracks:
 
     @property
     def count(self) -> int:
+        """Returns the number of points."""
         return int(self.points.max()) + 1 if len(self.points) else 0
 
     def chosen(self, good: Bool[np.ndarray, " n"]) -> "SceneTracks":
-        """Returns the chosen observations, of points that enough of them are left of."""
+        """Returns the observations that are ``good``, without the points that then have fewer than ``min_views`` of
+        them."""
         left = good & (np.bincount(self.points[good], minlength=self.count)[self.points] >= self.min_views)
         _, numbers = np.unique(self.points[left], return_inverse=True)
         return SceneTracks(numbers, self.cameras[left], self.pixels[left], self.min_views)
@@ -55,7 +58,8 @@ class SceneTracks:
 def find_tracks(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig, *, min_views: int = MIN_VIEWS
 ) -> SceneTracks:
-    """Finds points of the subject in all views of the rig, each in ``min_views`` or more of them that nearly agree."""
+    """Finds points of the subject in all views of the rig, each in ``min_views`` views or more whose rays nearly
+    meet."""
     names = rig.names
     seen = map_in_threads(lambda k: _keypoints(images[names[k]], silhouettes[names[k]]), len(rig))
     numbers = {name: k for k, name in enumerate(names)}
@@ -75,8 +79,8 @@ def find_tracks(
 
 
 def misses_px(tracks: SceneTracks, rig: Rig) -> Float[np.ndarray, "n 2"]:
-    """Returns each observation minus the pixel of the point that is nearest to all rays of its track; NaN where a lens
-    maps no ray."""
+    """Returns the reprojection error of each observation, measured minus projected: each point is placed where it is
+    nearest to all its rays. NaN where a pixel lies outside what the lens can show."""
     rays, centres = np.zeros((len(tracks.points), 3)), np.zeros((len(tracks.points), 3))
     for number, camera in enumerate(rig):
         observed = tracks.cameras == number

@@ -1,4 +1,4 @@
-"""A few views of many that stand well apart."""
+"""Chooses a few of many views that stand well apart."""
 
 import numpy as np
 

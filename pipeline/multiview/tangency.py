@@ -1,7 +1,8 @@
-"""Epipolar tangencies: planes through two camera centres that touch one silhouette touch the other's too.
+"""Finds epipolar tangencies: a plane through two camera centres that touches one silhouette touches the other's, too.
 
 Enters: two silhouettes and their cameras. Leaves: pairs of contour points that one plane should touch, and by how much
-they miss (Wong and Cipolla, *Structure and motion from silhouettes*, ICCV 2001)."""
+they miss (Wong and Cipolla, *Structure and motion from silhouettes*, ICCV 2001).
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,10 +23,17 @@ MIN_SLOPE = 1e-9  # rad a pixel: at the epipole a plane has no direction
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tangency:
-    """Holds one tangent plane of two cameras. For each camera: the pixel where the plane touches the outline, the unit
-    normal of the epipolar line (px), the plane's change of angle per pixel (rad), and how far (px) the outline reaches
-    along the normal beyond the other camera's plane. ``outward``: 1.0 if the normals point out of the subject, else
-    -1.0."""
+    """Holds one tangent plane of two cameras, with two values of each attribute, one for each camera.
+
+    Attributes:
+        cameras: their names.
+        pixels: the point of the outline that the plane touches.
+        steepness: how much the plane turns about the line through both centres for each pixel across the epipolar line,
+            rad.
+        normals: unit normal of the epipolar line in the image.
+        excess_px: how far the outline reaches along the normal beyond the other camera's plane.
+        outward: 1.0 if the normals point out of the subject, else -1.0.
+    """
 
     cameras: tuple[str, str]
     pixels: tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]
@@ -36,8 +44,8 @@ class Tangency:
 
 
 def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: float = 0.0) -> list[Tangency]:
-    """Finds the outer tangent planes of every two cameras that both images show whole. With ``inset_mm``, the planes
-    touch lines that far inside the outlines, measured at the subject."""
+    """Finds the outer tangent planes of every two cameras whose images both show the subject whole there. With
+    ``inset_mm``, the planes touch curves that far inside the outlines, measured at the subject."""
     middle = rig.centre_world()
     insets_px = {camera.name: inset_mm / pixel_mm(camera, middle) if inset_mm else 0.0 for camera in rig}
     outlines = {camera.name: _Outline.of(camera, silhouettes[camera.name], insets_px[camera.name]) for camera in rig}
@@ -49,7 +57,7 @@ def find_tangencies(silhouettes: Mapping[str, Silhouette], rig: Rig, inset_mm: f
 
 
 def pixel_mm(camera: Camera, place_world: Float[np.ndarray, " 3"]) -> float:
-    """Returns the width (mm) that a pixel covers at the distance of a place."""
+    """Returns the width (mm) that a pixel covers at the distance of a point."""
     return float(np.linalg.norm(place_world - camera.centre_world)) / camera.intrinsics.fx
 
 
@@ -72,9 +80,11 @@ class _Outline:
 
 
 def outer_hull(silhouette: Silhouette, inset_px: float = 0.0) -> Float[np.ndarray, "n 2"]:
-    """Returns the corners (px) of the convex hull of a mask, on its sub-pixel contour; empty for an empty mask. With
-    ``inset_px``, returns the hull of the line that far inside, which excludes strands and specks thinner than twice
-    that."""
+    """Returns the corners (px) of the convex hull of a mask, to a fraction of a pixel; empty for an empty mask.
+
+    With ``inset_px``, the hull is that of the curve so far inside the contour. Strands and specks thinner than twice
+    that do not reach it.
+    """
     inside = silhouette.distance < -inset_px if inset_px else silhouette.mask
     contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -127,7 +137,8 @@ def epipolar_plane_axes(
 
 
 def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 4 3"]:
-    """Returns unit rays (world) through the pixels one to the right, left, below and above of each given pixel."""
+    """Returns the unit rays (world) through the four pixels to the right and left of, below and above each given
+    pixel."""
     around = pixels[..., None, :] + np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     return camera.rays_world(around.reshape(-1, 2)).reshape(*around.shape[:-1], 3)
 
@@ -135,8 +146,8 @@ def rays_about(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.nd
 def angle_slopes(
     around: Float[np.ndarray, "*n 4 3"], u: Float[np.ndarray, " 3"], v: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "*n 2"]:
-    """Returns how much the angle of the epipolar plane through a pixel changes per pixel (rad), by x and by y.
-    ``around`` is the result of ``rays_about``."""
+    """Returns how much the angle of the epipolar plane through a pixel changes for each pixel (rad), by x and by y.
+    ``around`` is the result of ``rays_about``; ``u`` and ``v`` are those of ``epipolar_plane_axes``."""
     angle = np.arctan2(around @ v, around @ u)
     return np.stack([angle[..., 0] - angle[..., 1], angle[..., 2] - angle[..., 3]], axis=-1) / 2.0
 
@@ -148,9 +159,15 @@ def tangency(
     difference: float,
     outward: float,
 ) -> Tangency:
-    """Builds the tangency of two contour points that one plane should touch. ``slopes``: ``angle_slopes`` at both
-    points; ``difference``: angle (rad) of the first plane less that of the second; ``outward``: 1.0 if the angle grows
-    out of the subject, else -1.0."""
+    """Builds the tangency of two contour points that one plane should touch.
+
+    Args:
+        cameras: their names.
+        pixels: the contour point in each image.
+        slopes: ``angle_slopes`` at both points.
+        difference: angle of the plane through the first point less that through the second, rad.
+        outward: 1.0 if the angle grows out of the subject, else -1.0.
+    """
     steepness = float(np.linalg.norm(slopes[0])), float(np.linalg.norm(slopes[1]))
     normals = slopes[0] / steepness[0], slopes[1] / steepness[1]
     excess_px = difference / steepness[0], -difference / steepness[1]

@@ -1,7 +1,7 @@
-"""A point from its pixels in several views (section 4.2): Levenberg-Marquardt on the reprojection error.
+"""Computes a point from its pixels in several views (section 4.2), by Levenberg-Marquardt on the reprojection error.
 
-Enters: one pixel per camera. Leaves: the world point with its covariance. The start is the point nearest to all rays
-(linear least squares), and lens distortion is part of the projection, so nothing is undistorted first.
+Enters: one pixel per camera. Leaves: the world point with its covariance. The search starts at the point nearest to all
+rays (linear least squares). Lens distortion is part of the projection, so that nothing is undistorted first.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,21 +40,22 @@ class TriangulatedPoint:
     residuals_px: Mapping[str, Float[np.ndarray, " 2"]]
 
     def misfit(self, noise_px: float) -> float:
-        """Returns the sum of squared residuals divided by the squared noise: chi-square with ``2 * views - 3`` degrees
-        of freedom."""
+        """Returns the sum of squared residuals divided by the squared noise. For right pixels it is distributed as
+        chi-square with ``2 * views - 3`` degrees of freedom."""
         return sum(float(r @ r) for r in self.residuals_px.values()) / noise_px**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReprojectionTerm:
-    """Computes the residuals ``(projected - picked) / noise`` of a world point (mm), one for each view; NaN behind a
-    camera."""
+    """Computes the residuals ``(projected - picked) / noise`` of a world point (mm), two for each view; NaN for a point
+    behind a camera."""
 
     pixels: Float[np.ndarray, "n 2"]
     cameras: CameraStack
     noise_px: float
 
     def at(self, position_world: Float[np.ndarray, " 3"]) -> Residuals:
+        """Returns the residuals of all views for a point, with their derivatives by its position."""
         projected, slopes = self.cameras.project_with_jacobian(position_world)
         return Residuals((projected - self.pixels) / self.noise_px, lambda: slopes / self.noise_px)
 
@@ -70,10 +71,11 @@ def triangulate(
 
     Args:
         pixels: the picked pixel by camera.
-        noise_px: standard deviation of a picked coordinate; the covariance and the end of the search scale with it.
-        rays_world: what ``rays_of`` finds for the pixels, where the caller has it already; of other cameras, too.
+        rig: the cameras.
+        noise_px: standard deviation of each coordinate of a picked pixel, to which the covariance scales.
+        rays_world: the result of ``rays_of``, if the caller has it already; it may contain other cameras, too.
 
-    Raises NoPoint where fewer than two views, parallel rays or a point behind a camera leave nothing to determine.
+    Raises NoPoint for fewer than two views, for parallel rays, and for a point behind a camera.
     """
     if len(pixels) < 2:
         raise NoPoint(compose("point-in-few-views", count=len(pixels)))
@@ -118,10 +120,10 @@ def triangulate_many(
     Args:
         pixels: of each point in each view.
         cameras: of the views.
-        noise_px: standard deviation of a coordinate of each pixel; infinite where a view says nothing of a point.
-        start: points near to those that are wanted, where they are known; nothing is then said of parallel rays.
+        noise_px: standard deviation of each coordinate of a pixel; infinite where a view does not count for a point.
+        start: points near the result, if known; parallel rays are then not reported.
 
-    Raises NoPoint where a point's rays are parallel, where it lies behind a camera, or a pixel outside its lens.
+    Raises NoPoint if a point's rays are parallel, if it lies behind a camera, or if a pixel lies outside its lens.
     """
     points = _nearest_to_rays(pixels, cameras, noise_px) if start is None else start
     weights = 1.0 / noise_px[..., None]

@@ -1,7 +1,7 @@
-"""Which way is up, where photographs were held upright, on their side or upside down.
+"""Estimates which way is up, from cameras that were held upright, on their side or upside down.
 
-A camera that is not rolled by anything but quarter turns has its rows or its columns level, so up is nearly along one
-of its two image axes and across the other. That is a guess: floors and faces are not looked at.
+If a camera is rolled only by quarter turns, up is nearly along one of its image axes and across the other. That is a
+guess from the poses alone; the pictures are not examined.
 """
 
 import numpy as np
@@ -11,13 +11,13 @@ from rig.rig import Rig
 
 
 def quarter_turns(rig: Rig) -> Int[np.ndarray, " c"]:
-    """Returns the number of quarter turns that bring each camera's image upright."""
+    """Returns by how many quarter turns each camera's image must be rotated to be upright."""
     axes = _image_axes(rig)
     return np.argmin(_downs(axes) @ _nearest_up(rig, axes), axis=1)
 
 
 def guessed_up(rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the upward direction (unit, world), as the mean over the photographs after each is turned upright."""
+    """Returns the upward direction (unit, world): the mean over the photographs, each turned upright."""
     downs = _downs(_image_axes(rig))[np.arange(len(rig)), quarter_turns(rig)]
     up = -downs.mean(axis=0)
     return up / max(float(np.linalg.norm(up)), 1e-9)

@@ -1,10 +1,11 @@
-"""The visual hull (figure 1): the largest body that casts the silhouettes. A comparison, and a start for the pose.
+"""Computes the visual hull (figure 1): the largest body that casts the silhouettes. It serves as a comparison, and as a
+start for the pose.
 
-A point's value is its largest signed distance over the views, in mm at its depth, so that the hull's surface is the
-zero level and sub-pixel contours are used as they are. The field is computed on a coarse grid, and on the fine one only
-where the surface can be; naive surface nets (Gibson, *Constrained elastic surface nets*, 1998) make the mesh: a vertex
-in every cell that the surface crosses, a quadrilateral over every edge that it crosses. A hull, even from 50 views, has
-no eye sockets or philtrum; the paper shows it for that.
+The value of a point is its largest signed distance over the views, in mm at its depth. The hull's surface is the zero
+of that function, which uses sub-pixel contours as they are. It is computed on a coarse grid, and on the fine one only
+where the surface can be. Naive surface nets (Gibson, *Constrained elastic surface nets*, 1998) make the mesh: a vertex
+in every cell and a quadrilateral over every edge that the surface crosses. A hull, even from 50 views, has no eye
+sockets and no philtrum; the paper shows it for that reason.
 """
 
 from collections.abc import Mapping
@@ -34,17 +35,17 @@ class NoHull(EigenheadError):
 
 
 def hull_extent(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns centre (world, mm) and edge (mm) of a cube that holds the subject, by ``mask_extent`` of the usable
-    silhouettes."""
+    """Returns centre (world, mm) and edge length (mm) of a cube that contains the subject, as ``mask_extent`` of the
+    usable silhouettes."""
     return mask_extent({camera.name: silhouettes[camera.name].mask for camera in _believed(silhouettes, rig)}, rig)
 
 
 def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns the centre (world, mm) and edge (mm) of a cube that holds what the masks show. Masks may be smaller than
-    the images.
+    """Returns the centre (world, mm) and edge length (mm) of a cube that contains what the masks show. Masks may be
+    smaller than the images.
 
     The centre is the point nearest to the rays through the masks' middles; the edge is the largest diagonal of a mask
-    at that depth. Without a mask it is the place that the cameras look at, and 400 mm.
+    at that depth. Without any mask, the centre is the point that the cameras are directed at, and the edge 400 mm.
     """
     normal, right, views = 1e-9 * np.eye(3), np.zeros(3), []
     for name, mask in masks.items():
@@ -64,7 +65,7 @@ def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple
 
 
 def depth_of(camera: Camera, point: Float[np.ndarray, " 3"]) -> float:
-    """Returns the camera z of a point, at least 1 mm."""
+    """Returns the distance (mm) of a point along the camera's z axis, at least 1 mm."""
     return max(1.0, float(camera.camera_from_world.apply(point)[2]))
 
 
@@ -73,7 +74,8 @@ def visual_hull(
 ) -> Mesh:
     """Computes the visual hull of the usable silhouettes as a closed mesh (world, mm). Raises NoHull.
 
-    The grid has about ``spacing_mm`` between nodes, more if that needs over ``cells`` cells along a side.
+    The grid's nodes are about ``spacing_mm`` apart; farther if more than ``cells`` cells along a side were needed
+    otherwise.
     """
     centre, edge = hull_extent(silhouettes, rig)
     views = _believed(silhouettes, rig)

@@ -11,7 +11,8 @@ COARSE = 4  # fine cells along the side of a coarse one
 
 @njit(cache=True)
 def mark_occupied(known: np.ndarray, active: np.ndarray) -> None:
-    """Marks the fine corners of every coarse cell that is active; ``known`` is changed."""
+    """Marks all fine nodes in the ``active`` cells of the coarse grid, borders included: changes ``known`` in place. A
+    coarse cell has ``COARSE`` fine ones along each side."""
     for i, j, k in np.argwhere(active):
         known[
             i * COARSE : (i + 1) * COARSE + 1, j * COARSE : (j + 1) * COARSE + 1, k * COARSE : (k + 1) * COARSE + 1
@@ -29,7 +30,12 @@ def carve_view(
     p: np.ndarray,
     distance: np.ndarray,
 ) -> None:
-    """Raises ``field`` to this view's distance (mm) at the points of the active blocks, and counts the view there."""
+    """Raises ``field`` (mm, positive outside) to one view's signed distance at the nodes of the active blocks, and
+    counts the view in ``votes``, in place. Nodes outside the view are left alone.
+
+    ``active`` (b, b, b) marks blocks of ``split`` steps along each side; ``corner`` (world, mm) and ``step`` (mm) place
+    the nodes; ``p`` is the camera's row; ``distance`` (px) the silhouette's.
+    """
     height, width = distance.shape
     lens = p[LENS:]
     blocks = active.shape[0]
@@ -59,7 +65,8 @@ def carve_view(
 
 @njit(cache=True, nogil=True, inline="always")
 def owner_of(i: int, j: int, k: int, split: int, bi: int, bj: int, bk: int, active: np.ndarray) -> bool:
-    """Is (bi, bj, bk) the first active block, in index order, that the point belongs to?"""
+    """Tells whether (bi, bj, bk) is the first active block, in the order of indices, that contains the node (i, j, k),
+    so that a node on the border of several blocks is visited once."""
     for a in range((i - 1) // split if i % split == 0 else i // split, i // split + 1):
         for b in range((j - 1) // split if j % split == 0 else j // split, j // split + 1):
             for c in range((k - 1) // split if k % split == 0 else k // split, k // split + 1):

@@ -1,5 +1,5 @@
 """Labels every pixel of the subject as skin, hair or clothes.
 
-Enters: photographs, silhouettes and the head as its outlines give it. Leaves: a probability a pixel and part, which the
-photometric fit, the detail and the bust read.
+Enters: photographs, silhouettes and the head fitted to its outlines. Leaves: probabilities of the parts at each pixel,
+which the photometric fit, the detail and the bust read.
 """

@@ -1,6 +1,7 @@
-"""What parts are told apart by, on a coarse grid of every photograph: colour, fine structure, and place on the head.
+"""Computes what distinguishes the parts, on a coarse grid of every photograph: colour, fine structure, and position on
+the head.
 
-A cell is a square of pixels, some two millimetres wide on the subject whatever the camera's resolution.
+A cell is a square of pixels, about two millimetres wide on the subject whatever the camera's resolution.
 """
 
 from collections.abc import Mapping
@@ -32,8 +33,9 @@ DETAIL_BLUR_CELLS = 1.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadGuide:
-    """Holds where each vertex of a fitted head lies: its signed distance (mm) from the border of the face region,
-    positive within, its height (mm) above the chin along the head's upward axis, and that axis."""
+    """Holds the position of each vertex of a fitted head: its signed distance (mm) from the border of the face region,
+    positive inside, and its height (mm) above the chin along the head's upward axis; also which vertices are cheeks,
+    features, or the underside of the jaw."""
 
     mesh: Mesh  # world frame
     into_face_mm: Float[np.ndarray, " v"]
@@ -132,10 +134,10 @@ def make_cells(
     sizes = [_cell_px(camera, head.middle, cell_mm) for camera in cameras]
     shots = [images[camera.name] for camera in cameras]
 
-    def look(k: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    def read_view(k: int) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         return _linear(shots[k], sizes[k]), _seen(cameras[k], sizes[k], head, _grid(shots[k], sizes[k]))
 
-    light, seen = zip(*map_in_threads(look, len(cameras)), strict=True) if cameras else ((), ())
+    light, seen = zip(*map_in_threads(read_view, len(cameras)), strict=True) if cameras else ((), ())
     gains = _gains(cameras, sizes, list(light), [depth for depth, _ in seen], head)
 
     def cells(k: int) -> Cells:

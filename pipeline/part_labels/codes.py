@@ -1,7 +1,8 @@
-"""The parts that a surface shows, as ``bust.ply`` writes them, and the channel of each in a map of probabilities.
+"""Defines the parts that a surface shows, as ``bust.ply`` stores them, and the channel of each in a map of
+probabilities.
 
-A map's last axis holds skin, hair and clothes; there is no channel for what no view sees. Whoever goes from one to the
-other does it here.
+The last axis of a map holds skin, hair and clothes; there is no channel for what no view sees. All conversions between
+codes and channels are here.
 """
 
 from enum import IntEnum
@@ -11,7 +12,8 @@ from jaxtyping import Int, UInt8
 
 
 class Part(IntEnum):
-    """Holds what a vertex or a point of the surface shows. The numbers stand in written files: they never change."""
+    """Names what a vertex or a point of the surface shows. The numbers stand in files that were written, and never
+    change."""
 
     UNSEEN = 0
     SKIN = 1

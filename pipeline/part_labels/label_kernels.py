@@ -1,4 +1,4 @@
-"""The compiled loop that carries the cells' parts to the pixels of a photograph."""
+"""Compiled loop that interpolates the part probabilities of cells to the pixels of a photograph."""
 
 import numpy as np
 
@@ -7,10 +7,11 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True, nogil=True, fastmath=True)
 def spread_parts(slope, offset, size_px, grey, mask, out):
-    """``slope . grey + offset``, 0 to 1 and at most 1 in all, at the pixels of ``mask``; nothing elsewhere.
+    """Fills ``out`` (h, w, 3) with the probabilities of the three parts at the pixels of ``mask`` (h, w): ``slope *
+    grey + offset``, limited to 0 to 1 and to a sum of at most 1. Other pixels are left as they are.
 
-    ``slope`` and ``offset`` (r, c, 3) are bilinear between the middles of cells of ``size_px`` pixels, and even beyond
-    the outermost ones; ``grey`` is 0 to 255.
+    ``slope`` and ``offset`` (r, c, 3) are interpolated between the middles of cells of ``size_px`` pixels, and constant
+    beyond the outermost ones; ``grey`` (h, w) is 0 to 255, and counts as 0 to 1.
     """
     rows, columns = slope.shape[:2]
     one, per = np.float32(1.0), np.float32(1.0 / 255.0)

@@ -1,13 +1,12 @@
-"""What every pixel of the subject shows: skin, hair or clothes, learned from the capture itself.
+"""Labels every pixel of the subject as skin, hair or clothes, by what it learns from the capture itself.
 
-What the middle of the fitted face shows is skin. What lies beside the head above the chin is hair unless it looks like
-that skin, as a bald crown does; what lies below is clothes unless it looks like skin. From those starts expectation and
-maximisation (Dempster, Laird and Rubin 1977) learn how the parts of this capture look, as histograms of colour and fine
-structure over all views, cameras' gains taken out; place on the head is the prior; a filter that
-keeps to the photograph's edges makes neighbours agree (He, Sun and Tang 2010, guided image filtering,
-https://doi.org/10.1007/978-3-642-15549-9_1).
-
-A cap is told from hair only where it looks like the clothes below; both hide skin alike.
+The middle of the fitted face is skin. What lies beside the head above the chin is hair unless it looks like that skin,
+as a bald crown does; what lies below is clothes unless it looks like skin. From this start, expectation maximisation
+(Dempster, Laird and Rubin 1977) learns how the parts of this capture look, as histograms of colour and fine structure
+over all views, with the cameras' gains removed. The position on the head is the prior. A filter that keeps the edges of
+the photograph makes neighbours agree (He, Sun and Tang 2010, guided image filtering,
+https://doi.org/10.1007/978-3-642-15549-9_1). A cap is distinguished from hair only if it looks like the clothes below;
+both hide skin.
 """
 
 from collections.abc import Mapping
@@ -69,16 +68,16 @@ def classify_parts(
 
     Args:
         images: sRGB photographs by camera.
-        silhouettes: The subject's, by camera; views that are not usable are left out.
-        rig: The calibrated cameras.
-        head_world: The fitted bare head (mm).
-        face_region: Its vertices from ear to ear and from the lower forehead to under the chin.
-        landmarks_world: Its 26 landmarks (mm).
-        settings: Grid, smoothness and priors.
-        report: Told of progress.
+        silhouettes: of the subject, by camera; views that are not usable are left out.
+        rig: the cameras as calibrated.
+        head_world: the fitted head without hair (mm).
+        face_region: its vertices from ear to ear and from the lower forehead to under the chin.
+        landmarks_world: its 26 landmarks (mm).
+        settings: grid, smoothness and priors.
+        report: progress.
 
     Returns:
-        A map for each view that took part.
+        A map for each view that takes part.
     """
     masks = {n: s.mask for n, s in silhouettes.items() if s.quality.usable and n in images and n in rig.names}
     used = rig.subset(name for name in rig.names if name in masks)
@@ -113,7 +112,7 @@ def classify_parts(
 
 
 def bins(view: Cells) -> Int[np.ndarray, "r c 2"]:
-    """Returns the histogram bins of every cell: that of its colour and that of its fine structure."""
+    """Returns the histogram bins of every cell: the bin of its colour, and that of its fine structure."""
     red, blue, light = np.moveaxis(view.colour, 2, 0)
     a, b = _bin(red, RED_RANGE, RED_BINS), _bin(blue, BLUE_RANGE, BLUE_BINS)
     colour = (a * BLUE_BINS + b) * LIGHT_BINS + _bin(light, LIGHT_RANGE, LIGHT_BINS)
@@ -145,27 +144,27 @@ def beard_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
 
 
 def sideburn_zone(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Marks the cells above the beard zone, between cheeks and ears, where of all hair only a beard reaches."""
+    """Marks the cells above the beard zone, between cheeks and ears, where hair other than a beard does not occur."""
     above = (view.above_chin_mm >= 50.0) & (view.above_chin_mm < 80.0)
     return view.on_head & above & (view.into_face_mm > -15.0) & (view.cheek < 0.5)
 
 
 def lower_face(view: Cells) -> Bool[np.ndarray, "r c"]:
-    """Marks the cells of the beard zone whose skin would be plain and lit: not lips, and not the underside of jaw and
-    chin, which is dark with and without a beard."""
+    """Marks the cells of the beard zone that would be evenly lit skin without a beard: not the lips, and not the
+    underside of jaw and chin, which is dark with and without a beard."""
     return beard_zone(view) & (np.maximum(view.feature, view.underside) < PLAIN)
 
 
 def beard_evidence(unlikeness: Float[np.ndarray, " n"], lower: Bool[np.ndarray, " n"]) -> float:
-    """Returns 0 for a bare lower face and 1 for a beard, from the mean unlikeness of the lower face to cheeks and nose:
-    below 0.12 without a beard, above 0.9 with one."""
+    """Returns a number from 0 (no beard) to 1 (beard), from how much the lower face differs on average from cheeks and
+    nose (``unlikeness``): below 0.12 without a beard, above 0.9 with one."""
     share = float(unlikeness[lower].mean()) if lower.any() else 0.0
     return float(_ramp(np.full((1, 1), share, np.float32), *BEARD_SHARE)[0, 0])
 
 
 def place_prior(view: Cells, bearded: float = 0.0) -> Float32[np.ndarray, "r c 4"]:
-    """Returns the probability of skin, hair, clothes and none of them in each cell, from its position and from
-    ``beard_evidence`` alone."""
+    """Returns the prior probability of skin, hair, clothes, and of none of them, in each cell: from its position and
+    from ``beard_evidence`` alone."""
     face = _ramp(view.into_face_mm, -25.0, 15.0)
     upper = np.where(view.on_head, _ramp(view.above_chin_mm, -15.0, 45.0), _ramp(view.above_chin_mm, -45.0, 25.0))
     skin_above = np.where(view.on_head, 0.15 + 0.8 * face, 0.12)
@@ -196,8 +195,9 @@ def _ramp(values: Float32[np.ndarray, "r c"], low: float, high: float) -> Float3
 def unlike_cheeks(
     appearance: Int[np.ndarray, "n 2"], cheeks: Float32[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Returns how much every cell differs from cells that are surely skin, 0 to 1: by colour alone, and by colour and
-    fine structure. Fine structure separates a blond beard from skin, but also the borders of shadows."""
+    """Returns how much every cell differs from the cells ``cheeks``, which are certainly skin, from 0 to 1: by colour
+    alone, and by colour and fine structure. Fine structure separates a blond beard from skin, but also the borders of
+    shadows."""
     everything = np.ones(len(appearance), np.float32)
     colour, detail = (
         (of(which, cheeks) / of(which, everything))[which]
@@ -215,11 +215,11 @@ def fit_appearance(
     unlikeness: Float[np.ndarray, " n"],
     settings: PartSettings,
 ) -> Float32[np.ndarray, "n 4"]:
-    """Learns the appearance of the parts. Returns the log likelihood of every cell under skin, hair, clothes and the
-    outlier, with the evidence that the subject shows the part at all.
+    """Learns the appearance of the parts by expectation maximisation. Returns the log likelihood of every cell under
+    skin, hair, clothes and an outlier class, plus the evidence that this subject shows the part at all.
 
-    Starts from the cells that are sure by their position; those of hair and clothes count less the more they look like
-    skin.
+    It starts from the cells whose part follows from their position; those of hair and clothes count less the more they
+    look like skin.
     """
     colour, detail = appearance.T
     share = start.copy()
@@ -248,7 +248,7 @@ def _presence(
 
 
 def posterior(logs: Float32[np.ndarray, "n 4"], prior: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
-    """Returns the probability of skin, hair and clothes in each cell; what they lack to one belongs to the outlier."""
+    """Returns the probability of skin, hair and clothes in each cell; the rest to 1 belongs to the outlier class."""
     share = prior * np.exp(logs - logs.max(axis=1, keepdims=True))
     return share[:, :3] / share.sum(axis=1, keepdims=True)
 
@@ -285,7 +285,7 @@ def upsample_guided(
     mask: Bool[np.ndarray, "h w"],
     settings: PartSettings,
 ) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the cells' probabilities at each pixel of the photograph, smoothed up to its edges."""
+    """Returns the cells' probabilities at each pixel of the photograph, smooth except at its edges."""
     grid = np.zeros((*inside.shape, 3), np.float32)
     grid[inside] = share
     radius = max(1, round(0.5 * settings.smooth_mm / settings.cell_mm))
@@ -302,12 +302,9 @@ def guided(
     radius: int,
     edge: float,
 ) -> tuple[Float32[np.ndarray, "r c p"], Float32[np.ndarray, "r c p"]]:
-    """Returns slope and offset of the guided filter: ``slope guide + offset`` are the smooth values (eqs. 5, 6 and 8
-    there).
-
-    ``weight`` is 0 where values are unknown; ``edge`` is the contrast of the guide across which values are not
-    smoothed.
-    """
+    """Returns slope and offset of the guided filter: ``slope guide + offset`` is the smoothed value (He, Sun and Tang
+    2010, eqs. 5, 6 and 8). ``weight`` is 0 where values are unknown; ``edge`` is the contrast of the guide across which
+    values are not smoothed."""
 
     def mean(field: np.ndarray) -> np.ndarray:
         return cv2.blur(field, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_CONSTANT)

@@ -1,6 +1,6 @@
-"""What a place of the surface shows, by all the views that see it: their part maps vote, cell by cell.
+"""Combines the part maps of all views on the surface: in each small cell, the views that see it vote.
 
-A pixel alone may be a freckle or a gap between strands; and views that see a place from the side know less of it.
+A single pixel may be a freckle or a gap between strands, and a view that sees a point from the side knows less of it.
 """
 
 from collections.abc import Mapping, Sequence

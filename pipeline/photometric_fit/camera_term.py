@@ -1,14 +1,16 @@
-"""What a patch's views say of the cameras: how far each view would like to slide in its image.
+"""Estimates what the photographs of a patch say of the cameras: by how much each view should shift in its image.
 
-At a patch's peak the mean correlation of its views is the least-squares problem ``sum_k v_k |f_k - T|^2``: f_k the
-patch's grey values in view k, centred and of unit norm, T their mean with the weights v_k (which eliminates the unknown
-texture exactly, and sliding along the surface with it). Linear in the image shifts delta_k (px) of the views,
+At the depth where a patch's views correlate best, the mean correlation is the least-squares problem ``sum_k v_k |f_k -
+T|^2``. Here f_k are the patch's grey values in view k, centred and of unit norm, and T is their mean with the weights
+v_k. That eliminates the unknown texture exactly, and with it sliding along the surface. Linear in the image shifts
+delta_k (px) of the views,
 
     H_kl = v_k [k = l] <g_k, g_k> - v_k v_l / V <g_k, g_l>,   gradient_k = v_k <g_k, f_k - T>,
 
-g_k the images' slopes. A displacement u along the normal and camera corrections c_k make ``delta_k = p_k u + C_k c_k``.
-Eliminating u leaves the derivative of patch depth with respect to camera pose, and a quadratic form in the cameras
-alone: shifts that no surface explains. A camera of 0.2 px error shows in thousands of patches.
+where g_k are the images' slopes and V is the sum of the weights. A displacement u along the normal and camera
+corrections c_k make ``delta_k = p_k u + C_k c_k``. Eliminating u leaves the derivative of the patch's depth by the
+cameras' poses, and a quadratic form in the cameras alone: shifts that no surface explains. A camera of 0.2 px error
+shows in thousands of patches.
 """
 
 from dataclasses import dataclass
@@ -26,8 +28,8 @@ from rig.camera import Camera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraSensitivity:
-    """Holds, for n patches, how the depth of each depends on the cameras' poses, and what the shifts between its images
-    say of the cameras alone."""
+    """Holds, for n patches, how the depth of each depends on the cameras' poses, and the quadratic form in the cameras
+    that remains when depth is eliminated. v is the number of views of a patch, a = 2 v their image axes."""
 
     by_camera: Float[np.ndarray, "n c"]  # d(place, mm along the normal) / d(cameras), c = 6 K
     view: Int[np.ndarray, "n v"]
@@ -36,8 +38,8 @@ class CameraSensitivity:
     slides: Float[np.ndarray, "n a 6"]  # d(image shifts of a view) / d(its camera)
 
     def cameras(self, information: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
-        """Returns the patches' matrix and gradient (towards the minimum) in the cameras' unknowns, each patch weighted
-        by its ``information``."""
+        """Returns the sum of all patches' quadratic forms: its matrix, and its gradient towards the minimum, over the
+        corrections of all cameras (rad, mm). Each patch is weighted by its ``information`` (mm^-2)."""
         size = self.by_camera.shape[1]
         matrix, gradient = np.zeros((size, size)), np.zeros(size)
         add_cameras(self.view, self.stiff, self.slope, self.slides, information, matrix, gradient)
@@ -52,8 +54,16 @@ def camera_sensitivity(
     axes: Float[np.ndarray, "n 3"],
     cameras: tuple[Camera, ...],
 ) -> CameraSensitivity:
-    """Computes the sensitivity of patches whose surface lies at ``places`` (world, mm) and moves along ``axes``.
-    ``grams`` is the result of ``gram_matrices``."""
+    """Computes how the depths of n patches depend on the cameras.
+
+    Args:
+        view: the views of each patch, -1 for none.
+        value: their weights.
+        grams: the result of ``gram_matrices``.
+        places: the surface points of the patches, world, mm.
+        axes: unit normals along which they move, world.
+        cameras: of the views, at their current poses.
+    """
     slopes, mixed = grams
     axis_value = np.repeat(value, 2, axis=1)  # of the 2 v image axes
     total = np.maximum(value.sum(axis=1), 1e-12)[:, None]
@@ -90,9 +100,9 @@ def gram_matrices(
     samples: Samples,
     pictures: Pictures,
 ) -> tuple[Float[np.ndarray, "n a a"], Float[np.ndarray, "n a v"]]:
-    """Computes two sets of inner products for each patch, with the surface moved by ``shifts`` (mm along the normals):
-    of the image slopes of its views with each other (two axes for each view), and of the slopes with the grey values.
-    """
+    """Computes two sets of inner products for the ``chosen`` patches, with the surface moved by ``shifts`` (mm along
+    the normals): of the image slopes of its views with each other (two axes for each view), and of the slopes with the
+    grey values."""
     count, views = view.shape
     slopes, mixed = np.zeros((count, 2 * views, 2 * views)), np.zeros((count, 2 * views, views))
     members = Members(patches.start, patches.member, weights)

@@ -1,4 +1,5 @@
-"""The compiled loops of what patches say of the cameras."""
+"""Compiled loops of ``pipeline.photometric_fit.camera_term``, which has the equations. Shapes: n patches, v views of
+each, a = 2 v image axes."""
 
 import numpy as np
 
@@ -9,8 +10,13 @@ from pipeline.photometric_fit.correlation_kernels import read
 
 @njit(cache=True, nogil=True, fastmath=True)
 def write_image_motion(view, places, axes, cameras, ahead, slides):
-    """Per image axis of each patch's views: motion (px) by a mm along the axis, and by the correction of its camera (a
-    left perturbation, as everywhere: it acts on the point in the camera's frame)."""
+    """Fills how the image of each patch moves in each of its views: ``ahead`` (n, a; px per mm) when the patch moves
+    along its axis, and ``slides`` (n, a, 6; px per rad and mm) when the camera is corrected (rotation, translation,
+    applied to camera_from_world on the left).
+
+    ``view`` (n, v) are the views, -1 for none; ``places`` and ``axes`` (n, 3) are in the world frame, mm; ``cameras``
+    are rows of ``packed_camera``.
+    """
     for n in range(len(view)):
         x, y, z = places[n, 0], places[n, 1], places[n, 2]
         for j in range(view.shape[1]):
@@ -31,7 +37,9 @@ def write_image_motion(view, places, axes, cameras, ahead, slides):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def add_by_camera(view, pull, slides, by_camera):
-    """The sum over image axes of ``pull . slides``, each at its camera's columns."""
+    """Fills how the depth of each patch depends on the cameras: adds ``pull * slides``, summed over the image axes of
+    each view, to the six columns of the view's camera in ``by_camera`` (n, 6 k), in place. ``pull`` (n, a) is the
+    derivative of the depth by an image shift, ``slides`` (n, a, 6) that of the shift by the camera."""
     for n in range(len(view)):
         for row in range(pull.shape[1]):
             first = 6 * view[n, row // 2]
@@ -43,8 +51,13 @@ def add_by_camera(view, pull, slides, by_camera):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def add_cameras(view, stiff, slope, slides, information, matrix, gradient):
-    """``slides^T stiff slides`` and ``-slides^T slope`` of all patches, each worth its ``information``: a block a pair
-    of views."""
+    """Sums up, over all patches, the quadratic form in the cameras' corrections: adds ``slides^T stiff slides`` to
+    ``matrix`` (6 k, 6 k) and ``-slides^T slope`` to ``gradient`` (6 k), in place, for k cameras.
+
+    ``stiff`` (n, a, a) and ``slope`` (n, a) are the second and first derivatives of a patch's cost by its image shifts,
+    ``slides`` (n, a, 6) the derivatives of these shifts by their camera, ``information`` (n) the weight of the patch,
+    and ``view`` (n, v) its cameras, -1 for none.
+    """
     pulled = np.empty(6)
     for n in range(len(view)):
         for a in range(stiff.shape[1]):
@@ -67,6 +80,13 @@ def add_cameras(view, stiff, slope, slides, information, matrix, gradient):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def write_grams(first, last, chosen, members, view, shifts, samples, pictures, slopes, mixed):
+    """Fills the inner products of patches ``first`` to ``last`` of ``chosen``: ``slopes`` (n, a, a) of the image slopes
+    of their views with each other, and ``mixed`` (n, a, v) of the slopes with the grey values.
+
+    Grey values are read with the surface moved by ``shifts`` (n; mm along the normals), weighted with the members'
+    weights, centred and scaled to unit norm, with the noise as part of the norm. The slopes are the derivatives of
+    these (per px).
+    """
     start, member, weight = members
     pixel, along, seen = samples
     size, offset, image, noise = pictures
@@ -131,7 +151,8 @@ def _product(one, other, count):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def read_with_slopes(image, start, width, height, x, y):
-    """Bilinear, and the central differences over a pixel to both sides."""
+    """Returns the bilinear value of an image at (x, y) and its central differences (per px) along x and y. The image
+    begins at index ``start`` of the flat array ``image``."""
     if not (1.0 <= x < width - 3.0 and 1.0 <= y < height - 3.0):
         across = read(image, start, width, height, x + 1.0, y) - read(image, start, width, height, x - 1.0, y)
         down = read(image, start, width, height, x, y + 1.0) - read(image, start, width, height, x, y - 1.0)

@@ -1,7 +1,5 @@
-"""The compiled loops of photo-consistency: what the views show along the normals, and how alike they look.
-
-Plain loops over arrays; threads share them out.
-"""
+"""Compiled loops of photo-consistency: the grey values that views show along the normals, and their correlation.
+Threads share out the samples or patches."""
 
 from typing import NamedTuple
 
@@ -13,7 +11,8 @@ from pipeline.imaging.sampling_kernels import held, sample_row
 
 
 class Samples(NamedTuple):
-    """Where each camera sees each sample, how that moves along the normal (px / mm), and whether it does."""
+    """Holds at which pixel each of k cameras sees each of s samples, how that moves along the sample's normal (px per
+    mm), and whether the camera sees it."""
 
     pixel: Float[np.ndarray, "k s 2"]
     along: Float[np.ndarray, "k s 2"]
@@ -21,7 +20,7 @@ class Samples(NamedTuple):
 
 
 class Pictures(NamedTuple):
-    """Grey images of all cameras, one after the other, row by row."""
+    """Holds the grey images of all cameras in one flat array, one after the other, row by row."""
 
     size: Int[np.ndarray, "k 2"]  # width, height
     offset: Int[np.ndarray, " k"]
@@ -30,7 +29,8 @@ class Pictures(NamedTuple):
 
 
 class Members(NamedTuple):
-    """The samples of patch p are ``member[start[p] : start[p + 1]]``, with their weights in the window."""
+    """Holds which samples belong to which patch, with their weights in its window. Those of patch p are
+    ``member[start[p]:start[p + 1]]``."""
 
     start: np.ndarray
     member: np.ndarray
@@ -39,7 +39,8 @@ class Members(NamedTuple):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def read(image, start, width, height, x, y):
-    """The image that begins at ``start`` of the row of images, bilinear, held inside."""
+    """Returns the bilinear value of an image at (x, y), limited to its inside. The image begins at index ``start`` of
+    the flat array ``image``."""
     x, y = held(x, width), held(y, height)
     column, row = int(x), int(y)
     return sample_row(image, start + row * width + column, width, np.float32(x - column), np.float32(y - row))
@@ -47,6 +48,9 @@ def read(image, start, width, height, x, y):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def sweep_pictures(first, last, samples, pictures, steps, out):
+    """Fills ``out`` (s, k, d) for samples ``first`` to ``last``: the grey value that camera k shows for a sample that
+    is moved along its normal by each of ``steps`` (d; mm). Entries of cameras that do not see the sample are left as
+    they are."""
     pixel, along, seen = samples
     size, offset, image, _ = pictures
     for s in range(first, last):
@@ -61,7 +65,15 @@ def sweep_pictures(first, last, samples, pictures, steps, out):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def correlate_views(first, last, members, view, value, seen, grey, noise, score):
-    """|sum of v f / |f||^2 holds every pair twice, and each view with itself."""
+    """Fills ``score`` (c, d) for patches ``first`` to ``last``: the mean normalised cross-correlation of each patch's
+    views over all their pairs, weighted, at each of d steps along the normal. Patches with fewer than two views are
+    left as they are.
+
+    With f the centred grey values of a view and v its weight, the squared norm of ``sum v f / |f|`` holds every pair
+    twice, and each view with itself; the latter part is subtracted. ``view`` and ``value`` (c, n) are the views of each
+    patch (-1 for none) and their weights; ``grey`` (s, k, d) is the result of ``sweep_pictures``; ``noise`` (k) is part
+    of the norm.
+    """
     start, member, weight = members
     steps = grey.shape[2]
     mean, energy, factor = np.empty(steps, np.float32), np.empty(steps, np.float32), np.empty(steps, np.float32)

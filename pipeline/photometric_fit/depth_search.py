@@ -1,10 +1,10 @@
-"""Photo-consistency: where along its normal each patch of the surface looks alike in the views that see it.
+"""Finds where along its normal each patch of the surface looks alike in the views that see it (photo-consistency).
 
-The variance of a place is that of a shift between two signals of correlation rho,
+The variance of the depth is that of a shift between two signals of correlation rho,
 
     variance = floor^2 + noise area / window area * (1 - rho) / |d^2 rho / d shift^2|,
 
-so that texture, noise, defocus and grazing views all show in it. Gain and offset of a camera drop out.
+so that texture, noise, defocus and grazing views all have their effect. Gain and offset of a camera have none.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ SLOPE_SLACK = 1.5 * 1.414 * WINDOW_PX  # how much nearer its own slope may bring
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Holds the lengths of one search over all patches."""
+    """Holds the lengths (mm) of one search of all patches along their normals."""
 
     window_mm: float  # standard deviation of the patch's window
     blur_mm: float  # of the images, on the head
@@ -54,8 +54,8 @@ class Round:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampleVisibility:
-    """Holds the head at the current state and, for each camera, which samples of its surface are visible, where and how
-    frontally."""
+    """Holds the head at the current state and, for each camera, which samples of its surface are visible, at which
+    pixel, and how frontally."""
 
     cameras: tuple[Camera, ...]  # where the state has them
     vertices: Float[np.ndarray, "v 3"]  # full level, world
@@ -69,13 +69,13 @@ class SampleVisibility:
 def sample_visibility(
     problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"], settings: PhotoSettings
 ) -> SampleVisibility:
-    """Finds which samples each camera sees on the head of a state, by drawing the head's depth in every view."""
+    """Finds which samples each camera sees on the head of ``state``, by drawing the head's depth in every view."""
     head, coarse = head_of(problem, state), head_of(problem, state, DEPTH_LEVEL)
     return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks, settings=settings)
 
 
 def head_of(problem: ContourProblem, state: State, level: str = "full") -> Mesh:
-    """Returns the head of a state, world frame, mm."""
+    """Returns the head that ``state`` describes, on the given mesh level, world frame, mm."""
     laid = problem.model.levels[level]
     return Mesh(state.world_from_head.apply(laid.operator @ problem.model.cage(state.coefficients)), laid.faces)
 
@@ -90,16 +90,15 @@ def visibility_of(
     *,
     settings: PhotoSettings,
 ) -> SampleVisibility:
-    """Finds which samples of a head each camera sees. The mesh ``coarse_world`` stands for the head where it hides
-    samples.
+    """Finds which samples of a head each camera sees. A coarser mesh of the same surface decides what hides them.
 
     Args:
-        head_world: the patches' mesh, mm.
+        head_world: the mesh that the patches belong to, mm.
         coarse_world: the same surface with fewer triangles.
-        cameras: those of the views, where they stand.
-        views: their silhouettes.
-        patches: whose samples are asked for.
-        speaks: views whose photograph shows something.
+        cameras: of the views, at their current poses.
+        views: the silhouettes.
+        patches: whose samples are looked up.
+        speaks: which views have a photograph with texture; the others see nothing.
         settings: margins.
     """
     normals = head_world.normals()
@@ -125,7 +124,7 @@ def visibility_of(
 
 
 def moved_cameras(problem: ContourProblem, state: State) -> tuple[Camera, ...]:
-    """Returns the cameras with the state's corrections applied."""
+    """Returns the cameras with the corrections of ``state`` applied."""
     views = moved_views(problem, state)
     return tuple(
         replace(camera, camera_from_world=RigidTransform(rotation, translation))
@@ -141,10 +140,15 @@ def facing_of(
     distance: Float32[np.ndarray, "h w"],
     settings: PhotoSettings,
 ) -> Float32[np.ndarray, " s"]:
-    """Returns, for every sample that the camera sees, the cosine between its normal and the line of sight; 0 for hidden
-    samples.
+    """Returns the cosine between normal and line of sight for every sample that the camera sees; 0 for hidden samples.
 
-    ``depth`` is the z-buffer of the head, ``distance`` the silhouette's signed distance.
+    Args:
+        points: the samples, world, mm.
+        normals: unit, world.
+        camera: at its current pose.
+        depth: z-buffer (mm) of the head in this camera.
+        distance: signed distance (px) to the silhouette.
+        settings: margins.
     """
     towards = camera.centre_world - points
     cosine = np.einsum("sc,sc->s", towards, normals) / np.linalg.norm(towards, axis=1)
@@ -177,9 +181,20 @@ def observe(
     each: Round,
     settings: PhotoSettings,
 ) -> tuple[SurfaceObservations, Int[np.ndarray, " u"]]:
-    """Measures the surface at the patches' centres. Returns the observations, and the vertices that several cameras see
-    but that have no clear match. A patch of ``hair`` gives only an outer bound of the head. ``basis`` holds the model's
-    modes at the centres."""
+    """Measures the surface at the patches' centres. Returns the observations, and the vertices of patches that several
+    cameras see but whose views do not match.
+
+    Args:
+        problem: the contour solver's.
+        state: the current head and cameras.
+        photographs: of the views.
+        patches: to be measured.
+        visibility: of the patches' samples at ``state``.
+        hair: patches under hair, which only bound the head from outside.
+        basis: the model's modes at the patches' centres.
+        each: lengths of the search.
+        settings: thresholds.
+    """
     scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
     found = find_places(photographs, patches, visibility, problem.views, scale, each=each, settings=settings)
     several, clear, view, value = found.several, found.clear, found.view, found.value
@@ -216,7 +231,8 @@ def observe(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Says where c patches look most alike, and what that was read from."""
+    """Holds, for c patches, where along its normal each looks most alike in its views, and the data of which that was
+    computed."""
 
     place: Float[np.ndarray, " c"]  # mm along the normal
     height: Float[np.ndarray, " c"]  # the correlation there
@@ -240,8 +256,8 @@ def find_places(
     each: Round,
     settings: PhotoSettings,
 ) -> Places:
-    """Searches every patch along its normal for the place where its views correlate best. ``scale``: pixels per mm of
-    each camera."""
+    """Searches every patch along its normal for the depth at which its views correlate best. ``scale`` is the number of
+    pixels per mm at the head in each camera."""
     steps = np.linspace(-each.reach_mm, each.reach_mm, each.steps)
     image, noise = blurred(photographs, each.blur_mm * scale)
     weights, seen = patches.weights(each.window_mm), visibility.facing > 0
@@ -261,7 +277,8 @@ def find_places(
 def patch_depth_factor(
     patches: Patches, visibility: SampleVisibility, view: Int[np.ndarray, "c n"], value: Float[np.ndarray, "c n"]
 ) -> Float[np.ndarray, " c"]:
-    """Returns how many times farther a shift in the images moves each patch than before the usual rig."""
+    """Returns how much less precise the depth of each patch is than with the usual rig, since its views stand closer
+    together: the ratio of the depth errors that the same error in the images causes, at least 1."""
     centres, at = np.array([camera.centre_world for camera in visibility.cameras]), patches.centre
     return depth_factor(parallax(visibility.vertices[at], visibility.normals[at], centres, view, value))
 
@@ -269,8 +286,8 @@ def patch_depth_factor(
 def head_depth_factor(
     head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera], views_most: int
 ) -> float:
-    """Returns the median of ``depth_factor`` over vertices of a head (mm), each seen by its ``views_most`` most frontal
-    cameras, whatever hides it; 1 if no two face any."""
+    """Returns the median of ``depth_factor`` over the vertices ``face`` of a head (mm). Each vertex counts as seen by
+    its ``views_most`` most frontal cameras; what may hide it is ignored. Returns 1 if no vertex faces two cameras."""
     points, normals = head_world.vertices[face], head_world.normals()[face]
     centres = np.array([camera.centre_world for camera in cameras])
     towards = centres[None] - points[:, None]
@@ -286,9 +303,12 @@ def head_depth_factor(
 def metric_rig(
     cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"], spread: float
 ) -> Float[np.ndarray, "c c"]:
-    """Returns information against an error that moves all cameras towards the head alike: their distances come from one
-    board of known size. Images alone cannot exclude it; a contour a tenth of a pixel too far out would otherwise move
-    every camera closer, and the surface with them."""
+    """Returns the information (inverse covariance, over all cameras' corrections) that keeps the rig from shrinking or
+    growing: ``spread`` is the relative standard deviation of a common change of all distances to the head.
+
+    All distances come from one calibration board of known size. Images alone cannot determine them: a contour a tenth
+    of a pixel too far out would move every camera closer, and the surface with them.
+    """
     depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
     nearer = np.zeros((len(depth), 6))
     nearer[:, 5] = 1.0 / (len(depth) * depth)
@@ -296,7 +316,7 @@ def metric_rig(
 
 
 def pixels_per_mm(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:
-    """Returns how many pixels a mm at ``at_world`` covers in each camera."""
+    """Returns how many pixels a millimetre at ``at_world`` covers in each camera."""
     return np.array([c.intrinsics.fx / c.camera_from_world.apply(at_world)[2] for c in cameras])
 
 

@@ -1,8 +1,9 @@
-"""Which patches of the face lie under hair: its surface is not the head's, yet photographs see it sharply.
+"""Finds which patches of the face lie under hair. Photographs show hair sharply, but its surface is not the head's.
 
-The part maps (``pipeline.part_labels.labelling``) say of every pixel how probably it shows hair; a patch is hair's
-where most of what the views see of it is, and where it is about to be: its window reaches into the hair, which stands
-off the skin."""
+The part maps (``pipeline.part_labels.labelling``) give the probability that a pixel shows hair. A patch counts as hair
+if most of its pixels in the views do, and also if it is close to such a patch: its window then reaches into the hair,
+which stands off the skin.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -30,11 +31,11 @@ def under_hair(
 
     Args:
         patches: samples of the face and patches of them.
-        hair: probability that a pixel shows hair; cameras without a map are ignored.
+        hair: probability that a pixel shows hair, by camera; cameras without a map are ignored.
         names: of the k cameras.
-        pixel: where each camera sees each sample.
-        seen: whether it does.
-        centres: of the patches (mm).
+        pixel: the pixel at which each camera sees each sample.
+        seen: whether it sees the sample.
+        centres: of the patches, mm.
     """
     total, views = np.zeros(pixel.shape[1]), np.zeros(pixel.shape[1])
     for k, name in enumerate(names):
@@ -49,6 +50,6 @@ def under_hair(
 def patch_mean(
     patches: Patches, values: Float[np.ndarray, " s"], known: Bool[np.ndarray, " s"]
 ) -> Float[np.ndarray, " c"]:
-    """Returns the mean over each patch's known samples; 0 where none is known."""
+    """Returns, for each patch, the mean of ``values`` over its samples that are ``known``; 0 if none is."""
     total = patches.sums(patches.agreement, np.stack([values * known, known], axis=1).astype(float))
     return total[:, 0] / np.maximum(total[:, 1], 1e-9)

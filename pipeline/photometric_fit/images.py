@@ -1,9 +1,8 @@
-"""The photographs as photo-consistency reads them: grey, with their noise, without shading where that is asked for,
-and blurred to the size that is.
+"""Prepares the photographs for photo-consistency: grey, with their noise, with or without shading, and blurred.
 
-Shading is slow, and its glossy part moves with the camera: matched, it lies behind the surface where that is convex and
-before it where that is concave, 3 to 5 mm on oily skin before cameras 12 degrees apart. Pores, moles and lashes are
-fine, and stay where they are.
+Shading varies slowly, and its glossy part moves with the camera. Where it is matched, the result lies behind a convex
+surface and before a concave one: by 3 to 5 mm on oily skin, with cameras 12 degrees apart. Pores, moles and lashes are
+fine and stay where they are.
 """
 
 from collections.abc import Mapping
@@ -25,8 +24,8 @@ MIN_COVERAGE = 1e-3  # share of a window inside the silhouette
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographs:
-    """Holds, for each view of the solver, the grey photograph, its noise (grey levels) and whether it shows any
-    texture. A view without a photograph is black."""
+    """Holds, for each view of the solver, the grey photograph, its noise (standard deviation, grey levels), and whether
+    it shows any texture (``speaks``). A view without a photograph is black."""
 
     grey: tuple[Float32[np.ndarray, "_ _"], ...]
     noise: Float[np.ndarray, " k"]
@@ -34,8 +33,8 @@ class Photographs:
 
 
 def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Views) -> Photographs:
-    """Loads the photographs of the views in grey. A view without a photograph, or without texture inside its
-    silhouette, is marked as one that does not speak."""
+    """Converts the views' photographs to grey and measures their noise. ``speaks`` is False for a view without a
+    photograph, or without texture inside its silhouette."""
 
     def load(k: int) -> tuple[Float32[np.ndarray, "h w"], float, bool]:
         width, height = views.size[k]
@@ -49,7 +48,8 @@ def load_photographs(images: Mapping[str, UInt8[np.ndarray, "h w 3"]], views: Vi
 
 
 def fine_texture(photographs: Photographs, views: Views, px_per_mm: Float[np.ndarray, " k"]) -> Photographs:
-    """Returns the photographs without shading. ``px_per_mm``: pixels that a mm on the head covers in each view."""
+    """Returns the photographs without shading. ``px_per_mm`` is the number of pixels that a millimetre on the head
+    covers in each view."""
 
     def fine(k: int) -> Float32[np.ndarray, "h w"]:
         return without_shading(photographs.grey[k], distance_of(views, k) < 0.0, SHADING_MM * float(px_per_mm[k]))
@@ -60,8 +60,8 @@ def fine_texture(photographs: Photographs, views: Views, px_per_mm: Float[np.nda
 def without_shading(
     grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], sigma_px: float
 ) -> Float32[np.ndarray, "h w"]:
-    """Returns the difference of an image from its mean over a Gaussian window, background left out; 0 beyond the
-    silhouette's box."""
+    """Returns the difference between an image and its mean over a Gaussian window, into which the background does not
+    enter; 0 outside the silhouette."""
     out = np.zeros_like(grey)
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not len(rows):
@@ -81,8 +81,8 @@ def distance_of(views: Views, k: int) -> Float32[np.ndarray, "h w"]:
 
 
 def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"], noise: float) -> bool:
-    """Tells whether the pixels inside the silhouette show more than noise, and more than half of them are neither burnt
-    out nor black. A mask in place of a photograph is one even value there."""
+    """Tells whether the pixels inside the silhouette show more than noise, with more than half of them neither
+    overexposed nor black. A mask that was given as a photograph does not: it is a single value there."""
     if not inside.any():
         return False
     smooth = cv2.GaussianBlur(grey, (0, 0), TEXTURE_BLUR_PX)[inside]
@@ -95,8 +95,8 @@ def shows_texture(grey: Float32[np.ndarray, "h w"], inside: Bool[np.ndarray, "h 
 def blurred(
     photographs: Photographs, sigma_px: Float[np.ndarray, " k"]
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
-    """Returns all images, each blurred with its ``sigma_px``, as one flat array, and the noise that is left in each: a
-    blur divides white noise by 2 sqrt(pi) sigma."""
+    """Blurs each image with its ``sigma_px``. Returns all of them one after another in a flat array, and the noise that
+    is left in each: a blur divides white noise by 2 sqrt(pi) sigma."""
     sigma = np.maximum(sigma_px, MIN_BLUR_PX)
     grey = photographs.grey
     smooth = map_in_threads(lambda k: cv2.GaussianBlur(grey[k], (0, 0), float(sigma[k])).ravel(), len(grey))

@@ -1,8 +1,9 @@
-"""Where photographs are compared: samples spread over the face region, and patches of samples about chosen vertices.
+"""Chooses where photographs are compared: samples spread over the face region, and patches of samples around chosen
+vertices.
 
-A patch is no square of an image and no tangent plane but a piece of the current surface itself: its samples move with
-the head while it is fitted, so that all views of a patch are warped by the surface, lens distortion included. Samples
-are shared by the patches that overlap, so that every image is read once per sample, whatever the size of the patches.
+A patch is neither a square of an image nor a tangent plane, but a piece of the current surface. Its samples move with
+the head while it is fitted, so that all views of a patch are warped by the surface, lens distortion included.
+Overlapping patches share samples, so that every image is read once per sample, whatever the size of the patches.
 """
 
 from dataclasses import dataclass, fields
@@ -18,8 +19,12 @@ from rig.mesh import vertex_normals
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Holds s samples on the full level's triangles, and C patches, each a set of samples about a vertex. ``start`` and
-    ``member`` list the samples of each patch in compressed rows."""
+    """Holds s samples on triangles of the full level, and c patches. A sample is a point inside a triangle; a patch is
+    the set of samples around a vertex.
+
+    ``corners`` and ``shares`` are the triangle and barycentric coordinates of each sample. Patch i consists of the
+    samples ``member[start[i]:start[i + 1]]``; e counts all members.
+    """
 
     corners: Int32[np.ndarray, "s 3"]
     shares: Float[np.ndarray, "s 3"]
@@ -30,30 +35,32 @@ class Patches:
     agreement: Float[np.ndarray, " e"]  # cosine between the normals: nothing across a fold
 
     def points(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "s 3"]:
+        """Returns the positions of the samples on the full level with these vertices."""
         return _mixed(vertices, self.corners, self.shares)
 
     def mixed(self, values: Float[np.ndarray, " v"]) -> Float[np.ndarray, " s"]:
-        """Interpolates values at the vertices to the samples."""
+        """Interpolates values at the vertices of the full level to the samples."""
         return np.einsum("sk,sk->s", self.shares, values[self.corners])
 
     def normals(self, vertex_normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "s 3"]:
+        """Returns the unit normal at each sample, interpolated from those of the vertices."""
         mixed = _mixed(vertex_normals, self.corners, self.shares)
         return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
 
     def sums(self, weights: Float[np.ndarray, " e"], values: Float[np.ndarray, "s n"]) -> Float[np.ndarray, "c n"]:
-        """Returns, for each patch, the weighted sum of the values at its samples."""
+        """Returns, for each patch, the sum of ``values`` over its samples, with a weight for each member."""
         shape = (len(self.centre), len(self.corners))
         return sparse.csr_array((weights, self.member, self.start), shape=shape) @ values
 
     def weights(self, size_mm: float) -> Float[np.ndarray, " e"]:
-        """Returns the weight of each sample in its patch: a Gaussian with standard deviation ``size_mm`` times the
-        agreement of the normals."""
+        """Returns the weight of each member of each patch: a Gaussian of its distance to the patch's centre with
+        standard deviation ``size_mm``, times the agreement of the normals."""
         return np.exp(-0.5 * self.square_mm2 / size_mm**2) * self.agreement
 
 
 def make_patches(model: HeadModel, *, sample_mm: float, centre_mm: float, radius_mm: float) -> Patches:
-    """Spreads samples about ``sample_mm`` apart over the face region, and patches about ``centre_mm`` apart; a patch
-    holds all samples within ``radius_mm`` of its centre."""
+    """Spreads samples about ``sample_mm`` apart over the face region of the mean head, and patches about ``centre_mm``
+    apart. A patch holds all samples within ``radius_mm`` of its centre."""
     level = model.levels["full"]
     vertices = model.vertices(np.zeros(0))
     normals = vertex_normals(vertices, level.faces)
@@ -70,15 +77,16 @@ def make_patches(model: HeadModel, *, sample_mm: float, centre_mm: float, radius
 
 
 def arrays_of(patches: Patches) -> dict[str, np.ndarray]:
-    """Returns the arrays of the patches by the names of their fields."""
+    """Returns the arrays of the patches, by the names of their fields."""
     return {field.name: getattr(patches, field.name) for field in fields(patches)}
 
 
 def spread_samples(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], spacing_mm: float
 ) -> tuple[Int32[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
-    """Returns samples as corners and barycentric weights, about one for each square of edge ``spacing_mm``. Large
-    triangles get several; of small triangles only some get one."""
+    """Spreads points over triangles, about one for each square with an edge of ``spacing_mm``. Returns the triangle's
+    three vertices and the barycentric coordinates of each. A large triangle gets several points; of small ones only
+    some get one."""
     a, b, c = (vertices[faces[:, j]] for j in range(3))
     wanted = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) / spacing_mm**2
     splits = np.maximum(np.round(np.sqrt(wanted)), 1).astype(int)
@@ -104,8 +112,8 @@ def _centroids(k: int) -> Float[np.ndarray, "n 3"]:
 def thinned(
     vertices: Float[np.ndarray, "v 3"], rows: Int[np.ndarray, " n"], spacing_mm: float
 ) -> Int[np.ndarray, " c"]:
-    """Returns at most one of the vertices ``rows`` for each cube with edge ``spacing_mm``: the one nearest to the
-    cube's middle."""
+    """Thins out the vertices ``rows``: keeps one for each cube with an edge of ``spacing_mm``, the one nearest to its
+    middle."""
     scaled = vertices[rows] / spacing_mm
     cell = np.floor(scaled).astype(np.int64)
     _, cube = np.unique(cell, axis=0, return_inverse=True)

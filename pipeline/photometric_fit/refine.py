@@ -1,12 +1,12 @@
-"""Photographs as evidence inside the outline, in the contour solver's own problem.
+"""Refines a fit to outlines with the photographs inside them, in the contour solver's own problem.
 
-Enters: a solved contour problem and the photographs. Leaves: the same problem with a finer basis and with observations
-of the surface, solved again. Three rounds, coarse to fine: each patch of the current surface (``patches``) moves along
-its normals through the images of the cameras that see it; where its views look most alike, the surface is said to be
-(``depth_search``), and how far the views would rather slide says where the cameras are (``camera_term``). No peak
-inside the reach, or a low one (occluded, specular, textureless), is silence, and so is hair (``hair_mask``). The
-observations enter the normal equations beside rims, features and priors (``surface_term``), robustly; where they are
-silent the kernels carry on smoothly.
+Enters: a solved contour problem and the photographs. Leaves: the same problem, solved again with finer modes and with
+observations of the surface. There are three rounds, from coarse to fine. Each patch of the current surface
+(``patches``) is moved along its normal through the images of the cameras that see it. The surface is observed where its
+views look most alike (``depth_search``), and the shifts that remain between the views correct the cameras
+(``camera_term``). A patch whose best match is weak or at the end of the search (hidden, glossy, without texture) is
+left out, and so is hair (``hair_mask``). The observations enter the normal equations beside rims, features and priors
+(``surface_term``), robustly; where there are none, the kernels continue the surface smoothly.
 """
 
 import math
@@ -61,13 +61,14 @@ def refine_with_photographs(
     *,
     hair: HairProbability | None = None,
 ) -> tuple[ContourSolution, Detail]:
-    """Continues the contours' solution with observations of the photographs inside the outline, and with finer modes.
+    """Continues the contour solution with finer modes and with observations of the surface from photographs.
 
     Args:
-        solved: the contours' solution.
-        images: sRGB photographs by camera.
+        solved: the solution of the contour solver.
+        images: sRGB photographs, by camera.
         settings: lengths and thresholds.
-        hair: how probably each pixel shows hair, by camera; without it everything inside the outline is skin.
+        hair: for each camera, the probability that a pixel shows hair; None takes everything inside the outline for
+            skin.
 
     Returns:
         The refined solution, or ``solved`` if the photographs show too little; and the level of detail with the reason.
@@ -112,11 +113,13 @@ def refine_with_photographs(
 
 
 def rounds_of_rig(factor: float) -> tuple[Round, ...]:
-    """Returns the rounds before a rig where depth is ``factor`` times less sure than before the usual one: as many
-    steps over a wider reach, and for each time that the factor doubles the last one twice more, once with half of it.
+    """Returns the rounds of the search for a rig whose depths are ``factor`` times less precise than the usual rig's (1
+    or more).
 
-    Outlines of three cameras in front leave the middle of a face 8 mm open, and what is far off settles slowly. There
-    gloss looks like depth to the end, and no round reads it.
+    Each round has as many steps as usual, over a range ``factor`` times as wide. For each doubling of the factor, the
+    last round is repeated once, and once more over half its range: with three cameras in front, outlines leave the
+    middle of a face open by 8 mm, and what is far off takes long to converge. Shading is then removed in the last
+    rounds, too, since gloss looks like depth.
     """
     more = round(math.log2(factor))
     wider = [replace(each, reach_mm=factor * each.reach_mm) for each in ROUNDS]
@@ -127,8 +130,8 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
 def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
-    """Returns the model with the fine kernel's modes added, its patches, and its modes at their centres. All three
-    depend only on model and settings."""
+    """Returns the model with the fine kernel's modes added, its patches, and its modes at the patches' centres. All of
+    it depends on model and settings alone, and is kept for the next call."""
     length, amplitude = settings.fine_length_mm, settings.fine_amplitude_mm
     sizes = {
         "sample_mm": settings.sample_mm,
@@ -157,8 +160,8 @@ def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches
 
 
 def near_hair(model: HeadModel, hair: Int[np.ndarray, " h"]) -> Bool[np.ndarray, " v"]:
-    """Tells which vertices of the rim's level lie near vertices of the full level that are under hair, so that their
-    outline is that of hair. A fit to contours alone has bulged into the hair where its edge joined the face's."""
+    """Tells which vertices of the rim's mesh level lie near the full level's vertices ``hair``, those under hair. The
+    outline there is that of hair, and a fit to contours alone bulged into the hair at its border with the face."""
     mean = model.vertices(np.zeros(0))
     if not len(hair):
         return np.zeros(model.levels[LEVEL].count, bool)
@@ -171,9 +174,9 @@ def local_misfit_mm(
     """Returns, around each cage vertex, the RMS distance (mm) between the surface that photographs show and the fitted
     one.
 
-    At the vertices ``lost``, which several cameras see without a match within reach, it is taken as ``LOST_MM``: eyes
-    that are open in the model and closed in the photographs, for example. Those count around themselves only, not for
-    the whole head. Away from the patches the misfit fades to 0.
+    The vertices ``lost`` are seen by several cameras but have no match within the search; there the distance is taken
+    as ``LOST_MM``. An example are eyes that are open in the model and closed in the photographs. They count only around
+    themselves. Away from the patches the misfit fades to 0.
     """
     skin = ~seen.bound
     off = surface_residual(seen, state.coefficients, state.world_from_head, state.camera_shift)[0][skin]

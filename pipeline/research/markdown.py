@@ -1,4 +1,4 @@
-"""Tables as people read them."""
+"""Formats tables as Markdown."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,6 +12,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
 
 
 def of_figures(figures: Mapping[str, float]) -> str:
+    """Returns a Markdown table with a row for each figure: its name and its value."""
     return table(("figure", "value"), list(figures.items()))
 
 

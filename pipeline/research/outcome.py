@@ -1,4 +1,4 @@
-"""What an experiment gives."""
+"""Defines the result of an experiment."""
 
 from typing import Any, NotRequired, TypedDict
 
@@ -8,8 +8,11 @@ Row = dict[str, Any]  # of one subject: each experiment has its own quantities
 
 
 class Outcome(TypedDict):
-    """Holds an outcome; ``figures`` is flat: every number that README and docs quote. ``markdown`` and ``pictures`` go
-    to files, the rest is printed; for people ``lines`` in place of the figures."""
+    """Holds the result of an experiment.
+
+    ``figures`` is flat and has every number that README and docs quote. ``markdown`` and ``pictures`` go to files; the
+    rest is printed, with ``lines`` instead of the figures for people.
+    """
 
     figures: dict[str, float]
     rows: list[Row] | dict[str, list[Row]]

@@ -1,4 +1,5 @@
-"""The paper's figures 4 and 5 of one's own results: heads side by side, and silhouette differences before and after."""
+"""Draws figures 4 and 5 of the paper from own results: heads side by side, and silhouette differences before and
+after."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""Rows of long experiments, kept as they come, so that a run that was stopped goes on where it was."""
+"""Keeps the rows of long experiments as they are computed, so that a stopped run can continue."""
 
 import hashlib
 import inspect
@@ -34,7 +34,7 @@ CONTOUR = (
 
 
 class Records:
-    """Holds rows by key in one JSON file; ``None`` as a folder keeps them in memory alone."""
+    """Holds rows by key in one JSON file; without a folder, in memory alone."""
 
     def __init__(self, folder: Path | None, name: str, key: str) -> None:
         """``key`` names all that the rows depend on (model, settings, code version): another key starts anew."""
@@ -46,7 +46,7 @@ class Records:
             self._rows = kept["rows"] if kept.get("key") == key else {}
 
     def row(self, name: str, compute: Callable[[], Row]) -> Row:
-        """Returns the kept row, or the computed one, kept from now on."""
+        """Returns the row of this name; if there is none it is computed and kept."""
         if name not in self._rows:
             self._rows[name] = compute()
             if self._path is not None:
@@ -56,7 +56,7 @@ class Records:
 
 
 def key_of(*parts: object) -> str:
-    """Returns a key for ``Records``: modules count by their source, so that rows of an older solver are computed anew,
-    and everything else by its text."""
+    """Returns a key for ``Records``. Modules enter by their source, so that rows of older code are computed anew, and
+    everything else by its text."""
     texts = [inspect.getsource(part) if isinstance(part, ModuleType) else str(part) for part in parts]
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]

@@ -1,5 +1,5 @@
-"""The experiments behind ``eigenhead experiments``: which there are, what each needs from this machine, and the files
-that they leave: rows (so that a stopped run goes on), a Markdown table, pictures."""
+"""Runs the experiments of ``eigenhead experiments``: lists them, says what each needs from this machine, and writes
+their files: rows (so that a stopped run can continue), a Markdown table, and pictures."""
 
 import importlib.util
 from collections.abc import Callable
@@ -44,7 +44,7 @@ from rig.render.renderer import Renderer
 
 
 class UnknownExperiment(EigenheadError):
-    """Refuses a name that no experiment has."""
+    """Reports a name that no experiment has."""
 
     def __init__(self, name: str) -> None:
         super().__init__(f"no experiment is called {name!r}; there are {', '.join(EXPERIMENTS)}")
@@ -59,12 +59,16 @@ class MissingPeers(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Holds what some experiments take alone.
+    """Holds options that only some experiments take.
 
-    ``simplex``: how many subjects of a table the simplex fits too; ``captures``: whether those of the shared folder
-    count beside the studio's heads; ``openmvs``: that peer's programs. Of people and
-    relief ``folders`` are the captures, of people and growth ``only`` says which of their rows, of
-    people ``detail`` how deep; scaling runs ``job`` on the ``folders``.
+    Attributes:
+        simplex: how many subjects of a table the simplex fits too.
+        captures: whether the captures of the shared folder are used besides the studio's heads.
+        openmvs: folder of the programs of OpenMVS.
+        folders: captures, of people and relief; of scaling, those to run a job on.
+        only: which rows of people and growth to run.
+        detail: level of detail of people.
+        job: command that scaling runs.
     """
 
     simplex: int | None = None
@@ -78,7 +82,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """Holds what a command asks for."""
+    """Holds what a command asks an experiment to do."""
 
     head: HeadModel
     subjects: int | None
@@ -101,11 +105,9 @@ def run_experiment(
     report: Progress,
     options: Options = NO_OPTIONS,
 ) -> Outcome:
-    """Returns figures and rows of one experiment; rows are kept in ``folder``, so that a stopped run goes on, and a
-    table and pictures are left there.
-
-    ``shared`` holds captures/ with their truths and ict-facekit/. Raises UnknownExperiment, MissingPeers, InputError.
-    """
+    """Runs one experiment and returns its figures and rows. Rows are kept in ``folder``, so that a stopped run can
+    continue; a table and pictures are written there. ``shared`` holds captures/ with their truths, and ict-facekit/.
+    Raises UnknownExperiment, MissingPeers, InputError."""
     if name not in EXPERIMENTS:
         raise UnknownExperiment(name)
     found = EXPERIMENTS[name](Task(load_model(model), subjects, shared, folder, report, options))

@@ -1,6 +1,6 @@
-"""The subjects of section 5.2, as cameras see them: silhouettes of bare heads of the model, on exact cameras.
+"""Simulates the subjects of section 5.2: silhouettes of heads of the model without hair, with exact cameras.
 
-Every error is the mean distance of corresponding face-region vertices in the world frame with no realignment, unless an
+Every error is the mean distance of corresponding face-region vertices in the world frame without realignment, unless an
 experiment says otherwise.
 """
 
@@ -29,7 +29,7 @@ START_TURN, START_SHIFT_MM = np.radians(2.0), 4.0  # what feature points leave (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planted:
-    """Holds a head with known coefficients in a known pose, and a start as feature points would leave it."""
+    """Holds a head with known coefficients in a known pose, and a start pose as feature points would give it."""
 
     name: str
     coefficients: Float[np.ndarray, " m"]
@@ -37,11 +37,13 @@ class Planted:
     start: Similarity
 
     def vertices(self, model: HeadModel, level: str = "full") -> Float[np.ndarray, "v 3"]:
+        """Returns the true vertices of a mesh level, world frame, mm."""
         return self.world_from_head.apply(model.vertices(self.coefficients, level))
 
 
 def subjects_of_section_5_2(model: HeadModel, count: int = 100, seed: int = 52) -> list[Planted]:
-    """Returns half of them heads of the database (all their modes), half random (60 modes)."""
+    """Returns the subjects of section 5.2: half of them heads of the database (all their modes), half random (60
+    modes)."""
     rng = np.random.default_rng(seed)
     known = rng.permutation(len(model.scores))[: count // 2]
     found = [_planted(f"database-{i:03}", np.asarray(model.scores[i], float), rng) for i in known]
@@ -74,14 +76,14 @@ def _planted(name: str, coefficients: np.ndarray, rng: np.random.Generator) -> P
 
 
 def exact(rig: Rig) -> Rig:
-    """Returns the rig with calibration errors stated as none."""
+    """Returns the rig with calibration errors stated as zero."""
     return Rig(tuple(replace(camera, covariance=1e-12 * np.eye(6)) for camera in rig))
 
 
 def binary_silhouettes(
     model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, scale: float = 1.0
 ) -> dict[str, Silhouette]:
-    """Returns masks as the renderer draws them at full mesh resolution."""
+    """Returns silhouettes of masks that the renderer draws at full mesh resolution."""
     with renderer.silhouette_set(rig, model.levels["full"].faces, scale) as drawn:
         masks = drawn.masks(subject.vertices(model))
     return {name: silhouette_from_mask(mask) for name, mask in masks.items()}
@@ -90,7 +92,7 @@ def binary_silhouettes(
 def exact_silhouettes(
     model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, finer: int = 4, level: str = "full"
 ) -> dict[str, Silhouette]:
-    """Returns signed distances of the true outline, to 0.03 px or so, from masks drawn ``finer`` times as large."""
+    """Returns silhouettes with signed distances exact to about 0.03 px, from masks drawn ``finer`` times as large."""
     with renderer.silhouette_set(rig, model.levels[level].faces, float(finer)) as drawn:
         masks = drawn.masks(subject.vertices(model, level))
     found = {}
@@ -110,7 +112,7 @@ def face_errors(model: HeadModel, fit: Fit, subject: Planted) -> Float[np.ndarra
 
 
 def mean_error_mm(model: HeadModel, fit: Fit, subject: Planted) -> float:
-    """Returns the mean distance (mm) of the face region's vertices from where they truly are."""
+    """Returns the mean distance (mm) of the face region's vertices from their true positions."""
     return float(np.linalg.norm(face_errors(model, fit, subject), axis=1).mean())
 
 
@@ -118,8 +120,8 @@ def worn_silhouettes(
     model: HeadModel, subject: Planted, rig: Rig, renderer: Renderer, style: HairStyle, rng: np.random.Generator,
     *, strands: bool = True,
 ) -> dict[str, Silhouette]:  # fmt: skip
-    """Returns masks of the head with hair, strands and all, and a shirt, as the studio dresses a subject. Without
-    ``strands`` they are as masks that ask for half of a pixel: most strands are thinner."""
+    """Returns silhouettes of the head with hair, its strands, and a shirt, as the studio dresses a subject. Without
+    ``strands`` they are like masks that count a pixel from one half of coverage on: most strands are thinner."""
     head, full = model.vertices(subject.coefficients), model.levels["full"]
     body = anatomy(head, {name: head[row] for name, row in model.landmarks.items()})
     hair, worn = grow(head, body, style, rng), shirt(Mesh(head, full.faces), body, rng)
@@ -134,8 +136,8 @@ def worn_silhouettes(
 
 
 def off_by(rig: Rig, error_px: float, rng: np.random.Generator) -> Rig:
-    """Returns the rig with every camera's pose off, drawn from the solver's prior for ``error_px``: a head in the
-    middle moves by 1.3 times that along each axis of the image, RMS."""
+    """Returns the rig with an error in every camera's pose, drawn from the solver's prior for ``error_px``: a head in
+    the middle moves by 1.3 times that along each axis of the image, RMS."""
     moved = []
     for camera in rig:
         depth = float(camera.camera_from_world.apply(rig.centre_world())[2])
@@ -147,7 +149,7 @@ def off_by(rig: Rig, error_px: float, rng: np.random.Generator) -> Rig:
 
 
 def stated(rig: Rig, error_px: float) -> Rig:
-    """Returns the rig with calibration errors of that size stated as each camera's covariance."""
+    """Returns the rig with calibration errors of ``error_px`` stated as each camera's covariance."""
     cameras = []
     for camera in rig:
         depth = float(camera.camera_from_world.apply(rig.centre_world())[2])

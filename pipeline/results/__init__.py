@@ -1,1 +1,1 @@
-"""What a reconstruction is, and the folder that it is written to."""
+"""Defines what a reconstruction consists of, and writes its result folder."""

@@ -1,4 +1,4 @@
-"""A head in clay, or in colours of one's own, lit from its right front."""
+"""Draws a head in clay, or in given colours, lit from its right front."""
 
 import cv2
 import numpy as np
@@ -28,8 +28,18 @@ def clay(
     paper: tuple[int, int, int] = PAPER,
     darkest: float = DARKEST,
 ) -> Resized:
-    """Draws a mesh (head frame, mm) seen from ``azimuth_deg`` towards its left, twice supersampled; ``panel`` is width
-    and height in pixels. ``box``: two corners of what fills the panel, so that several meshes can share a scale."""
+    """Draws a mesh (head frame, mm), supersampled twice.
+
+    Args:
+        mesh: the head.
+        colours: sRGB of its vertices; None draws clay.
+        azimuth_deg: direction from which it is seen, 0 = from the front, positive from its left.
+        panel: width and height of the picture, px.
+        box: two opposite corners (mm) of what fills the picture, so that several meshes can share a scale; None fits
+            the mesh.
+        paper: sRGB of the background.
+        darkest: brightness of surfaces in full shadow.
+    """
     low, high = (mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) if box is None else box
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     width, height = 2 * panel[0], 2 * panel[1]
@@ -45,7 +55,7 @@ def clay(
 def lit(
     mesh: Mesh, colours: UInt8[np.ndarray, "v 3"] | None = None, darkest: float = DARKEST
 ) -> UInt8[np.ndarray, "v 3"]:
-    """Returns the vertex colours (clay if None) shaded by the lamp."""
+    """Returns the colours of the vertices (clay if None) shaded by the lamp."""
     cosine: Float[np.ndarray, " v"] = np.clip(mesh.normals() @ (LAMP / np.linalg.norm(LAMP)), 0.0, 1.0)
     base = SKIN if colours is None else colours.astype(float)
     return np.clip(base * (darkest + (1.0 - darkest) * cosine[:, None]), 0, 255).astype(np.uint8)

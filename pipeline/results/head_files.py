@@ -1,10 +1,9 @@
-"""The fitted head in every format that the settings ask for.
+"""Writes the fitted head in every format that the settings ask for.
 
-head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm,
-z up.
-texture/albedo.png: in the layout of head.glb and head.obj, where the settings ask for it.
-With a texture the first vertices of head.glb are head.ply's, in its order; those at the seam follow once more. With a
-normal map it has some of them alone (``rows_of_ply``).
+head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm, z
+up. texture/albedo.png: in the layout of head.glb and head.obj, if the settings ask for it. With a texture, the first
+vertices of head.glb are those of head.ply in the same order; the vertices on the texture's seam follow once more. With
+a normal map it has only some of them (``rows_of_ply``).
 """
 
 from pathlib import Path
@@ -37,7 +36,8 @@ ENCODINGS = {
 
 
 def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
-    """Writes head.ply and the other head files that ``settings.outputs`` names. Raises NoUsd, OSError.
+    """Writes head.ply and the other head files that ``settings.outputs`` names. Raises NoUsd if the library for USD is
+    missing, and OSError.
 
     Args:
         folder: of the result.

@@ -1,5 +1,5 @@
-"""What files say of themselves: model, version, unit, frame, and what the job that made them was given. No ids and no
-times, so that the bytes repeat."""
+"""Describes a result inside its files: model, version, unit, frame, and the inputs of the job. There are no ids and no
+times, so that the same job gives the same bytes."""
 
 from importlib.metadata import version
 from typing import Any
@@ -23,7 +23,7 @@ def ply_comments(result: Reconstruction) -> list[str]:
 
 
 def asset_extras(result: Reconstruction) -> dict[str, Any]:
-    """Returns ``asset.extras`` of head.glb and bust.glb."""
+    """Returns the object ``asset.extras`` of head.glb and bust.glb."""
     return {
         "unit": "m",
         "frame": "head",

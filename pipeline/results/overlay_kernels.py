@@ -7,7 +7,8 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True, nogil=True)
 def tint(image, parts, colours, most, out):
-    """``out``: each pixel of ``image`` moved towards the ``colours`` of its ``parts``, by at most ``most``."""
+    """Fills ``out`` (h, w, 3; uint8) with the image, each pixel moved towards the ``colours`` (3, 3) of three parts in
+    proportion to the probabilities ``parts`` (h, w, 3), by the share ``most`` where a probability is 1."""
     for y in range(image.shape[0]):
         for x in range(image.shape[1]):
             a, b, c = most * parts[y, x, 0], most * parts[y, x, 1], most * parts[y, x, 2]

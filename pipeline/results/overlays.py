@@ -1,9 +1,8 @@
-"""Pictures of a result: input and fitted contour over each image, the contact sheet, the turntable strip.
+"""Draws the pictures of a result: input and fitted contour over each image, the contact sheet, the turntable strip.
 
-A contour is painted straight from a signed distance, ``alpha = half width + 1/2 - |d|``, so that it is antialiased and
-lies where the sub-pixel contour lies. Vermilion and sky blue are told apart by every kind of colour vision
-(Okabe and Ito, *Color Universal Design*,
-https://jfly.uni-koeln.de/color/); a dark rim keeps them readable on any image.
+A contour is painted from its signed distance d, with opacity ``half width + 1/2 - |d|``, so that it is antialiased and
+lies where the sub-pixel contour lies. Vermilion and sky blue can be told apart with every kind of colour vision (Okabe
+and Ito, *Color Universal Design*, https://jfly.uni-koeln.de/color/); a dark border keeps them readable on any image.
 """
 
 from collections.abc import Sequence
@@ -41,8 +40,15 @@ def overlay(
     label: str = "",
     parts: Float32[np.ndarray, "h w 3"] | None = None,
 ) -> ImageRgb:
-    """Draws the input contour (sky blue) and the fitted head's contour (vermilion) on the image. With ``parts``, also
-    tints each pixel by its probabilities of skin, hair and clothes."""
+    """Draws the contour of the input (sky blue) and that of the fitted head (vermilion) on the image.
+
+    Args:
+        image: the photograph.
+        input_distance: signed distance to the silhouette, px.
+        fitted_mask: which pixels the fitted head covers.
+        label: text in a corner.
+        parts: probabilities of skin, hair and clothes, by which each pixel is tinted; None leaves it.
+    """
     line = max(1.0, 1.5 * image.shape[1] / 1024)
     painted = image.copy() if parts is None else tinted(image, parts)
     contours = [_near(input_distance, line), _near(_smooth_distance(fitted_mask), line)]
@@ -63,8 +69,8 @@ def tinted(image: ImageRgb, parts: Float32[np.ndarray, "h w 3"]) -> ImageRgb:
 
 
 def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[np.ndarray, "h w"]) -> Resized:
-    """Draws the difference of eq. (4) over a pale image of a panel's size: sky blue where only the input mask is,
-    vermilion where only the model is."""
+    """Draws the difference of eq. (4) over a pale copy of the image in a panel's size: sky blue where only the input
+    mask is, vermilion where only the model is."""
     size = _fitted_size(image)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     observed, model = (
@@ -80,7 +86,7 @@ def difference(image: ImageRgb, observed: Bool[np.ndarray, "h w"], model: Bool[n
 
 
 def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]]) -> ImageRgb:
-    """Returns the image with lines of text in its top left corner, each in its colour on darkened ground."""
+    """Returns the image with lines of text in its top left corner, each in its colour on a darkened ground."""
     if not entries:
         return image
     scale = max(0.5, image.shape[1] / 1280)
@@ -98,8 +104,8 @@ def legend(image: ImageRgb, entries: Sequence[tuple[str, tuple[int, int, int]]])
 def turntable(
     mesh_head: Mesh, colours: UInt8[np.ndarray, "v 3"], panel: tuple[int, int] = (280, 360)
 ) -> list[ImageRgb]:
-    """Draws the head from each of ``AZIMUTHS_DEG`` around its y axis, as panels of the given width and height, twice
-    supersampled."""
+    """Draws the head from each of ``AZIMUTHS_DEG`` around its y axis, supersampled twice. ``panel`` is width and height
+    of each picture, px."""
     low, high = mesh_head.vertices.min(axis=0), mesh_head.vertices.max(axis=0)
     centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     width, height = 2 * panel[0], 2 * panel[1]

@@ -1,4 +1,4 @@
-"""A head that a slicer takes: closed, upright on its neck."""
+"""Closes a head for 3D printing and stands it on its neck."""
 
 import numpy as np
 
@@ -11,8 +11,8 @@ FAN_MM = 15.0  # a border that reaches so far to all sides is the neck's: it is 
 def printable(head: Mesh) -> Mesh:
     """Returns the head (head frame, mm) as a closed mesh for printing: z up, standing on z = 0.
 
-    The neck is closed by a fan about the middle of its border; open lids and lips are closed by a strip from corner to
-    corner. Raises NotAManifold if a border touches itself.
+    The neck is closed by triangles around the middle of its border; open lids and lips are closed by a strip from
+    corner to corner. Raises NotAManifold if a border touches itself.
     """
     vertices, added = [head.vertices], [head.faces]
     count = len(head.vertices)

@@ -1,7 +1,7 @@
-"""What a reconstruction is: the products of the stages, which ``pipeline.results.write`` writes.
+"""Defines what a reconstruction is: the products of the stages, which ``pipeline.results.write`` writes.
 
 It holds everything that the result folder shows and nothing that depends on where or when it was made, apart from the
-seconds that the stages took (those reach report.json only, never head.ply).
+seconds of the stages (those reach report.json only, never head.ply).
 """
 
 from collections.abc import Mapping
@@ -24,8 +24,8 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """Holds everything that a reconstruction produced: the textured head in the world frame, the results of all stages,
-    and the evidence."""
+    """Holds everything that a reconstruction produced: the products of all stages, with the textured head in the world
+    frame and its evidence."""
 
     model_name: str
     model_sha256: str

@@ -45,8 +45,8 @@ ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 
 
 
 def report_document(result: Reconstruction, template: TemplateHeader | None = None) -> Report:
-    """Returns the report as JSON types; every number is finite, and unknown ones are None. ``template``: the template
-    in whose vertex order the head was also written."""
+    """Returns the report as JSON types. Every number is finite; unknown ones are None. ``template`` is the template in
+    whose vertex order the head was also written."""
     head, evidence, refined = result.head, result.evidence, result.refined
     return {
         "format": FORMAT,

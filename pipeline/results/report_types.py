@@ -1,4 +1,4 @@
-"""The types of ``report.json``, format ``eigenhead-report/1``: what programs rely on."""
+"""Types of ``report.json``, format ``eigenhead-report/1``, on which other programs rely."""
 
 from typing import NotRequired, TypedDict
 
@@ -8,7 +8,7 @@ FORMAT = "eigenhead-report/1"
 
 
 class ViewReport(TypedDict):
-    """How far a camera's silhouette was to be trusted."""
+    """Describes how far a camera's silhouette was trusted."""
 
     usable: bool
     contrast: float | None
@@ -21,7 +21,8 @@ class ViewReport(TypedDict):
 
 
 class CameraReport(TypedDict):
-    """``camera_shift``: rotation (rad) and translation (mm), left perturbation of camera_from_world."""
+    """Describes how well the head explains one camera. ``camera_shift`` is the correction of its pose: rotation (rad)
+    and translation (mm), applied to camera_from_world on the left."""
 
     used: bool
     iou: float | None
@@ -35,7 +36,7 @@ class CameraReport(TypedDict):
 
 
 class FaceReport(TypedDict):
-    """The subject's face in a camera's picture; ``found`` is false where none was."""
+    """Describes the subject's face in a camera's picture; ``found`` is false where there is none."""
 
     found: bool
     box_px: list[float] | None
@@ -45,8 +46,9 @@ class FaceReport(TypedDict):
 
 
 class PoseReport(TypedDict):
-    """What the pose came from (landmarks, features or silhouettes), how much more the best other pose costs (a share),
-    by camera how far the head's landmarks lie from the found ones (by the face's size), and whether it is in doubt."""
+    """Describes how the pose was found: the method (landmarks, features or silhouettes), how much more the best other
+    pose costs (a share), how far the head's landmarks lie from those in each camera's picture (relative to the face's
+    size), and whether the pose is in doubt."""
 
     method: str
     rival: float | None
@@ -55,26 +57,30 @@ class PoseReport(TypedDict):
 
 
 class NamedModel(TypedDict):
+    """Describes the head model that was used: its name and the SHA-256 digest of its file."""
+
     name: str
     sha256: str
 
 
 class Measured(TypedDict):
-    """In mm, with its standard deviation where the solver tells one."""
+    """Describes a measurement in mm with its standard deviation; ``std`` is null if the solver computes none."""
 
     value: float
     std: float | None
 
 
 class Placed(TypedDict):
-    """A landmark in the world (mm), with its standard deviations along the world's axes where the solver tells them."""
+    """Describes a landmark's position (world, mm) with its standard deviations along the world's axes; ``std`` is null
+    if the solver computes none."""
 
     position: list[float]
     std: list[float] | None
 
 
 class ExpressionReport(TypedDict):
-    """What the face does: the model's name, the same in words, a weight from 0 to 1 and its standard deviation."""
+    """Describes one expression of the face: the model's name of it, the same in words, its weight from 0 to 1, and the
+    weight's standard deviation."""
 
     name: str
     words: str
@@ -83,16 +89,16 @@ class ExpressionReport(TypedDict):
 
 
 class MorphsReport(TypedDict):
-    """Of posed.glb: the weights that give the head as photographed, and those of Apple's names that move nothing
-    because the model has no counterpart."""
+    """Describes the morph targets of posed.glb: the weights that give the head as photographed, and those of Apple's
+    names that move nothing because the model has no counterpart."""
 
     weights: dict[str, float]
     without_counterpart: list[str]
 
 
 class TemplateReport(TypedDict):
-    """Of head-NAME.obj: whose vertex order it has. ``sha256`` is of the mesh's file; ``registration``: the figures of
-    ``eigenhead template add``."""
+    """Describes the template in whose vertex order head-NAME.obj is. ``sha256`` is that of its mesh's file;
+    ``registration`` has the figures that ``eigenhead template add`` printed."""
 
     name: str
     source: str
@@ -101,8 +107,8 @@ class TemplateReport(TypedDict):
 
 
 class SimilarityReport(TypedDict):
-    """x_world = scale (rotation x_head + translation), mm: the paper's form (section 4.2), in which the scale holds for
-    the translation, too."""
+    """Describes x_world = scale (rotation x_head + translation), mm. In the paper's form (section 4.2), which this is,
+    the scale applies to the translation, too."""
 
     scale: float
     rotation: list[list[float]]
@@ -110,7 +116,7 @@ class SimilarityReport(TypedDict):
 
 
 class BustReport(TypedDict):
-    """Of the whole visible surface; ``closed``: every edge has two faces."""
+    """Describes the bust, the whole visible surface. ``closed`` says whether every edge has two faces."""
 
     spacing_mm: float
     vertices: int
@@ -123,7 +129,8 @@ class BustReport(TypedDict):
 
 
 class TextureReport(TypedDict):
-    """``filled``: vertices that no photograph coloured; ``gains``: linear RGB, by camera."""
+    """Describes the head's colours. ``filled`` counts the vertices that no photograph coloured; ``gains`` are factors
+    of linear RGB, by camera."""
 
     vertices: int
     filled: int
@@ -133,7 +140,7 @@ class TextureReport(TypedDict):
 
 
 class DetailReport(TypedDict):
-    """How deep the fit went, and why no deeper or why so deep."""
+    """Describes which level of detail the fit reached, and why that one."""
 
     level: str
     reason: str
@@ -141,7 +148,7 @@ class DetailReport(TypedDict):
 
 
 class Report(TypedDict):
-    """``report.json``."""
+    """Describes ``report.json`` of a result."""
 
     format: str
     version: str

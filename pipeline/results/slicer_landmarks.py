@@ -22,7 +22,7 @@ LPS_FROM_HEAD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def landmarks_document(result: Reconstruction) -> dict[str, Any]:
-    """Returns the point list as JSON types, one control point a landmark."""
+    """Returns the point list as JSON types, with one control point for each landmark."""
     place = result.head.fit.world_from_head
     head_from_world = RigidTransform(place.rotation, place.translation).inverse()  # keeps the size, as head.glb does
     lps_from_world = RigidTransform(LPS_FROM_HEAD, np.zeros(3)) @ head_from_world

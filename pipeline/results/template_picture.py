@@ -1,4 +1,4 @@
-"""A registered template beside the model that carries it, to be looked at before it is used."""
+"""Draws a registered template beside the head model it was registered to, so that it can be inspected before use."""
 
 import numpy as np
 
@@ -16,8 +16,8 @@ AZIMUTHS_DEG = (0.0, 55.0)
 
 def template_picture(template: Template, found: Registration, model: HeadModel) -> ImageRgb:
     """Draws a template from the front and the side, in five panels: the mesh as it came; the model fitted to it; the
-    mesh registered to the model (blue: follows the skin; green: moves as a whole); the mesh on the model's mean head;
-    and that mean head."""
+    mesh registered to the model (blue: vertices that follow the skin; green: closed parts that move as a whole); the
+    mesh on the model's mean head; and that mean head."""
     faces, triangles = model.levels["full"].faces, template.mesh.triangles()
     mean = model.vertices(np.zeros(0))
     kinds = np.tile(np.array(DEEP), (len(found.surface_binding.rest), 1))

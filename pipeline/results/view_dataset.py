@@ -1,8 +1,8 @@
-"""A capture as a data set of views: undistorted pictures, masks, and the files that say where each was taken.
+"""Writes a capture as a data set of views: undistorted pictures, masks, and the files that say where each was taken.
 
-Enters: a capture, its silhouettes and rig. Leaves: the folder of ``rig.formats.dataset_json``, of the views that take
-part. GaussianAvatars' pictures show the subject before white and are of pinholes with square pixels and a principal
-point in the middle; nerfstudio's keep background and camera matrix.
+Enters: a capture, its silhouettes and rig. Leaves: the folder described in ``rig.formats.dataset_json``, of the views
+that take part. For GaussianAvatars the pictures show the subject on white, by pinhole cameras with square pixels and
+the principal point in the middle; for nerfstudio they keep background and camera matrix.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,8 @@ THREADS = 4  # a view of four megapixels takes half a gigabyte while it is resam
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewDataset:
-    """Holds what a data set is made of; ``head_world``: a surface in the capture's world frame (mm) to begin from."""
+    """Holds what a data set is made of. ``head_world`` is a surface in the capture's world frame (mm) from which
+    training may start."""
 
     capture: Capture
     rig: Rig
@@ -37,12 +38,13 @@ class ViewDataset:
 
     @property
     def rig_used(self) -> Rig:
-        """The cameras whose views take part."""
+        """Returns the cameras whose views take part."""
         return self.rig.subset(name for name, view in self.silhouettes.items() if view.quality.usable)
 
 
 def write_view_dataset(folder: Path, dataset: ViewDataset, form: DatasetFormat) -> None:
-    """Writes the files of a data set, each under a temporary name first; the JSON files come last."""
+    """Writes the files of a data set in the layout that ``form`` names. Each file is written under a temporary name
+    first; the JSON files come last."""
     rig = dataset.rig_used
     pinholes = Rig(
         tuple(

@@ -41,8 +41,15 @@ THREADS = 4  # cv2, NumPy and the rasteriser release the interpreter lock, and e
 
 
 def write_result(folder: Path, result: Reconstruction, capture: Capture, template: Template | None = None) -> None:
-    """Writes every file of a result, each under a temporary name first. ``capture`` is the one that was reconstructed,
-    as read; with ``template`` the head is also written in its vertex order. Raises OSError if the disk is full."""
+    """Writes every file of a result, each under a temporary name first. Raises OSError, for example if the disk is
+    full.
+
+    Args:
+        folder: where the files go.
+        result: the reconstruction.
+        capture: the capture that was reconstructed, as it was read.
+        template: if not None, the head is also written in its vertex order.
+    """
     capture = reassign_images(capture, pictures=result.views.assignment)
     head, blendshape_rig = head_mesh(result), result.evidence.blendshape_rig
     with task_pool(THREADS) as pool:
@@ -87,8 +94,8 @@ def _write_meshes(folder: Path, result: Reconstruction, head: Mesh) -> None:
 
 
 def head_mesh(result: Reconstruction) -> Mesh:
-    """Returns the result's mesh in the head frame, in true millimetres: rotation and translation of the pose are
-    undone, the scale is kept."""
+    """Returns the result's mesh in the head frame, in true millimetres: the rotation and translation of the pose are
+    undone, its scale is kept."""
     head_from_world = _head_from_world(result.head.fit.world_from_head)
     mesh = result.mesh_world
     return Mesh(head_from_world.apply(mesh.vertices), mesh.faces, result.texturing.vertices.colours)

@@ -1,4 +1,5 @@
-"""``neutral.glb`` and ``posed.glb`` of a result: the head without its expression, and with morphs to make others."""
+"""Writes ``neutral.glb`` and ``posed.glb`` of a result: the head without its expression, and the head with morph
+targets for other expressions."""
 
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from rig.mesh import Mesh
 
 
 def write_expression(folder: Path, result: Reconstruction, blendshape_rig: BlendshapeRig) -> None:
-    """Writes ``neutral.glb`` and ``posed.glb`` if the settings ask for them. Their colours are those of the
-    photographed head's vertices."""
+    """Writes ``neutral.glb`` and ``posed.glb`` if the settings ask for them, with the vertex colours of the
+    photographed head."""
     place, outputs = result.head.fit.world_from_head, result.settings.outputs
     head_from_world = RigidTransform(place.rotation, place.translation).inverse()
     neutral = Mesh(

@@ -1,7 +1,9 @@
-"""``head-NAME.obj`` of a result: the head in a template's vertex order, polygons, groups and texture coordinates.
+"""Writes ``head-NAME.obj`` of a result: the head in a template's vertex order, polygons, groups and texture
+coordinates.
 
-World frame, mm, as head.ply and head.obj are. With a texture and texture coordinates of the template, its skin has one
-(head-NAME.mtl, head-NAME.jpg, a tile more a file); else vertices have their colours.
+World frame, mm, as head.ply and head.obj. If both the result has a texture and the template texture coordinates, the
+skin is textured (head-NAME.mtl, head-NAME.jpg, and one more file for each further tile); else the vertices are
+coloured.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
 """Finds the subject in every photograph (section 5.4), with clean plates or without.
 
-Enters: a capture and its rig. Leaves: a ``Silhouette`` a camera, with its quality.
+Enters: a capture and its rig. Leaves: a ``Silhouette`` for each camera, with its quality.
 """

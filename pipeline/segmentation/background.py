@@ -1,9 +1,10 @@
-"""What the clean plate would look like behind the subject, at the moment of the shot.
+"""Estimates what the clean plate would look like behind the subject, at the moment of the shot.
 
-Between plate and shot the lamps drift and a camera may change its exposure, so the plate is multiplied by a smooth gain
-field, one a channel, found from the pixels that still look like the plate. The start is the mode of the log ratio: it
-is the background's, however large the subject, because the subject's ratios have no common value. Noise is measured
-from what is left: as a curve over brightness (photon noise grows with it), and by pixel where several plates show more.
+Between plate and shot the lamps drift, and a camera may change its exposure. So the plate is multiplied by a smooth
+gain field, one for each channel, estimated from the pixels that still look like the plate. It starts at the mode of the
+log ratio, which is the background's however large the subject is, because the subject's ratios have no common value.
+The noise is measured from the residuals: as a curve over brightness (photon noise grows with it), and by pixel where
+several plates show more.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ STEPS = 4  # of reweighting; the field moves by less than 0.1 grey level after t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Holds the clean plates and what they need to look like the background of the image: a gain field, the noise, and
+    """Holds the clean plates and what makes them look like the background of the image: a gain field, the noise, and
     which pixels show the background."""
 
     plates: UInt8[np.ndarray, "p h w 3"]
@@ -36,8 +37,8 @@ class Background:
 
 
 def coarse_size(shape: tuple[int, ...], width: int) -> tuple[int, int]:
-    """Returns the width and height (px) of the coarse level: the image's, divided by the whole number that brings the
-    width nearest to ``width``."""
+    """Returns the width and height (px) of the coarse level: those of the image divided by the whole number that brings
+    its width nearest to ``width``."""
     factor = max(1, round(shape[1] / width))
     return max(1, shape[1] // factor), max(1, shape[0] // factor)
 

@@ -1,8 +1,8 @@
-"""What other cameras say of doubtful pixels: could anything of the subject stand on the pixel's ray?
+"""Asks the other cameras about doubtful pixels: whether any part of the subject can lie on the pixel's ray.
 
-A point of the ray is denied by every camera whose mask it falls outside of; of all points on the ray the least denied
-one counts, as for the visual hull (figure 1). One camera may err where another's hair or coat is lost in its backdrop,
-so that the answer is a number, and the asking side decides.
+A point of the ray is rejected by every camera whose mask it falls outside of. The least rejected point of the ray
+counts, as for the visual hull (figure 1). One camera may be wrong where hair or a coat is lost in its backdrop, so the
+answer is a number, and the caller decides.
 """
 
 from collections.abc import Mapping
@@ -21,10 +21,8 @@ def count_rejecting_cameras(
     doubt: Bool[np.ndarray, "h w"], name: str, masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig
 ) -> Int8[np.ndarray, "h w"]:
     """Counts, for each doubtful pixel of camera ``name``, how many other cameras see no subject anywhere on its ray (at
-    most ``MAX_DISSENT``); -1 for pixels without doubt or with too few witnesses.
-
-    Masks may be smaller than the images; all are evenly reduced.
-    """
+    most ``MAX_DISSENT``); -1 for pixels that are not doubtful or are seen by too few cameras. Masks may be smaller than
+    the images; all are reduced by the same factor."""
     out = np.full(doubt.shape, -1, np.int8)
     others = [camera for camera in rig if camera.name != name and masks[camera.name].any()]
     if len(others) < MIN_WITNESSES or not doubt.any():

@@ -20,8 +20,13 @@ def least_dissent(
     distances: np.ndarray,
     scales: np.ndarray,
 ) -> np.ndarray:
-    """How many cameras see background at the place on each ray (between ``span``, mm) where fewest do; -1 where too
-    few look."""
+    """Returns, for each ray (n), the smallest number of cameras that see background at any one of its points, int8; -1
+    if no point is seen by ``MIN_WITNESSES`` cameras. Numbers above ``MAX_DISSENT`` are not counted further.
+
+    ``origin`` (3) and ``rays`` (n, 3) are in the world frame; points lie at distances in ``span`` (mm) along them.
+    ``cameras`` are rows of ``packed_camera``; ``distances`` (k, h, w) the distances (px) to each camera's mask,
+    negative where unknown, in images reduced by ``scales`` (k).
+    """
     out = np.full(len(rays), -1, np.int8)
     step = (span[1] - span[0]) / STEPS
     for n in range(len(rays)):

@@ -1,12 +1,11 @@
-"""What is subject and what plate, decided at a coarse level, where averaging quarters the noise.
+"""Decides what is subject and what is background, at a coarse level, where averaging reduces the noise to a quarter.
 
-Foreground log-odds against the exposure-corrected background (``pipeline.segmentation.background``), a soft
-shadow being no subject, are made smooth by mean-field sweeps whose links are cut where the *difference* to the plate
-has an edge (Sun et al., *Background Cut*, ECCV 2006), so that edges of the backdrop cut nothing.
-
-A pixel that looks like the plate proves something only where the subject does not: ``Decision.clear``. Elsewhere, and
-where a shadow might be a coat, the other cameras are asked (``pipeline.segmentation.cross_view``), and ``reconsider``
-decides again.
+The log odds of foreground against the corrected background (``pipeline.segmentation.background``), in which soft
+shadows count as background, are smoothed by mean-field sweeps. Their links are cut where the *difference* to the plate
+has an edge (Sun et al., *Background Cut*, ECCV 2006), so that edges of the backdrop cut nothing. A pixel that looks
+like the plate proves something only where the subject looks different: ``Decision.clear``. Elsewhere, and where a
+shadow might be a coat, the other cameras are asked (``pipeline.segmentation.cross_view``), and ``reconsider`` decides
+again.
 """
 
 from dataclasses import dataclass, replace
@@ -46,7 +45,7 @@ UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must le
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """Holds the decision on one image by itself: what is subject and what is plate. All arrays are at the coarse level;
+    """Holds the decision on a single image: what is subject and what is background. All arrays are at the coarse level;
     without a subject the mask is empty."""
 
     coarse: Float32[np.ndarray, "h w 3"]  # the image
@@ -63,7 +62,7 @@ class Decision:
 
     @property
     def reduction(self) -> float:
-        """Returns how many image pixels a coarse pixel is wide."""
+        """Returns the width of a coarse pixel, in pixels of the image."""
         return self.background.plates.shape[2] / self.mask.shape[1]
 
 
@@ -92,7 +91,7 @@ def decide(
     )
     mask, detached_component_areas = whole_subject(raw, plain, settings)
     mixed = (mixture > 1) & (away > (2 * background.noise @ CHANNEL_SUM / 3) ** 2)
-    own_odds = _own_odds(coarse, raw, paint, chi2, variance, settings)
+    own_odds = _subject_colour_odds(coarse, raw, paint, chi2, variance, settings)
     own_odds = np.where(other, np.maximum(own_odds, 0.5 * unexplained - settings.evidence), own_odds)
     return Decision(
         coarse, background, odds, probability, mask, detached_component_areas, paint, own_odds, clear, plain, mixed
@@ -119,7 +118,7 @@ def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: Se
     )
 
 
-def _own_odds(
+def _subject_colour_odds(
     image: Float32[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
     paint: Float32[np.ndarray, "h w 3"],
@@ -144,8 +143,9 @@ def _own_odds(
 def find_mixtures(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], background: Background
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Returns the squared difference of each coarse pixel to the plate (mean of the channels), and a measure of how far
-    the pixel mixes subject and plate, as at strands of hair: the variance within it relative to that difference."""
+    """Returns the squared difference of each coarse pixel from the plate (mean over the channels), and a measure of how
+    much the pixel mixes subject and plate, as at strands of hair: the variance inside it relative to that
+    difference."""
     half = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(
         np.float32
     )
@@ -172,7 +172,7 @@ def _against_plate(
 def colours_apart(
     colour: Float32[np.ndarray, "h w 3"], other: Float32[np.ndarray, "h w 3"], variance: Float32[np.ndarray, "h w 3"]
 ) -> Float32[np.ndarray, "h w"]:
-    """Returns the distance (standard deviations) between two colours, after ``colour`` is darkened or lightened to come
+    """Returns the distance (standard deviations) between two colours, after ``colour`` is made as bright as brings it
     nearest to ``other``."""
     sigma = np.sqrt(variance)
     f, b = colour / sigma, other / sigma

@@ -1,15 +1,15 @@
-"""From a coarse mask to a sub-pixel contour: alpha in a band around it.
+"""Finds a sub-pixel contour from a coarse mask: the alpha of pixels in a band around it.
 
-With the background B of every pixel known, and the subject's colour F taken from just inside, a pixel is
-``I = q F + (1 - alpha) B`` in linear light, q being alpha times the local shade of the subject, which darkens where it
-turns away from the camera; least squares over the channels with q close to alpha gives alpha, and the contour is where
-alpha is one half, which for an edge blurred by any symmetric optics is where the edge is. Light adds up, its sRGB codes
-do not: with codes the contour of dark hair was 0.25 px too far in, on captures rendered by another program; without q
-that of cheeks, which end in their own shade, was 0.2 px too far in.
+With the background B of every pixel known, and the subject's colour F taken from just inside, a pixel is ``I = q F + (1
+- alpha) B`` in linear light. Here q is alpha times the local brightness of the subject, which darkens where it turns
+away from the camera. Least squares over the channels, with q close to alpha, gives alpha. The contour is where alpha is
+one half, which for an edge blurred by any symmetric optics is where the edge is.
 
-B is first matched to the pixels just outside, so that a shadow or bounced light at the edge does not move it; F, which
-may vary (a dark rim, a lock of hair), is taken again from inside the first contour. Where the colours are too close to
-tell, alpha follows the coarse mask.
+Light adds up; its sRGB codes do not: with codes the contour of dark hair was 0.25 px too far inside, on captures
+rendered by another program. Without q, that of cheeks, which darken towards their edge, was 0.2 px too far inside. B is
+first matched to the pixels just outside, so that a shadow or reflected light at the edge does not move it. F, which may
+vary (a dark edge, a lock of hair), is taken again from inside the first contour. If the colours are too similar, alpha
+follows the coarse mask.
 """
 
 from dataclasses import dataclass

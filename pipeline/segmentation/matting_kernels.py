@@ -11,7 +11,8 @@ MAX_ALPHA_INFORMATION = 25.0  # 1 / variance of one pixel's alpha, below which i
 
 @njit(cache=True, nogil=True, inline="always")
 def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
-    """Cell and fraction for linear interpolation between pixel centres of a smaller image."""
+    """Returns the pixel of a smaller image (``small`` pixels along this side) before the centre of pixel ``x`` of a
+    larger one (``size``), and the fraction of the way to the next one."""
     at = min(max((x + 0.5) * small / size - 0.5, 0.0), small - 1.0)
     low = min(int(at), max(small - 2, 0))
     return low, at - low
@@ -19,13 +20,14 @@ def corner_of(x: int, size: int, small: int) -> tuple[int, float]:
 
 @njit(cache=True, nogil=True, inline="always")
 def interpolated_colour(a: np.ndarray, y: int, x: int, c: int, fy: float, fx: float) -> float:
-    """One channel of an image between four of its pixels."""
+    """Returns channel ``c`` of an image (h, w, 3), interpolated between pixel (y, x) and the ones to its right and
+    below."""
     return bilinear(a[y, x, c], a[y, x + 1, c], a[y + 1, x, c], a[y + 1, x + 1, c], fx, fy)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def decoded_level(table: np.ndarray, code: float) -> float:
-    """Linear light of a code between 0 and 255, between the table's entries."""
+    """Returns the linear light of a code (0 to 255, fractions allowed) by linear interpolation in ``table``."""
     code = min(max(code, 0.0), 255.0)
     low = int(code)
     return table[low] + (code - low) * (table[low + 1] - table[low])
@@ -44,11 +46,25 @@ def solve_alpha(
     sigmas: tuple[float, float],
     first: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Alpha (-0.5 to 1.5) of every pixel, and in the band |F - B| in standard deviations of the image's noise (-1
-    elsewhere) and 1 / variance of alpha (1 elsewhere).
+    """Computes how much of each pixel is subject (alpha), from image I, background B and the subject's colour F, all in
+    linear light: the least-squares solution of I - B = q F - alpha B. Here q, the brightness of the subject times
+    alpha, is near alpha, and alpha is near the coarse ``probability``, both as ``sigmas`` say.
 
-    ``zone``: 0 outside, 1 band, 2 inside, 3 band in which the first guess of the subject's colour is no help.
-    ``sigmas``: standard deviations of alpha about the coarse mask, and of the subject's brightness at the rim.
+    Args:
+        table: linear light by sRGB code.
+        image: (h, w, 3) codes.
+        plates: clean plates (k, h, w, 3), whose mean is the background.
+        light: factor (r, c, 3) by which the background's light differs from the plates'.
+        sigma: standard deviation of the noise (r, c).
+        zone: (r, c); 0 outside, 1 band along the outline, 2 inside, 3 band where the first guess of F is no help.
+        probability: coarse alpha (r, c).
+        subject: the subject's colour (r2, c2, 3), codes.
+        sigmas: standard deviations of alpha about the coarse one, and of the subject's brightness.
+        first: whether ``subject`` is a first guess.
+
+    Returns:
+        Alpha (-0.5 to 1.5) and, in the band, |F - B| in standard deviations of the noise (-1 elsewhere) and the inverse
+            variance of alpha (``MAX_ALPHA_INFORMATION`` elsewhere).
     """
     coarse_sigma, shade = sigmas
     height, width = image.shape[:2]

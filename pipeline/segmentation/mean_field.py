@@ -16,8 +16,8 @@ def smooth_odds(
     background: Background,
     settings: SegmentationSettings,
 ) -> Float[np.ndarray, "h w"]:
-    """Returns the probability of the subject at each pixel after mean-field smoothing, in which neighbours of alike
-    residual influence each other."""
+    """Returns the probability of the subject at each pixel after mean-field smoothing, in which neighbours with similar
+    residuals influence each other."""
     residual = ((image - background.coarse) / np.maximum(background.noise, 1.0)).astype(np.float32)
     field = mean_field_sweeps(np.asarray(odds, np.float32), residual, settings.smoothness, SWEEPS)
     return 1 / (1 + np.exp(-2 * field))

@@ -9,7 +9,13 @@ MAX_ODDS = 6.0  # log odds are clipped there, so that one pixel cannot outvote i
 
 @njit(cache=True, nogil=True)
 def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, sweeps: int) -> np.ndarray:
-    """Half log odds after mean-field sweeps over eight neighbours, in alternating order (Gauss-Seidel)."""
+    """Returns half the log odds (h, w) of each pixel after mean-field sweeps over its eight neighbours, by Gauss-Seidel
+    in alternating order.
+
+    ``odds`` (h, w) are the log odds of each pixel by itself. Two neighbours are linked by ``strength``, less the more
+    their ``residual`` (h, w, c; standard deviations) differs: the coupling is strength exp(-|difference|^2 / 18), and
+    0.71 of that along diagonals.
+    """
     height, width = odds.shape
     steps = ((0, 1), (1, 0), (1, 1), (1, -1))
     links = np.zeros((4, height, width), np.float32)
@@ -45,7 +51,8 @@ def mean_field_sweeps(odds: np.ndarray, residual: np.ndarray, strength: float, s
 
 @njit(cache=True, nogil=True)
 def undecided_pixels(odds: np.ndarray) -> np.ndarray:
-    """Pixels (flat) within two of one whose log odds are not clipped or that differs: the others cannot change."""
+    """Returns the pixels (flat indices) that can change: those within two pixels of one whose log odds are not clipped,
+    or differ from theirs."""
     height, width = odds.shape
     out = np.empty(height * width, np.int64)
     count = 0

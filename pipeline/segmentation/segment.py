@@ -1,11 +1,10 @@
-"""Background subtraction (section 5.4): a capture to one silhouette a camera.
+"""Subtracts the background (section 5.4): from a capture to one silhouette for each camera.
 
-``pipeline.segmentation.foreground`` decides what is subject, asking the other cameras where it is in doubt;
-``pipeline.segmentation.matting`` then finds the sub-pixel contour, and ``pipeline.segmentation.view_consistency``
-compares what the cameras say.
-
-The paper says only "background subtraction". A view whose mask cannot be trusted is reported: ``quality.usable`` is
-False where it would hurt a fit, and ``quality.warnings`` say why. Operator masks override everything.
+``pipeline.segmentation.foreground`` decides what is subject, with the help of other cameras where it is in doubt;
+``pipeline.segmentation.matting`` then finds the sub-pixel contour; ``pipeline.segmentation.view_consistency`` compares
+the cameras. The paper says only "background subtraction". A view whose mask is unreliable is reported:
+``quality.usable`` is False if it would harm a fit, and ``quality.warnings`` say why. Masks of the operator override
+everything.
 """
 
 from collections.abc import Mapping
@@ -127,13 +126,13 @@ def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouet
     if weak <= settings.weak_share_warned:
         return silhouette
     text = compose("outline-guessed", share=weak)
-    kept = tuple(warning for warning in quality.warnings if not _speaks_of(warning, "outline-weak"))
+    kept = tuple(warning for warning in quality.warnings if not _concerns(warning, "outline-weak"))
     if weak > settings.weak_share_unusable:
         return replace(silhouette, quality=replace(quality, warnings=(*kept, compose("view-unused", remark=text))))
     return replace(silhouette, quality=replace(quality, warnings=kept, doubts=(text,)))
 
 
-def _speaks_of(message: Message, code: str) -> bool:
+def _concerns(message: Message, code: str) -> bool:
     """Tells whether a message has the given code, or has a remark with that code."""
     remark = message.parameters.get("remark")
     return message.code == code or (isinstance(remark, Message) and remark.code == code)

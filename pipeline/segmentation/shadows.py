@@ -1,4 +1,4 @@
-"""Soft shadows on the backdrop at the coarse level, which are no subject."""
+"""Finds soft shadows on the backdrop at the coarse level, which do not belong to the subject."""
 
 import cv2
 import numpy as np

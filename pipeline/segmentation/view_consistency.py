@@ -1,14 +1,15 @@
-"""Do the cameras agree? Each silhouette is asked whether the others allow it (the idea of the visual hull, figure 1).
+"""Checks whether the silhouettes of all cameras agree (by the idea of the visual hull, figure 1).
 
-On a coarse grid of voxels every camera votes: a voxel that falls clearly outside its silhouette is empty. Two things
-can be wrong with a view. *Strange* area is mask where every voxel behind it is empty for at least two of the others: a
-chair that was moved, a person walking by. *Missing* area is where all other cameras keep voxels that this one alone
-rejects: hair or a coat in the colour of the backdrop. One bad view must not make the others look bad, hence the second
-vote before a voxel counts as empty. Voxels outside an image have no vote there, and may hold what a view shows.
+On a coarse grid of voxels every camera votes: a voxel that falls clearly outside its silhouette is empty. A view can be
+wrong in two ways. *Strange* area is mask where every voxel on the ray is empty for at least two of the others: a chair
+that was moved, a person walking by. *Missing* area is where all other cameras keep voxels that this one alone rejects:
+hair or a coat in the colour of the backdrop. One bad view must not make the others look bad, so that a voxel counts as
+empty only with two votes. Voxels outside an image have no vote there, and may be what a view shows.
 
-A hull keeps more than the subject, the more the fewer and the farther apart the cameras are: the hull of three others
-shows up to 11 % more than a true fourth mask. Missing area is therefore believed only where the view also *contradicts*
-the others: mask of theirs behind which it alone leaves nothing. True masks contradict nobody, however few they are.
+A hull contains more than the subject, the more so the fewer and the farther apart the cameras are: the hull of three
+others shows up to 11 % more than a true fourth mask. Missing area is therefore believed only if the view also
+*contradicts* the others: there is mask of theirs behind which it alone leaves no voxel. True masks contradict no other,
+however few they are.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -37,8 +38,8 @@ MAX_CONTRADICTED = 0.5  # ... which contradicts less than this share of what the
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Votes:
-    """Holds, for each camera and voxel, whether the camera sees the voxel and whether its silhouette leaves the voxel
-    empty."""
+    """Holds, for each camera and voxel, whether the camera sees the voxel and whether it lies outside its
+    silhouette."""
 
     pixels: Float[np.ndarray, "k n 2"]
     radius_px: Float[np.ndarray, " k"]  # of a voxel in each camera
@@ -54,8 +55,8 @@ def voxel_grid(centre: Float[np.ndarray, " 3"], edge: float, count: int) -> Floa
 
 
 def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRID) -> Votes:
-    """Projects the voxels of a coarse grid around the subject into every camera. Returns which voxels each silhouette
-    contains or excludes."""
+    """Projects the voxels of a coarse grid around the subject into every camera. Returns which of them each camera
+    sees, and which lie outside its silhouette."""
     centre, edge = hull_extent(silhouettes, rig)
     voxels = voxel_grid(centre, edge, count)
 
@@ -80,14 +81,14 @@ def judge_agreement(
     *,
     ready: Collection[str] = (),
 ) -> dict[str, Silhouette]:
-    """Compares each silhouette with those of the other cameras. Returns the same silhouettes with what disagrees added
-    to their quality.
+    """Compares each silhouette with those of the other cameras. Returns the same silhouettes with the disagreement
+    added to their quality.
 
     Args:
-        silhouettes: by camera; those that are not usable have no say.
+        silhouettes: by camera; those that are not usable are ignored.
         rig: the cameras as calibrated.
-        settings: which shares are warned of, and which make a view unusable.
-        ready: cameras whose mask is an operator's: they are warned of, and stay usable.
+        settings: the shares of area that give a warning, and those that make a view unusable.
+        ready: cameras whose mask was given by the operator; they get warnings, but stay usable.
     """
     trusted = [name for name in rig.names if silhouettes[name].quality.usable]
     if len(trusted) < MIN_CAMERAS:

@@ -1,8 +1,9 @@
-"""The paper's fit (sections 4.4 and 5.1): the downhill simplex, first on a coarse level, then on the working level.
+"""Runs the paper's fit (sections 4.4 and 5.1): the downhill simplex, first on a coarse level, then on the working
+level.
 
-Enters: the aligned model and the silhouettes. Leaves: coefficients, at full mesh resolution whoever evaluates them. The
-pose stays what the alignment said, as in the paper. The coarse answer is the start p_0 of the working level, and both
-levels begin with p_i = p_0 + mu_i e_i, mu_i = 3 sigma_i (three standard deviations, the unit of our coefficients).
+Enters: the aligned model and the silhouettes. Leaves: coefficients, which hold for the full mesh. The pose remains that
+of the alignment, as in the paper. The result of the coarse level is the start p_0 of the working level, and both levels
+begin with p_i = p_0 + mu_i e_i, mu_i = 3 sigma_i (three standard deviations, the unit of our coefficients).
 """
 
 from collections.abc import Mapping
@@ -29,7 +30,7 @@ LIMIT = 3500  # evaluations a level: 60 modes have converged or will not
 
 @dataclass(frozen=True, slots=True)
 class HierarchyLevel:
-    """Holds which decimation of the mesh a level uses, and the scale of its images."""
+    """Holds one level of the hierarchy: the decimation of its mesh, and the scale of its images."""
 
     mesh: str
     image_scale: float
@@ -51,11 +52,10 @@ def fit_simplex(
     speaking: Literal["face", "all"] = "face",
     weighted: bool = True,
 ) -> Fit:
-    """Finds the coefficients that minimise eq. (2), starting from the mean head. ``report("fit", fraction)`` may raise
-    Cancelled.
+    """Finds the coefficients that minimise the paper's eq. (2), starting from the mean head.
 
-    ``speaking`` and ``weighted`` are the objective's: which pixels count, and whether by eq. (5) or eq. (4). ``rig``
-    and ``silhouettes`` may differ: cameras without a silhouette stay out.
+    Cameras without a silhouette are left out. ``report("fit", fraction)`` may raise Cancelled. ``speaking`` says which
+    pixels count ("all", or those near the face), and ``weighted`` whether by eq. (5) or eq. (4).
     """
     rig = rig.subset(name for name in silhouettes if silhouettes[name].quality.usable)
     coefficients = np.zeros(min(settings.modes, len(model.modes)))

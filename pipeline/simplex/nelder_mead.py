@@ -1,8 +1,8 @@
-"""Downhill simplex (section 4.4): Nelder and Mead 1965, as Press et al., Numerical Recipes, section 10.4 describe it.
+"""Minimises a function without derivatives by the downhill simplex (section 4.4): Nelder and Mead 1965, as described by
+Press et al., Numerical Recipes, section 10.4. Nothing here knows of heads.
 
-Knows nothing of heads: a function of a vector, no derivatives. Where the paper is silent we follow Numerical Recipes:
-reflection 1, expansion 2, contraction 1/2, shrinking 1/2 towards the best point, and an end at a relative spread
-``2 |f_high - f_low| / (|f_high| + |f_low|)`` of the values.
+What the paper leaves open follows Numerical Recipes: reflection 1, expansion 2, contraction 1/2, shrinking 1/2 towards
+the best point; the search ends at a small relative spread ``2 |f_high - f_low| / (|f_high| + |f_low|)`` of the values.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,7 @@ SPREAD_TINY = 1e-30  # keeps the relative spread defined at a minimum of exactly
 
 @dataclass(frozen=True, slots=True)
 class Stats:
-    """Holds how many times the function was called, the least value found, and the relative spread of the values at the
-    end."""
+    """Holds how often the function was called, its smallest value, and the relative spread of the values at the end."""
 
     evaluations: int
     cost: float

@@ -1,17 +1,18 @@
-"""The paper's objective (eqs. 2 and 5): the boundary-weighted XOR of input and model silhouettes, over all cameras.
+"""Computes the paper's objective (eqs. 2 and 5): the boundary-weighted XOR of input and model silhouettes, over all
+cameras.
 
 Enters: coefficients. Leaves: one number, drawn and summed by the renderer; no image is read back.
 
-What may speak. Eq. (5) lets a mismatch far from the input contour hardly count. That answers what the model lacks
-*inside* the outline. It does not answer what the input has and the model cannot make: below the cut through the neck
-the input goes on into shoulders, and every pixel by which the open edge of the mesh creeps down them pays off, so that
-the head grows a neck; hair lowers the cost of an enlarged skull. So pixels have a say only where the outline of
-the aligned head nearest to them belongs to the face region (ear to ear, forehead to chin), and weight zero elsewhere.
-The division is made once per level from the head that the level starts with: within a level the cost is a fixed
-function of the coefficients, eq. (5) with some weights zero. ``speaking="all"`` is the paper's cost to the letter.
+Which pixels count: in eq. (5) a mismatch far from the input contour has hardly any weight. That covers what the model
+lacks *inside* the outline, but not what the input has and the model cannot make. Below the cut through the neck the
+input goes on into shoulders; every pixel by which the open edge of the mesh moves down would pay off, so that the head
+would grow a neck. Hair would make an enlarged skull cheaper. So a pixel counts only if the nearest part of the aligned
+head's outline belongs to the face region (ear to ear, forehead to chin); others have weight zero. This is determined
+once for each level, from the head at its start, so that within a level the cost is a fixed function of the
+coefficients: eq. (5) with some weights zero. ``speaking="all"`` is the paper's cost to the letter.
 
-The cut through the neck being mute, it is closed with a lid, so that back faces need not be drawn: of 19 ms an
-evaluation that saves 5. The lid adds a thousandth of the area where the cut is not flat, all of it at the cut.
+As the cut through the neck does not count, it is closed with a lid, so that back faces need not be drawn: that saves 5
+of 19 ms for each evaluation. The lid adds a thousandth of the area where the cut is not flat, all of it at the cut.
 """
 
 from collections.abc import Mapping
@@ -87,14 +88,14 @@ class SilhouetteObjective:
         return float(self._drawn.xor_costs(self.vertices_world(coefficients)).sum())
 
     def vertices_world(self, coefficients: Float[np.ndarray, " m"]) -> Float[np.ndarray, "v 3"]:
-        """Returns t(H(alpha)): the level's vertices in the world, mm."""
+        """Returns the level's vertices for these coefficients, in the world frame, mm: the paper's T(H(alpha))."""
         moved = (np.asarray(coefficients, np.float32) @ self._basis).reshape(-1, 3)
         return self._mean_world + moved @ self._turn.T
 
 
 def lidded(faces: Int[np.ndarray, "f 3"], face_region: Bool[np.ndarray, " v"]) -> Int[np.ndarray, "g 3"]:
-    """Returns the triangles with a fan over every hole, so that each edge belongs to two triangles. Returns them
-    unchanged if a hole reaches the face region, whose outline counts, or if two holes meet."""
+    """Closes every hole of a mesh with a fan of triangles, so that each edge belongs to two of them. Returns the
+    triangles unchanged if a hole reaches the face region, whose outline counts, or if two holes meet."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
     edges = {(a, b) for a, b in directed}
     rim = [(a, b) for a, b in edges if (b, a) not in edges]
@@ -116,9 +117,10 @@ def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.n
     """Returns the mask at another resolution: True where a pixel's centre lies inside the contour, as the renderer
     draws.
 
-    From the signed distance (px, negative inside), averaged over the pixel. The contour of a binary mask often runs
-    through a larger pixel's very centre; were all those ties to fall to one side, the contour would move by 0.15 px all
-    around (0.3 px where pixels of the mask are counted), so they fall as the squares of a chessboard.
+    It is computed from the signed distance (px, negative inside), averaged over the pixel. The contour of a binary mask
+    often runs exactly through a larger pixel's centre. If all these ties fell to one side, the contour would move by
+    0.15 px all around (0.3 px where pixels of the mask are counted); so they alternate like the squares of a
+    chessboard.
     """
     height, width = distance.shape
     smaller = cv2.resize(distance, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
@@ -129,11 +131,9 @@ def mask_at_scale(distance: Float[np.ndarray, "h w"], scale: float) -> Bool[np.n
 def face_pixels(
     outline_mask: Bool[np.ndarray, "h w"], pixels: Float[np.ndarray, "v 2"], face_region: Bool[np.ndarray, " v"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Tells for which pixels the nearest part of the model's outline belongs to the face region.
-
-    ``pixels`` are the model's vertices in this view; those near the edge of ``outline_mask`` decide which part of the
-    outline is face.
-    """
+    """Tells for which pixels the nearest part of the model's outline belongs to the face region. ``pixels`` are the
+    model's vertices in this view; those near the edge of ``outline_mask`` decide which part of the outline belongs to
+    the face."""
     height, width = outline_mask.shape
     with np.errstate(invalid="ignore"):
         nearest = np.round(pixels)

@@ -1,4 +1,4 @@
-"""Where the head is before its shape is known (section 4.2)."""
+"""Determines pose and scale of the head before its shape is known (section 4.2)."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -28,8 +28,8 @@ from rig.rig import Rig
 class Alignment:
     """Holds the pose of the mean head, the camera that the subject faces, and the method that found the pose.
 
-    ``landmarks``: those of the subject's face, if the pose came from them. ``rival``: how much more the best other pose
-    costs, as a share, if the pose came from silhouettes.
+    ``landmarks`` are those of the subject's face, if the pose came from them. ``rival`` says how much more the best
+    other pose costs, as a share of the cost (0.1 = 10 %), if the pose came from silhouettes.
     """
 
     world_from_head: Similarity
@@ -40,8 +40,8 @@ class Alignment:
 
 
 def front_camera(rig: Rig, settings: Settings) -> str:
-    """Returns the camera that the subject faces: the one in the settings, or else the middle one of the rig. Raises
-    EigenheadError."""
+    """Returns the name of the camera that the subject faces: the one in the settings, or else the middle one of the
+    rig. Raises EigenheadError if the settings name a camera that the rig does not have."""
     if settings.front is None:
         return rig.front_camera()
     if settings.front not in rig:
@@ -51,8 +51,8 @@ def front_camera(rig: Rig, settings: Settings) -> str:
 
 @stage("alignment")
 def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> Staged[Alignment]:
-    """Aligns the mean head to the capture's feature points or, without any, to the face in the photographs or, without
-    a face, to the silhouettes. Raises TooFewFeatures, WrongFeatures, NoSubject."""
+    """Aligns the mean head to the capture's feature points; without these, to the subject's face in the photographs;
+    and without a face, to the silhouettes. Raises TooFewFeatures, WrongFeatures, NoSubject."""
     model, rig, settings = model_basis(context.model, context.settings), context.rig, context.settings
     face = None if faces.subject is None else faces.subject.matched
     if views.capture.features and face is not None:
@@ -73,7 +73,8 @@ def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> St
 def align_to_views(
     model: HeadModel, views: Views, rig: Rig, settings: Settings, *, progress: Progress
 ) -> Staged[Alignment]:
-    """Aligns the mean head to the capture's feature points or, without any, to the silhouettes."""
+    """Aligns the mean head to the capture's feature points or, without any, to the silhouettes. Raises TooFewFeatures,
+    WrongFeatures, NoSubject."""
     front = front_camera(rig, settings)
     if not views.capture.features:
         stated = settings.front is not None

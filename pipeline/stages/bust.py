@@ -1,4 +1,4 @@
-"""All that the cameras see as one closed surface, in the photographs' colours."""
+"""Makes the bust: all that the cameras see as one closed surface, in the photographs' colours."""
 
 from dataclasses import dataclass
 
@@ -22,8 +22,9 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bust:
-    """Holds the closed surface of everything that the cameras see, with its colours (sRGB). ``views``: how many images
-    coloured each vertex; 0 if it was filled from its neighbours."""
+    """Holds the closed surface of everything that the cameras see, with its colours (sRGB). ``views`` is the number of
+    images that coloured each vertex; 0 if its colour was filled from its neighbours. ``spacing_mm`` is the grid's
+    spacing."""
 
     surface: BustSurface
     normals: Float[np.ndarray, "v 3"]
@@ -33,6 +34,7 @@ class Bust:
 
     @property
     def mesh_world(self) -> Mesh:
+        """Returns the surface as a mesh, world frame, mm."""
         return self.surface.mesh_world
 
 
@@ -40,10 +42,10 @@ class Bust:
 def fuse_depth(
     context: ReconstructionContext, views: Views, head_world: Mesh, depth: Depth
 ) -> Staged[DepthSurface | None]:
-    """Fuses the depth maps to one closed surface, with the fitted head where nobody looks.
+    """Fuses the depth maps to one closed surface; where no camera sees the subject, the fitted head is used.
 
-    Returns None if the settings ask for the head only, and None with the warning ``no-bust`` if the depth maps do not
-    determine a surface.
+    Returns None if the settings ask for the head only. Returns None with the warning ``no-bust`` if the depth maps do
+    not determine a surface.
     """
     settings = context.settings
     if settings.outputs.surface == "head":
@@ -67,7 +69,8 @@ def fuse_depth(
 def shape_bust(
     context: ReconstructionContext, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
 ) -> Staged[BustSurface | None]:
-    """Brings the fused surface into agreement with the delivered head, and untangles it."""
+    """Moves the fused surface to the delivered head where both show the same skin, and removes self-intersections.
+    Returns None for None."""
     if fused is None:
         return Staged(None)
     displaced = refined.displaced
@@ -79,7 +82,7 @@ def shape_bust(
 def colour_bust(
     context: ReconstructionContext, views: Views, surface: BustSurface | None, coloured: Capture
 ) -> Staged[Bust | None]:
-    """Colours the bust from the photographs of ``coloured``."""
+    """Colours the bust from the photographs of ``coloured``. Returns None without a surface."""
     if surface is None:
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, surface.mesh_world

@@ -1,4 +1,4 @@
-"""What every stage of one reconstruction may read."""
+"""Defines what every stage of one reconstruction may read."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -20,7 +20,7 @@ Segment = Callable[..., dict[str, Silhouette]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReconstructionContext:
-    """Holds one capture with all that decides its reconstruction, and the resources that the caller owns.
+    """Holds one capture with everything that decides its reconstruction, and the resources that the caller owns.
 
     Attributes:
         capture: the shot as it was read.
@@ -28,10 +28,10 @@ class ReconstructionContext:
         model: the head model with all its modes.
         settings: of this reconstruction.
         renderer: an OpenGL context of the calling thread.
-        progress: called with a stage's name and the share of it that is done; may raise Cancelled.
-        segment: finds the silhouettes of a capture; a caller that caches them passes its own.
-        networks: find faces; a caller of many jobs passes them on.
-        device: compares the photographs; None: the processor does.
+        progress: called with a stage's name and the share of it that is done; raises Cancelled to stop.
+        segment: computes the silhouettes of a capture; a caller that caches them passes its own function.
+        networks: neural networks that find faces; a caller of many jobs loads them once.
+        device: GPU that compares the photographs; None uses the processor.
     """
 
     capture: Capture
@@ -45,7 +45,7 @@ class ReconstructionContext:
     device: ComputeDevice | None = None
 
     def within_stage(self, name: str) -> "ReconstructionContext":
-        """Returns the context with all progress reported under ``name``, whatever stage name the called code
+        """Returns the context with all progress reported under the stage ``name``, whatever name the called code
         reports."""
         return replace(self, progress=partial(_report_as, self.progress, name))
 

@@ -1,4 +1,4 @@
-"""Depth in every view from the photographs, and what of it is the fitted head's surface."""
+"""Measures depth in every view from the photographs, and finds which part of it is the fitted head's surface."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ from pipeline.stereo.window_bias import WindowBias
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Depth:
-    """Holds the depth maps, the parts that their pixels show, the same surface as oriented points, and the bias of the
-    depth measured on the fitted face."""
+    """Holds the depth maps and what follows from them: which parts (skin, hair, clothes) the surface shows, the same
+    surface as points with normals, the points on the face, and the bias of the depth as measured on the fitted face."""
 
     maps: tuple[DepthMap, ...]  # none where no stage needs them
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]]  # as they were matched, without highlights
@@ -36,14 +36,14 @@ class Depth:
 
 
 def is_refined(head: HeadFit, settings: Settings) -> bool:
-    """Tells whether the head is to be deformed to the dense surface: the fit used the photographs and the settings ask
-    for fine detail."""
+    """Tells whether a later stage deforms the head to the measured surface: the fit used the photographs, and the
+    settings ask for the detail ``fine``."""
     return head.detail.level == "photo" and settings.detail in FINE_LEVELS
 
 
 @stage("depth")
 def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, labels: PartLabels) -> Staged[Depth]:
-    """Measures depth in every view, within bounds set by the fitted head, if a later stage needs it."""
+    """Measures depth in every view if a later stage needs it. The fitted head limits the depths to search."""
     settings, mesh = context.settings, head.mesh_world
     maps: tuple[DepthMap, ...] = ()
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]] = views.capture.images

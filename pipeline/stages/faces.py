@@ -1,4 +1,4 @@
-"""The subject's face in the photographs: where it is, how it is turned, 468 landmarks on it."""
+"""Finds the subject's face in the photographs: where it is, how it is turned, and 468 landmarks on it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,9 +12,9 @@ from rig.capture import Capture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Faces:
-    """Holds the subject's faces in the photographs; None if the settings do not ask for them.
+    """Holds the subject's faces in the photographs; ``subject`` is None if the settings do not ask for them.
 
-    ``eye_openings``: how far the lids of each eye stand apart (``faces.eyes``), if the views agree on the subject's
+    ``eye_openings`` says how far the lids of each eye stand apart (``faces.eyes``), if the views agree on the subject's
     face.
     """
 

@@ -1,6 +1,6 @@
-"""Section 4.4 by the solver that the settings name, and what photographs add to it.
+"""Fits the head to the outlines (section 4.4) by the solver that the settings name, and then to the photographs.
 
-Two stages, since what the pixels show is decided in between: ``fit_outlines``, and ``fit_head`` that goes on from it.
+These are two stages, ``fit_outlines`` and ``fit_head``, since the parts that pixels show are labelled in between.
 """
 
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ from rig.messages.message import compose
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlineFit:
-    """Holds a head fitted to the outlines alone. ``solution`` is the simplex's fit, or the state from which the contour
-    solver continues."""
+    """Holds a head fitted to the outlines alone. ``solution`` is the fit of the simplex method, or the state from which
+    the contour solver continues."""
 
     solution: ContourSolution | Fit
     model: HeadModel  # with the modes that the solution has
@@ -39,7 +39,7 @@ class OutlineFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadFit:
-    """Holds a fit with its posterior, the model whose modes it uses, and the level of detail that it reached."""
+    """Holds a fit with its covariance, the model whose modes it uses, and the level of detail that it reached."""
 
     fit: Fit
     model: HeadModel
@@ -52,14 +52,14 @@ class HeadFit:
 
 
 def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
-    """Returns the head of a fit, full level, world frame, mm."""
+    """Returns the head that a fit describes, on the full level, world frame, mm."""
     return Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), model.levels["full"].faces)
 
 
 @stage("fit")
 def fit_outlines(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[OutlineFit]:
-    """Fits shape and pose to the silhouettes with the contour solver; with the simplex method, then fits the shape
-    again at that pose."""
+    """Fits shape and pose to the silhouettes with the contour solver. If the settings name the simplex method, that
+    then fits the shape anew at the same pose."""
     settings, rig = context.settings, context.rig
     model, features = model_basis(context.model, settings), views.capture.features
     solved = solve_contour(

@@ -1,4 +1,4 @@
-"""What the pixels show: skin, hair or clothes."""
+"""Labels what the pixels show: skin, hair or clothes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,8 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLabels:
-    """Holds the part map of each camera; empty if no stage needs them."""
+    """Holds the part map of each camera, the probabilities of skin, hair and clothes at every pixel; empty if no stage
+    needs them."""
 
     maps: Mapping[str, PartMap]
 
@@ -33,8 +34,8 @@ class PartLabels:
 
 @stage("parts")
 def label_parts(context: ReconstructionContext, views: Views, model: HeadModel, head_world: Mesh) -> Staged[PartLabels]:
-    """Labels the pixels of every photograph as skin, hair or clothes, starting from a fitted head (world, mm) with the
-    vertices of ``model``."""
+    """Labels the pixels of every photograph as skin, hair or clothes, starting from a fitted head: ``head_world`` (mm),
+    whose vertices are those of ``model``."""
     settings = context.settings
     if settings.detail not in PHOTO_LEVELS and settings.outputs.surface == "head":
         return Staged(PartLabels({}))

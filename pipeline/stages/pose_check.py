@@ -1,4 +1,4 @@
-"""Whether the delivered head lies where the photographs show the face."""
+"""Checks whether the delivered head lies where the photographs show the face."""
 
 from pipeline.evidence.pose import PoseEvidence, judge_pose
 from pipeline.faces.landmark_map import landmark_map
@@ -14,7 +14,7 @@ from pipeline.stages.refined_head import RefinedHead
 def check_pose(
     context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
 ) -> Staged[PoseEvidence]:
-    """Compares the delivered head with the faces in the photographs, and the cost of its pose with that of the best
+    """Compares the head's landmarks with the faces in the photographs, and the cost of its pose with that of the best
     other pose."""
     evidence, warnings = judge_pose(
         refined.mesh_world,

@@ -1,4 +1,4 @@
-"""How stages are run: the one place that collects warnings and seconds and tells progress."""
+"""Runs stages: the one place that collects their warnings and seconds and reports progress."""
 
 import threading
 import time
@@ -38,11 +38,12 @@ class Stage(Generic[P, T]):
     function: StageFunction[P, T]
 
     def __call__(self, context: ReconstructionContext, /, *products: P.args, **options: P.kwargs) -> Staged[T]:
+        """Runs the stage on the products of earlier stages."""
         return self.function(context, *products, **options)
 
 
 def stage(name: str) -> Callable[[StageFunction[P, T]], Stage[P, T]]:
-    """Makes the decorated function a stage with the given name. The seconds of stages with the same name add up."""
+    """Decorates a function as a stage of the given name. The seconds of stages with the same name are added up."""
 
     def named(function: StageFunction[P, T]) -> Stage[P, T]:
         return Stage(name, function)
@@ -51,7 +52,8 @@ def stage(name: str) -> Callable[[StageFunction[P, T]], Stage[P, T]]:
 
 
 class Pending(Generic[T]):
-    """Holds what a stage that runs beside others makes; ``product`` may be read once their block has ended."""
+    """Holds the product of a stage that runs in another thread. ``product`` may be read once the block of
+    ``Recorder.beside`` has ended."""
 
     product: T
 
@@ -59,9 +61,9 @@ class Pending(Generic[T]):
 class Recorder:
     """Runs stages one after the other, or one beside others, and records their seconds and warnings.
 
-    ``progress`` is called when a stage begins, and by the stage as it advances; if it raises Cancelled, the stage does
-    too. A stage that runs beside others tells no progress, and its seconds are those that were waited for it: so all
-    seconds add up to the job's.
+    ``progress`` is called when a stage begins, and by the stage as it advances; a stage ends with Cancelled if it
+    raises that. A stage that runs beside others reports no progress, and only the time that was spent waiting for it is
+    counted: so all seconds add up to the job's.
     """
 
     def __init__(self, progress: Progress) -> None:
@@ -71,6 +73,7 @@ class Recorder:
         self._warnings: list[ReportWarning] = []
 
     def __call__(self, stage: Stage[P, T], context: ReconstructionContext, *products: P.args, **options: P.kwargs) -> T:
+        """Runs a stage, records its seconds and warnings, and returns its product."""
         self._progress(stage.name, 0.0)
         began = time.perf_counter()
         staged = _run(stage, context.within_stage(stage.name), *products, **options)
@@ -80,11 +83,11 @@ class Recorder:
     def beside(
         self, stage: Stage[P, T], context: ReconstructionContext, *products: P.args, **options: P.kwargs
     ) -> Iterator[Pending[T]]:
-        """Runs a stage in a thread of its own while the block runs others; waits for it at the block's end. It may use
-        nothing that belongs to the calling thread, as the renderer does. Where one thread is allowed it runs before
-        the block.
+        """Runs a stage in a thread of its own while the block runs others, and waits for it at the end of the block.
+        With a single thread allowed, the stage runs before the block.
 
-        If the block fails, the stage is stopped when it next tells its progress. Raises what the stage raises.
+        The stage may use nothing that belongs to the calling thread, such as the renderer. If the block fails, the
+        stage is stopped when it next reports progress. Raises what the stage raises.
         """
         pending, abandoned = Pending[T](), threading.Event()
 
@@ -117,6 +120,7 @@ class Recorder:
 
     @property
     def warnings(self) -> tuple[ReportWarning, ...]:
+        """Returns the warnings of all stages so far, in the order in which they ended."""
         return tuple(self._warnings)
 
     def seconds(self) -> dict[str, float]:

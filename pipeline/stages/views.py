@@ -1,4 +1,4 @@
-"""Background subtraction (section 5.4), and which views take part."""
+"""Finds the silhouettes (section 5.4), and decides which views take part."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,9 +14,10 @@ from rig.capture import Capture
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
     """Holds the capture with every picture under the right camera, and its silhouettes; views that take no part are
-    marked unusable.
+    marked as not usable.
 
-    ``assignment``: for each camera that had another's picture, the name under which its own was filed.
+    ``assignment`` has an entry for each camera under whose name another's picture was filed: the name under which its
+    own was found.
     """
 
     capture: Capture

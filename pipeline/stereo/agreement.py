@@ -1,4 +1,4 @@
-"""What the views say together: a place counts where another view has it too."""
+"""Keeps of the depth maps what other views confirm: a surface point counts only where another view has it too."""
 
 from collections.abc import Sequence
 
@@ -30,8 +30,8 @@ PIXEL_SHARE = 0.56  # of a pixel's square on the surface, brought onto the ray, 
 def depth_maps(
     crops: Sequence[Crop], stack: Stack, fields: Sequence[Field], settings: DenseSettings
 ) -> tuple[DepthMap, ...]:
-    """Compares the full-size fields of all views with each other. Returns a depth map for each view that keeps only
-    places that other views confirm."""
+    """Compares the full-size fields of all views with each other. Returns a depth map for each view with only those
+    pixels whose surface point other views confirm."""
     matched = np.concatenate([(1.0 / np.sqrt(field.information + 1e-6)).ravel() for field in fields])
     depth = np.concatenate([field.depth.ravel() for field in fields])
     slopes = np.concatenate([field.slopes.reshape(-1, 2) for field in fields])
@@ -60,8 +60,10 @@ def stated_deviation(
     """Returns the standard deviation (mm) of the depth at each pixel, along the ray.
 
     Args:
-        agreeing: how many other views have the surface at the same place.
-        apart: mean square distance to their surfaces, mm^2.
+        camera: of the view.
+        field: depths of the view.
+        agreeing: how many other views have the surface at the same point.
+        apart: mean squared distance to their surfaces, mm^2.
     """
     k = camera.intrinsics
     pixel_mm = np.maximum(field.depth, 1.0) / k.fx
@@ -91,8 +93,8 @@ def _depth_map(
 
 
 def normals_world(camera: Camera, field: Field) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the unit normal (world frame, towards the camera) of the surface at each pixel, from the field's depth
-    and slopes."""
+    """Returns the unit normal (world frame, towards the camera) of the surface at each pixel, from the depths and
+    slopes of the field."""
     k = camera.intrinsics
     column, row = np.meshgrid(np.arange(k.width, dtype=np.float32), np.arange(k.height, dtype=np.float32))
     x, y = (column - k.cx) / k.fx, (row - k.cy) / k.fy

@@ -1,4 +1,4 @@
-"""Compiled loops of the agreement between views: does the surface that one sees lie where the others have it?"""
+"""Compiled loop that checks whether the surface of one view lies where the other views have it."""
 
 import numpy as np
 
@@ -11,14 +11,15 @@ FAR_TOLERANCES = 20.0  # along a ray: at the steepest slope the planes are then 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def count_agreeing(start, ways, lenses, deviation, depth, slopes, limits, agreeing, before, apart):
-    """Fills, for every pixel of one view, how many others have the surface at the same place (``agreeing``), how many
-    see past it (``before``: the place lies in their free space), and the mean square distance between the views that
-    agree (``apart``, mm^2).
+    """Fills, for every pixel (h, w) of one view: how many other views have the surface at the same point
+    (``agreeing``), how many see through it (``before``: the point lies in front of their surface), and the mean squared
+    distance to those that agree (``apart``, mm^2).
 
-    Two views agree where the distance from the other's plane is below ``tolerance_mm``, or below ``deviations`` of
-    their joint standard deviation, half a ``tolerance_mm`` at least. A view in which something nearer stands before the
-    place says nothing. ``depth``, ``slopes`` and ``deviation`` are those of all views in one row, ``ways`` as
-    ``Stack.homographies`` has them, ``lenses`` fx and fy of the others, ``limits`` ``tolerance_mm`` and ``deviations``.
+    Two views agree if the distance from the other's plane is below ``tolerance_mm``, and below ``deviations`` standard
+    deviations of both (or half of ``tolerance_mm``, if that is more). A view in which something nearer hides the point
+    does not count. ``limits`` are ``tolerance_mm`` and ``deviations``. ``depth``, ``slopes`` and ``deviation`` hold all
+    views one after the other, this view from ``start`` on; ``ways`` are rows of ``Stack.homographies``, ``lenses`` fx
+    and fy of the others.
     """
     tolerance_mm, deviations = limits
     far_mm = FAR_TOLERANCES * tolerance_mm

@@ -1,4 +1,4 @@
-"""The compiled loop of ``crops``: where a photograph with its lens shows the pixels of a pinhole."""
+"""Compiled loop of ``crops``: which point of a photograph each pixel of a pinhole camera shows."""
 
 import numpy as np
 
@@ -10,8 +10,9 @@ BESIDE_PX = -1e4  # a place that is in no photograph
 
 @njit(cache=True, nogil=True)
 def fill_lens_map(crop: np.ndarray, lens: np.ndarray, columns: np.ndarray, rows: np.ndarray) -> None:
-    """Fills column and row in the photograph of each pixel (h, w) of a pinhole with fx fy cx cy ``crop`` at the same
-    pose; ``lens`` as ``packed_lens`` has it."""
+    """Fills ``columns`` and ``rows`` (h, w) with the point (px) of the photograph that each pixel of a pinhole camera
+    at the same pose shows; ``BESIDE_PX`` if there is none. ``crop`` is fx, fy, cx, cy of the pinhole; ``lens`` that of
+    the photograph (``packed_lens``)."""
     height, width = columns.shape
     for row in range(height):
         for column in range(width):

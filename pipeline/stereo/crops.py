@@ -1,7 +1,8 @@
-"""The photographs as the dense stage reads them: pinhole crops about the subject, grey, at several sizes.
+"""Prepares the photographs for dense matching: grey pinhole crops around the subject, at several sizes.
 
-A crop keeps its camera's pose and name. Without lens distortion a plane's way from one view to another is a homography,
-which a small window may take as affine; so the lens costs one resampling a photograph, not one a comparison.
+A crop keeps its camera's pose and name, but has no lens distortion. A plane then maps from one view to another by a
+homography, which is nearly affine over a small window. The lens thus costs one resampling of each photograph instead of
+one for each comparison.
 """
 
 from collections.abc import Mapping
@@ -38,7 +39,8 @@ class Level:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crop:
-    """Holds one camera's picture of the subject; each of its ``levels`` has half the size of the one before."""
+    """Holds one camera's picture of the subject, cropped and undistorted; each of its ``levels`` has half the size of
+    the one before."""
 
     levels: tuple[Level, ...]
     colour: UInt8[np.ndarray, "h w 3"]
@@ -46,6 +48,7 @@ class Crop:
 
     @property
     def camera(self) -> Camera:
+        """Returns the pinhole camera of the crop at full size."""
         return self.levels[0].camera
 
 
@@ -60,8 +63,11 @@ def make_crops(
     """Returns the crops of all cameras that have a photograph and a usable silhouette that is not empty.
 
     Args:
-        pixel_mm: a photograph with smaller pixels than this (mm, at ``at_world``) is reduced to it.
-        at_world: about the middle of the subject.
+        images: RGB photographs, by camera name.
+        silhouettes: by camera name.
+        rig: the cameras.
+        pixel_mm: a photograph whose pixels are smaller than this (mm, at ``at_world``) is reduced to it.
+        at_world: about the middle of the subject, mm.
     """
     found = []
     for camera in rig:
@@ -105,10 +111,12 @@ def _crop(
 
 
 def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
-    """Returns a pinhole camera at the camera's pose whose image just holds the subject. Width and height are multiples
-    of 2^(``LEVELS`` - 1), so that they can be halved.
+    """Returns a pinhole camera at the pose of ``camera`` whose image just contains the subject, in pixels ``scale``
+    times as many for each of the camera's. Width and height are multiples of 2^(``LEVELS`` - 1), so that they can be
+    halved.
 
-    Where the photograph cuts the subject off, the crop extends ``MARGIN_PX`` beyond it; pixels there are unseen.
+    Where the photograph cuts the subject off, the crop extends ``MARGIN_PX`` beyond the photograph; pixels there are
+    marked as unseen.
     """
     row, column = np.flatnonzero(silhouette.mask.any(axis=1)), np.flatnonzero(silhouette.mask.any(axis=0))
     k = camera.intrinsics
@@ -129,7 +137,8 @@ def crop_camera(camera: Camera, silhouette: Silhouette, scale: float) -> Camera:
 
 
 def lens_map(camera: Camera, pinhole: Camera) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Returns the column and row at which the camera's photograph shows each pixel of a pinhole at the same pose."""
+    """Returns the column and the row (px) in the camera's photograph that each pixel of ``pinhole`` shows. Both cameras
+    have the same pose."""
     k = pinhole.intrinsics
     x, y = np.empty((k.height, k.width), np.float32), np.empty((k.height, k.width), np.float32)
     fill_lens_map(k.values()[:4], packed_lens(camera), x, y)

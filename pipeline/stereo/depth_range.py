@@ -1,8 +1,9 @@
-"""Where along each ray the subject can be: behind the visual hull's front, before the fitted head or the hull's back.
+"""Finds where along each ray the subject can be: behind the visual hull's front, and before the fitted head or the
+hull's back.
 
-Hair lies between the skull and the hull, clothes inside the hull, and skin within a few mm of the fitted head; so that
-little is searched. The room is found at the least size; its two bounds are smooth surfaces, whose slopes the search
-takes for those of everything between.
+Hair lies between skull and hull, clothes lie inside the hull, and skin lies within a few mm of the fitted head, so that
+only a short range of depths has to be searched. The range is found at the smallest size. Both of its bounds are smooth
+surfaces; the search interpolates their slopes for the depths between.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.raster import depth_map
 from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import MAX_UNSEEN_PX, Crop
-from pipeline.stereo.depth_range_kernels import find_room
+from pipeline.stereo.depth_range_kernels import find_depth_range
 from pipeline.stereo.stack import Stack
 from rig.mesh import Mesh
 
@@ -32,8 +33,8 @@ STEEPEST = 3.0  # slope against the image plane: 72 degrees
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthRange:
-    """Holds the nearest and farthest depth (mm) that the search tries at each pixel of a view, 0 where it tries none,
-    and the slopes of both bounds by x and y (mm per pixel)."""
+    """Holds the range of depths to search in one view: at each pixel the smallest and the largest depth (mm), 0 where
+    nothing is searched, and the slopes of both bounds by x and y (mm per pixel)."""
 
     near: Float32[np.ndarray, "h w"]
     far: Float32[np.ndarray, "h w"]
@@ -51,9 +52,12 @@ def find_depth_ranges(
     """Finds the range of depths to search in every view, at the size of ``stack``.
 
     Args:
-        least: the crops at their least size, where the range is first found.
+        crops: of the views.
+        least: the crops at their smallest size, where the range is first found.
+        stack: the crops at the size of the search.
         head_world: the fitted head, world frame, mm; without it the range ends ``reach_mm`` behind the hull's front.
-        extent: middle (world) and edge (mm) of a cube that holds the subject.
+        extent: middle (world) and edge length (mm) of a cube that contains the subject.
+        settings: lengths.
     """
 
     def work(view: int) -> DepthRange:
@@ -79,7 +83,7 @@ def _bounds(
     width, height = least.size[view]
     others = np.delete(np.arange(len(least)), view)
     near, far = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
-    find_room(
+    find_depth_range(
         int(least.offset[view]), least.homographies(view, others), least.distance_px, SLACK_PX, max(middle - half, 1.0),
         middle + half, step, near, far,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Compiled loops of the depth range: how far along each ray the silhouettes leave room for the subject."""
+"""Compiled loop that finds the range of depths along each ray that the silhouettes leave to the subject."""
 
 from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import NEAREST_MM, placed
@@ -15,11 +15,13 @@ def _distance_at(distance_px, way, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_room(start, ways, distance_px, slack_px, low, high, step, near, far):
-    """Fills ``near`` and ``far`` (mm of depth, for the view's pixels; 0 where no room is).
+def find_depth_range(start, ways, distance_px, slack_px, low, high, step, near, far):
+    """Fills ``near`` and ``far`` (h, w; mm of depth, 0 for none) for the pixels of one view: the first and the last
+    depth at which the point of the ray is inside the visual hull. Depths between may be outside.
 
-    A place is inside where no view that sees it shows it beside the subject by more than ``slack_px``, and at least one
-    other sees it. The range goes from the first such place to the last: what lies between may be empty.
+    Depths from ``low`` to ``high`` are tried at every ``step`` (mm). A point is inside if no view that sees it shows it
+    outside the silhouette by more than ``slack_px``, and at least one other view sees it. ``distance_px`` holds the
+    signed distances of all views, this view's from ``start`` on; ``ways`` are rows of ``Stack.homographies``.
     """
     height, width = near.shape
     for row in range(height):

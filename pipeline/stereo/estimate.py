@@ -1,14 +1,14 @@
-"""Depth, normal and deviation in every view, from the photographs.
+"""Measures depth, normal and standard deviation in every view, from the photographs.
 
-Enters: photographs, silhouettes, the rig and the head fitted so far. Leaves: a ``DepthMap`` a usable view. Every view
-is matched with its neighbours by windows that lie on slanted planes (Bleyer, Rhemann and Rother, *PatchMatch stereo*,
-2011, https://doi.org/10.5244/C.25.14, have planes and their propagation), coarse to fine. Unlike there nothing is drawn
-at random: silhouettes and head bound the search (``room``), an even sweep with paths of least cost finds the place
-(``search``), and from there least squares slides windows to a fraction of a pixel and says what it knows
-(``refinement``; Goesele et al., *Multi-view stereo for community photo collections*, 2007,
-https://doi.org/10.1109/ICCV.2007.4408933). What no other view confirms is not told (``agreement``).
+Enters: photographs, silhouettes, the rig and the head fitted so far. Leaves: a ``DepthMap`` for each usable view. Every
+view is matched with its neighbours by windows that lie on slanted planes (Bleyer, Rhemann and Rother, *PatchMatch
+stereo*, 2011, https://doi.org/10.5244/C.25.14, have planes and their propagation), from coarse to fine. Unlike there,
+nothing is random: silhouettes and head bound the search (``depth_range``), depths at even steps joined by paths of
+least cost give the first estimate (``search``), and from there least squares moves the windows to a fraction of a pixel
+and computes their information (``refinement``; Goesele et al., *Multi-view stereo for community photo collections*,
+2007, https://doi.org/10.1109/ICCV.2007.4408933). What no other view confirms is discarded (``agreement``).
 
-The result depends on nothing but what enters: views are refined each for itself, and compared when all are done.
+The result does not depend on the order of work: each view is refined by itself, and all are compared at the end.
 """
 
 from collections.abc import Mapping
@@ -59,14 +59,16 @@ def estimate_depth(
 
     Args:
         images: RGB, by camera name.
-        silhouettes: by camera name; a view whose silhouette is not usable takes no part.
-        head_world: the head fitted so far (world, mm), which bounds the search from behind; None where there is none.
-        report: called with ``"dense"`` and the share that is done; may raise to stop.
-        device: compares the windows; None: compiled loops do.
+        silhouettes: by camera name; a view whose silhouette is not usable is left out.
+        rig: the cameras.
+        head_world: the head fitted so far (world, mm), which limits the depths to search; None if there is none.
+        settings: of the dense stage.
+        report: called with ``"dense"`` and the share that is done; an exception that it raises stops the work.
+        device: GPU that compares the windows; None uses compiled loops.
 
     Returns:
         One depth map for each view that takes part, in the order of the rig. With fewer than two views no depth is
-        known.
+            known.
     """
     extent = hull_extent(silhouettes, rig)
     report("dense", 0.0)

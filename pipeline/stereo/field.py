@@ -1,4 +1,4 @@
-"""The surface as one view has it so far: a plane a pixel, and how much is known of its depth."""
+"""Holds a view's current estimate of the surface: a plane at each pixel, and how much is known of its depth."""
 
 from dataclasses import dataclass
 
@@ -8,8 +8,8 @@ from jaxtyping import Float32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Field:
-    """Holds one view's current estimate of the surface: at each pixel the depth (mm of camera z, 0 where there is no
-    surface) and the slopes (mm per pixel, by x and y)."""
+    """Holds one view's current estimate of the surface: at each pixel the depth (mm along the camera's z axis, 0 where
+    there is no surface) and its slopes (mm per pixel, by x and y)."""
 
     depth: Float32[np.ndarray, "h w"]
     slopes: Float32[np.ndarray, "h w 2"]

@@ -1,4 +1,4 @@
-"""Compiled loops over depth and slopes as images: doubling their size, and planes through neighbourhoods."""
+"""Compiled loops over images of depth and slopes: doubling their size, and planes fitted around each pixel."""
 
 import numpy as np
 
@@ -7,8 +7,9 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def double(depth, slopes, live, depth_out, slopes_out):
-    """The planes of (h, w) pixels at twice the size, where ``live``; a pixel whose own parent is empty takes the plane
-    of the nearest of the parents about it."""
+    """Fills ``depth_out`` (2 h, 2 w) and ``slopes_out`` with the planes of (h, w) pixels at twice the size, at the
+    ``live`` pixels (2 h, 2 w), and 0 elsewhere. A pixel whose own parent is empty continues the plane of the nearest
+    parent around it."""
     height, width = depth.shape
     for row in range(2 * height):
         for column in range(2 * width):
@@ -33,9 +34,13 @@ def double(depth, slopes, live, depth_out, slopes_out):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def fit_planes(depth, slopes, information, radius, tolerance_mm, steepest, depth_out, slopes_out, relief_mm):
-    """A plane through the depths about every pixel, weighted by their ``information`` and by how well they agree with
-    the plane that the pixel has (half at ``tolerance_mm``): not across an edge. ``steepest`` slope, mm a pixel;
-    ``relief_mm``: by how much the depths deviate from the plane (RMS)."""
+    """Fits a plane to the depths (mm) around every pixel, within ``radius`` pixels. Depths are weighted by their
+    ``information`` (mm^-2), and by how well they agree with the current plane of the pixel (half at ``tolerance_mm``),
+    so that the fit does not reach across an edge.
+
+    Fills ``depth_out`` (moved to the plane as far as noise explains the offset), ``slopes_out`` (mm per pixel, at most
+    ``steepest``), and ``relief_mm``, the RMS deviation of the depths from the plane. Empty pixels stay empty.
+    """
     height, width = depth.shape
     falloff = 1.0 / (tolerance_mm * tolerance_mm)
     near = 1.0 / (radius * radius)

@@ -1,7 +1,7 @@
-"""Windows of the views compared with each other, at one size of the photographs: by compiled loops, or on a GPU.
+"""Compares windows of the views with each other, at one size of the photographs: by compiled loops, or on a GPU.
 
-Both do the same; the loops are the reference. In the shaders all arithmetic is of single precision, and their order of
-operations is the driver's: depths differ by hundredths of a millimetre.
+Both compute the same; the loops are the reference. The shaders' arithmetic is in single precision, and the driver
+decides the order of operations, so that depths differ by hundredths of a millimetre.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,8 @@ GROUP = 8  # invocations across and down of one group, as in shaders/matching.gl
 
 
 class Planes(NamedTuple):
-    """The plane that each pixel of a view has, and what is known of it; the arrays change in place."""
+    """Holds the plane that each pixel of a view currently has, and the plane's matching cost. The arrays are changed in
+    place."""
 
     depth: Float32[np.ndarray, "h w"]  # mm; 0 where there is none
     slopes: Float32[np.ndarray, "h w 2"]  # by x and y, mm a pixel
@@ -35,38 +36,41 @@ class Planes(NamedTuple):
 
 @runtime_checkable  # the tests check types of calls
 class Matcher(Protocol):
-    """Compares windows of one view, on planes, with its neighbours."""
+    """Describes an object that compares windows of one view with its neighbours, on the assumption that each window
+    lies on a plane."""
 
     def sweep(
         self, room: DepthRange, strides: Int32[np.ndarray, "h w"], labels: int
     ) -> Float32[np.ndarray, "h w labels"]:
-        """Returns the cost of each place through the range of each pixel; ``strides``: one label in so many is matched,
-        those between are interpolated."""
+        """Returns the matching cost at ``labels`` depths, evenly spaced through the range of each pixel.
+
+        At a pixel with ``strides`` of n only every n-th depth is matched; the costs between are interpolated.
+        """
         ...
 
     def propagate(self, planes: Planes, parity: int, steps_px: Sequence[int], same_mm: float) -> None:
-        """Lets pixels of one colour of the chequerboard take over their neighbours' planes where those cost less, as
-        ``refine_kernels.propagate`` says; changes ``planes``."""
+        """Lets pixels take over the planes of neighbours where these cost less, for the pixels of one colour of a
+        chequerboard (``parity`` 0 or 1). Changes ``planes`` in place; ``refine_kernels.propagate`` says how."""
         ...
 
     def slide(
         self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
     ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-        """Returns where a step of least squares puts each depth (mm, at most ``most_px`` away), the information
-        (1 / mm^2) and the likeness."""
+        """Moves each plane along its ray by a step of least squares, at most ``most_px`` pixels in the neighbours'
+        images. Returns the new depths (mm), their information (mm^-2), and how alike the windows are (0 to 1)."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matching:
-    """Holds the views at one size and what their windows are compared by.
+    """Holds all views at one size, and how their windows are compared.
 
     Attributes:
         stack: the views.
-        neighbours: of each view, those that it is compared with.
-        pattern: samples of a window, across and down from its middle, px.
-        contrast_levels: difference in grey levels at which a sample counts half.
-        device: what compares; None: compiled loops.
+        neighbours: for each view, the views that it is compared with.
+        pattern: offsets of a window's samples from its middle, across and down, px.
+        contrast_levels: a sample whose grey value differs by this from the middle's counts half.
+        device: GPU that compares; None uses compiled loops.
         uploaded: the stack's pixels and distances on the device.
     """
 
@@ -78,7 +82,7 @@ class Matching:
     uploaded: tuple[DeviceArray, ...] = ()
 
     def matcher(self, view: int) -> Matcher:
-        """Returns what compares one view; for one thread."""
+        """Returns a matcher for one view. It may be used by one thread at a time."""
         if self.device is None:
             others = self.neighbours[view]
             return LoopMatcher(self.stack.match_arguments(view, others, self.pattern, self.contrast_levels))
@@ -93,8 +97,8 @@ def matching_on(
     pattern: Float32[np.ndarray, "2 s"],
     contrast_levels: float,
 ) -> Iterator[Matching]:
-    """Yields the matching of a stack, whose pixels lie on the device until the end. A stack that is too large for the
-    device is matched by compiled loops."""
+    """Yields the matching of a stack whose pixels are on the device until the block ends. Without a device, or if the
+    stack is too large for it, compiled loops do the matching."""
     if device is None or stack.pairs.nbytes > device.largest_array:
         yield Matching(stack, neighbours, pattern, contrast_levels)
         return
@@ -103,7 +107,7 @@ def matching_on(
 
 
 class LoopMatcher:
-    """Compares windows by compiled loops."""
+    """Compares the windows of one view by compiled loops."""
 
     def __init__(self, sight: Sight) -> None:
         self._sight, self._scratch = sight, make_scratch(sight)
@@ -111,11 +115,13 @@ class LoopMatcher:
     def sweep(
         self, room: DepthRange, strides: Int32[np.ndarray, "h w"], labels: int
     ) -> Float32[np.ndarray, "h w labels"]:
+        """Returns the matching cost at ``labels`` depths through the range of each pixel, as ``Matcher.sweep``."""
         cost = np.empty((*room.near.shape, labels), np.float32)
         sweep_view(self._sight, self._scratch, room.near, room.far, room.slopes, strides, cost)
         return cost
 
     def propagate(self, planes: Planes, parity: int, steps_px: Sequence[int], same_mm: float) -> None:
+        """Lets pixels take over cheaper planes of their neighbours, as ``Matcher.propagate``."""
         steps = np.array(steps_px)
         propagate(
             self._sight, self._scratch, parity, steps, same_mm, planes.fresh, planes.depth, planes.slopes, planes.cost
@@ -124,13 +130,14 @@ class LoopMatcher:
     def slide(
         self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
     ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+        """Moves planes by a step of least squares, as ``Matcher.slide``."""
         place_mm, information, likeness = np.empty_like(depth), np.empty_like(depth), np.empty_like(depth)
         slide(self._sight, self._scratch, most_px, depth, slopes, place_mm, information, likeness)
         return place_mm, information, likeness
 
 
 class ShaderMatcher:
-    """Compares windows by compute shaders."""
+    """Compares the windows of one view by compute shaders on a GPU."""
 
     def __init__(self, matching: Matching, view: int, device: ComputeDevice) -> None:
         stack, others = matching.stack, matching.neighbours[view]
@@ -153,11 +160,13 @@ class ShaderMatcher:
     def sweep(
         self, room: DepthRange, strides: Int32[np.ndarray, "h w"], labels: int
     ) -> Float32[np.ndarray, "h w labels"]:
+        """Returns the matching cost at ``labels`` depths through the range of each pixel, as ``Matcher.sweep``."""
         cost = np.empty((*room.near.shape, labels), np.float32)
         self._run("sweep.comp", [room.near, room.far, room.slopes, strides, cost], [4], labels=labels)
         return cost
 
     def propagate(self, planes: Planes, parity: int, steps_px: Sequence[int], same_mm: float) -> None:
+        """Lets pixels take over cheaper planes of their neighbours, as ``Matcher.propagate``."""
         flags, steps = planes.fresh.astype(np.uint32), np.array(steps_px, np.int32)
         self._run(
             "propagate.comp", [flags, planes.depth, planes.slopes, planes.cost, steps], [0, 1, 2, 3],
@@ -168,6 +177,7 @@ class ShaderMatcher:
     def slide(
         self, most_px: float, depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"]
     ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+        """Moves planes by a step of least squares, as ``Matcher.slide``."""
         results = np.empty((*depth.shape, 4), np.float32)
         self._run("slide.comp", [depth, slopes, results], [2], most_px=most_px)
         return results[:, :, 0].copy(), results[:, :, 1].copy(), results[:, :, 2].copy()
@@ -187,8 +197,9 @@ class ShaderMatcher:
 
 
 def packed_ways(stack: Stack, view: int, others: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m 16"]:
-    """Returns the ways from a view to others as the struct Way of shaders/matching.glsl has them; the last three
-    numbers of a row are integers. At least one row: no buffer may be empty."""
+    """Returns the maps from a view's pixels to other views, one row each, in the memory layout of the struct Way of
+    shaders/matching.glsl; the last three numbers of a row are integers. There is at least one row, since no GPU buffer
+    may be empty."""
     ways = stack.homographies(view, others)
     packed = np.zeros((max(len(ways), 1), 16), np.float32)
     packed[: len(ways), :12], packed[: len(ways), 12] = ways[:, :12], ways[:, 15]

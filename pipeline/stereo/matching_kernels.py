@@ -1,10 +1,11 @@
-"""Compiled matching of one window between two views: the window lies on a plane, which the other view sees slanted.
+"""Compiled matching of one window between two views. The window lies on a plane, which the other view sees slanted.
 
-Scores are zero-mean normalised cross-correlations, so that gain and offset of a camera drop out. The noise of both
-views stands in the norms: a window without texture is like nothing, however alike its noise may look.
+Scores are zero-mean normalised cross-correlations, so that gain and offset of a camera have no effect. The noise of
+both views is part of the norms, so that a window without texture correlates with nothing, even if its noise happens to.
 
-A view that is compared with is a row of 16 numbers (``Stack.homographies``): how a point there comes about, and where
-its pixels lie. Few and small arguments: a call that hands over twenty arrays takes longer than a window.
+A view to compare with, a *way*, is a row of 16 numbers (``Stack.homographies``): how a pixel and its depth map to that
+view, and where its pixels are stored. Arguments are few and small, since handing over twenty arrays takes longer than a
+window. A *shade* is the unit in which ``Stack`` stores grey values.
 """
 
 from typing import NamedTuple
@@ -27,7 +28,7 @@ HIGH = np.uint32(16)
 
 
 class Sight(NamedTuple):
-    """A view that is matched, and all that it is matched with."""
+    """Holds a view that is matched, and everything it is matched with."""
 
     start: int  # of its first pixel
     noise: float  # shades
@@ -39,7 +40,7 @@ class Sight(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Where one view's loops keep what they look at, for they make no arrays."""
+    """Holds arrays that the loops of one view reuse, so that they need not create any."""
 
     window: np.ndarray  # zero-mean shades, weights
     scores: np.ndarray  # of the views that it is compared with
@@ -48,13 +49,13 @@ class Scratch(NamedTuple):
 
 
 def make_scratch(sight: Sight) -> Scratch:
-    """For a sight, and for one thread."""
+    """Returns the arrays that a sight's loops reuse. They may be used by one thread at a time."""
     count, samples = len(sight.ways), sight.pattern.shape[1]
     return Scratch(np.empty((2, samples), np.float32), np.empty(count), np.empty(8), np.empty((count, 3)))
 
 
 class Loaded(NamedTuple):
-    """The window about one pixel, by ``load_window``."""
+    """Holds the window around one pixel, as ``load_window`` made it."""
 
     column: int
     row: int
@@ -65,7 +66,7 @@ class Loaded(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy", allocates=False)
 def farthest(pattern):
-    """The farthest that a sample lies from a window's middle, across or down, px."""
+    """Returns the largest distance of a sample of ``pattern`` (2, s) from the window's middle, across or down, px."""
     reach = np.float32(0.0)
     for i in range(pattern.shape[1]):
         reach = max(reach, abs(pattern[0, i]), abs(pattern[1, i]))
@@ -74,11 +75,12 @@ def farthest(pattern):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def load_window(sight, width, height, column, row, window):
-    """Fills ``window`` (zero-mean shades, weights) with the samples that the pattern has about a pixel;
-    returns the sums of the weights and of the weighted squares.
+    """Fills ``window`` (2, s) with the grey values (zero mean) and weights of the samples around a pixel. Returns the
+    sum of the weights, and the weighted sum of squares.
 
-    Pixels beside the subject weigh nothing, those of another brightness little: half at the sight's ``contrast``.
-    So a window at an outline or a crease holds one surface.
+    Pixels outside the subject have no weight, and those of another brightness little (half at the sight's
+    ``contrast``), so that a window at an outline or a crease holds one surface. ``width`` and ``height`` are those of
+    the view's image.
     """
     pairs, pattern, start = sight.pairs, sight.pattern, sight.start
     centre = np.float32(np.int32(pairs[start + row * width + column] & LOW))
@@ -108,9 +110,12 @@ def load_window(sight, width, height, column, row, window):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def place_window(way, z, z_x, z_y, column, row, reach, place):
-    """Where another view sees a window on the plane of depth ``z`` (mm) at the pixel and slopes ``z_x``, ``z_y`` (mm a
-    pixel). Fills ``place``: pixel x, y; their derivatives by the pixel here, x_x, x_y, y_x, y_y; by the depth, x_z, y_z
-    (px / mm). False where the view does not see all of it."""
+    """Computes where another view sees a window that lies on a plane: of depth ``z`` (mm) at the pixel (column, row)
+    and slopes ``z_x``, ``z_y`` (mm per pixel). Returns False if that view does not see all of it.
+
+    Fills ``place`` (8): the pixel x, y there; its derivatives by the pixel here, x_x, x_y, y_x, y_y; and by the depth,
+    x_z, y_z (px per mm). ``reach`` is the result of ``farthest``.
+    """
     ray0, ray1, ray2 = turned(way, column, row, 1.0)
     depth = z * ray2 + way[11]
     if depth < NEAREST_MM:
@@ -132,13 +137,14 @@ def place_window(way, z, z_x, z_y, column, row, reach, place):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def distance_there(way, place, distance_px):
-    """Signed distance to the other view's outline at the window's middle."""
+    """Returns the signed distance (px) to the other view's outline at the window's middle."""
     return distance_px[int(way[START]) + int(place[1] + 0.5) * int(way[WIDTH]) + int(place[0] + 0.5)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def correlate(way, place, sight, loaded):
-    """Correlation of the loaded window with another view at ``place``."""
+    """Returns the normalised cross-correlation of the loaded window with another view at ``place``, as ``place_window``
+    filled it."""
     pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
     window, total, energy = loaded.window, loaded.total, loaded.energy
     x, y = np.float32(place[0]), np.float32(place[1])
@@ -164,8 +170,9 @@ def correlate(way, place, sight, loaded):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def match(way, sight, loaded, z, z_x, z_y, reach, place):
-    """Correlation of the loaded window with another view, if the surface is that plane; NO_SAY or AGAINST where there
-    is nothing to compare."""
+    """Returns the correlation of the loaded window with another view if the surface is the given plane. Returns NO_SAY
+    if that view does not see it, and AGAINST if it shows the point outside the subject. Fills ``place`` as
+    ``place_window`` does."""
     if not place_window(way, z, z_x, z_y, loaded.column, loaded.row, reach, place):
         return NO_SAY
     beside = distance_there(way, place, sight.distance_px)
@@ -178,11 +185,11 @@ def match(way, sight, loaded, z, z_x, z_y, reach, place):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def correlate_and_slide(way, place, sight, loaded, found):
-    """``correlate``, and how the window would slide along the ray: fills ``found`` with the correlation, and with
-    gradient (1 / mm) and information (1 / mm^2) of the depth.
+    """Fills ``found`` (3) with the correlation of the loaded window, and with what a move along the ray would change:
+    the gradient (1 / mm) and the information (1 / mm^2) of the depth.
 
-    Least squares of ``shade = gain (other + slope step) + offset`` by gain, offset and step: gain and offset are
-    projected out. The variance of a sample is what the best gain leaves, and noise.
+    It is the least-squares fit of ``shade = gain (other + slope step) + offset``, where gain and offset are eliminated.
+    The variance of a sample is what the best gain leaves, plus noise.
     """
     pairs, pattern, noise = sight.pairs, sight.pattern, sight.noise
     window, total, energy = loaded.window, loaded.total, loaded.energy

@@ -1,4 +1,5 @@
-"""Which views are compared: those whose directions differ enough to say something, and not so much as to mismatch."""
+"""Chooses which views are compared: their directions must differ enough to determine depth, but not so much that
+windows no longer match."""
 
 from collections.abc import Sequence
 
@@ -16,7 +17,9 @@ def choose_neighbours(
     sight; empty if there are none.
 
     Args:
-        at_world: about the middle of the subject; angles are between the lines of sight to it.
+        cameras: of all views.
+        at_world: about the middle of the subject (mm), where the lines of sight meet.
+        settings: limits of the angle and of the number.
     """
     towards = np.stack([camera.centre_world - at_world for camera in cameras])
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)

@@ -1,4 +1,4 @@
-"""Compiled loops that better the depth that a view has: planes taken over from neighbours, and least squares."""
+"""Compiled loops that improve the depths of a view: planes taken over from neighbours, and steps of least squares."""
 
 import numpy as np
 
@@ -20,12 +20,13 @@ BEHIND_BEST = 0.35  # a view that is less alike than the best by this is taken f
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def propagate(sight, scratch, parity, steps, same_mm, fresh, depth, slopes, cost):
-    """Every pixel of one colour of the chequerboard tries the planes of its neighbours of the other colour, ``steps``
-    pixels away (odd), and keeps the best of them and its own. ``cost`` below 0: not yet known. Planes that differ by
-    less than ``same_mm``, in depth and a pixel beside it, are the same.
+    """Lets every pixel of one colour of the chequerboard (``parity``) try the planes of its neighbours of the other
+    colour, ``steps`` pixels away (odd), and keeps the best of these and its own. Changes ``fresh``, ``depth``,
+    ``slopes`` and ``cost`` (h, w) in place.
 
-    ``fresh``: planes that their neighbours did not try yet; a pixel of known cost tries no others. Those taken over
-    here become fresh.
+    A cost below 0 is not yet known. A plane that differs from the current one by less than ``same_mm``, at the pixel
+    and one pixel beside it, is not tried. ``fresh`` marks planes that their neighbours have not tried yet; a pixel
+    whose cost is known tries only those. Planes taken over here become fresh.
     """
     height, width = depth.shape
     window, scores, place = scratch.window, scratch.scores, scratch.place
@@ -80,10 +81,11 @@ def _is_beside(fresh, row, column, steps):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def slide(sight, scratch, most_px, depth, slopes, place_mm, information, likeness):
-    """One step of least squares on the depth of every pixel, over all views that show it alike.
+    """Makes one step of least squares on the depth of every pixel (h, w), with all views in which it looks alike.
 
-    Fills ``place_mm`` (where the depth should be; at most ``most_px`` of the most sensitive view away), its
-    ``information`` (1 / mm^2 of independent samples; 0 where nothing is known) and the mean ``likeness``.
+    Fills ``place_mm`` (the new depth, at most ``most_px`` away in the view that is most sensitive to it), its
+    ``information`` (mm^-2, samples taken as independent; 0 where nothing is known), and ``likeness``, the mean
+    correlation.
     """
     height, width = depth.shape
     ways, window, place, found = sight.ways, scratch.window, scratch.place, scratch.found

@@ -1,7 +1,8 @@
-"""From one size of the photographs to the next: planes doubled, taken over from neighbours, and slid to their place.
+"""Carries the planes from one size of the photographs to the next: enlarges them, lets pixels take over better planes
+of their neighbours, and moves each to the best match.
 
-What the smaller size knew is carried along with a share of its information, and no more than the relief about a pixel
-allows: its windows see shading that smaller ones do not, and miss what is smaller than they are.
+A part of the information from the smaller size is kept, limited by the relief around the pixel: the larger windows
+there see shading that smaller ones do not, and miss what is smaller than they are.
 """
 
 from collections.abc import Sequence
@@ -28,8 +29,8 @@ MAX_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
 def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> list[Field]:
-    """Returns the fields enlarged to twice their size, the size of ``stack``, with a share of their information
-    kept."""
+    """Returns the fields enlarged to twice their width and height, the size of ``stack``. They keep a part of their
+    information."""
 
     def work(view: int) -> Field:
         field, distance = fields[view], stack.image(stack.distance_px, view)
@@ -47,7 +48,7 @@ def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> l
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """How the planes are improved at one size."""
+    """Holds how the planes are improved at one size of the photographs."""
 
     steps_px: tuple[int, ...]  # each pixel tries the planes of pixels that far away (odd)
     speck_px: int  # pieces of surface of so few pixels are replaced
@@ -55,8 +56,8 @@ class Pass:
 
 
 def refined(fields: Sequence[Field], matching: Matching, settings: DenseSettings, once: Pass) -> list[Field]:
-    """Improves the field of every view: pixels take over each other's planes, specks are replaced, and least squares
-    then moves the planes."""
+    """Improves the field of every view: pixels take over their neighbours' planes, small wrong pieces of surface are
+    replaced, and least squares then moves the planes."""
 
     def work(view: int) -> Field:
         return _refined(fields[view], matching, view, settings, once)

@@ -1,4 +1,5 @@
-"""The first depth: every ray is tried at even steps through its room, and neighbouring rays agree on a path."""
+"""Finds the first depth of every pixel: depths at even steps through its range are tried, and the one is chosen that
+agrees with neighbouring pixels along paths."""
 
 from collections.abc import Sequence
 
@@ -23,7 +24,8 @@ STEP_COST, EDGE_COST = np.float32(0.1), np.float32(0.8)
 
 
 def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> int:
-    """Returns how many times the crops are halved for the search, so that a pixel is about ``SEARCH_PIXEL_MM``.
+    """Returns how often the crops are halved for the search, so that a pixel is about ``SEARCH_PIXEL_MM`` wide at the
+    subject.
 
     Args:
         cameras: of the crops at full size; one at least.
@@ -36,8 +38,8 @@ def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3
 
 
 def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange], settings: DenseSettings) -> list[Field]:
-    """Finds a first depth in every view by trying depths in even steps through the range of each pixel. The information
-    of the returned fields is 0."""
+    """Finds a first depth in every view by trying depths at even steps through the range of each pixel. The fields have
+    no information yet (0)."""
 
     def work(view: int) -> Field:
         room = depth_ranges[view]
@@ -48,8 +50,8 @@ def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange], setting
 
 
 def label_strides(room: DepthRange, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
-    """Returns, for each pixel, that only one label in so many is matched: 1, 2, 4 ... A narrow range needs fewer labels
-    for the same spacing in depth."""
+    """Returns how many depths each pixel advances from one matched depth to the next: 1, 2, 4 and so on. A narrow range
+    needs fewer of them for the same spacing in mm."""
     depth = np.clip(room.far - room.near, settings.reach_mm / settings.labels, settings.reach_mm)
     return (2 ** np.floor(np.log2(settings.reach_mm / depth))).astype(np.int32)
 

@@ -1,8 +1,8 @@
-"""Compiled loops that take specks off a field: pieces of surface too small to be anything but chance matches.
+"""Compiled loops that find and replace specks in a field: pieces of surface too small to be more than chance matches.
 
-Where skin has no texture any place along a ray is as good as another, and windows that overlap err alike: they make
-pieces of a few windows' size that lie before or behind all that is about them. Unlike a pixel that errs alone, such a
-piece agrees with itself, so that neither planes taken over from neighbours nor a mean over neighbours ends it.
+Where skin has no texture, any depth along a ray is as good as another, and overlapping windows make the same error.
+They form pieces of a few windows' size, before or behind everything around them. Unlike a single wrong pixel, such a
+piece is consistent in itself, so that neither planes of neighbours nor a mean over neighbours removes it.
 """
 
 import numpy as np
@@ -12,9 +12,10 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_specks(depth, slopes, gap_mm, most_px, specks):
-    """Sets ``specks`` at the pixels of every piece that has ``most_px`` pixels or fewer.
+    """Sets ``specks`` (h, w) at the pixels of every piece of surface that has at most ``most_px`` pixels.
 
-    Neighbouring pixels are of one piece where their planes, halfway between them, lie nearer than ``gap_mm``.
+    Neighbouring pixels belong to one piece if their planes, extended half way to each other, are less than ``gap_mm``
+    apart.
     """
     height, width = depth.shape
     done, queue = np.zeros((height, width), np.bool_), np.empty(height * width, np.int64)
@@ -45,8 +46,9 @@ def mark_specks(depth, slopes, gap_mm, most_px, specks):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_specks(depth, slopes, specks, sweeps):
-    """Lays the pixels of ``specks`` onto the membrane (least squared steps between neighbours) through what is about
-    them, in ``sweeps``, with its slopes. Those that nothing else touches stay."""
+    """Replaces depth and slopes at the pixels of ``specks``, in place, by the smoothest surface through what surrounds
+    them (least squares of the steps between neighbours), in ``sweeps`` of Gauss-Seidel. Specks that touch nothing else
+    stay."""
     height, width = depth.shape
     left = specks.copy()
     filled, count, ring = np.empty(height * width, np.int64), 0, -1

@@ -1,4 +1,4 @@
-"""Which small pieces of a field's surface are chance matches, and what takes their place."""
+"""Finds small pieces of a field's surface that are chance matches, and replaces them."""
 
 import cv2
 import numpy as np
@@ -13,12 +13,12 @@ SWEEPS = 30  # a speck of 60 pixels is 8 wide
 def take_specks_off(
     depth: Float32[np.ndarray, "h w"], slopes: Float32[np.ndarray, "h w 2"], pixel_mm: float, most_px: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Replaces, in place, pieces of at most ``most_px`` pixels by a membrane through their surroundings. Returns which
-    pixels were replaced.
+    """Replaces, in place, small separate pieces of surface (at most ``most_px`` pixels) by a smooth surface through
+    what surrounds them. Returns which pixels were replaced.
 
-    A piece stays if its surroundings are not known: at an outline, where the surface may go on behind, and among so
-    many others that together they exceed ``most_px``. A quarter of draw-b's clothes at the search's size are such
-    pieces beside each other: two fifths of them are right, and membranes over all of them lost 6 % of the clothes.
+    A piece stays if nothing is known around it: at an outline, where the surface may go on behind, or among so many
+    other pieces that together they exceed ``most_px``. (In one capture a quarter of the clothes are such neighbouring
+    pieces at the search's size; two fifths of them are right, and replacing them all lost 6 % of the clothes.)
     """
     specks = np.zeros(depth.shape, bool)
     mark_specks(depth, slopes, GAP_PX * pixel_mm, most_px, specks)

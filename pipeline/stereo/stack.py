@@ -1,7 +1,8 @@
-"""All crops at one size, laid out for compiled loops: images in one row, and the way from every view to every other.
+"""Packs all crops of one size for compiled loops: the images one after the other, and the maps from every view to every
+other.
 
-Compiled loops spend their time fetching pixels, so that a pixel comes with its right neighbour in one 32-bit word: two
-fetches instead of four for a bilinear value, 1.4 ns instead of 2.3 ns a sample.
+Compiled loops spend their time fetching pixels. So each pixel is stored with its right neighbour in one 32-bit word: a
+bilinear value needs two fetches instead of four, 1.4 ns instead of 2.3 ns a sample.
 """
 
 from collections.abc import Sequence
@@ -18,9 +19,9 @@ SHADES = 256  # of a grey level: the images are smooth, and rounding is to be fa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stack:
-    """Holds all views at one size as flat arrays.
+    """Holds all n views at one size as flat arrays.
 
-    A point at depth ``z`` of pixel ``(x, y)`` in view r lies in view k at the pixel ``(p0 / p2, p1 / p2)`` and the
+    The point at depth ``z`` (mm) of pixel ``(x, y)`` in view r is seen in view k at pixel ``(p0 / p2, p1 / p2)`` and
     depth ``p2``, where ``p = z (turn[r, k] @ (x, y, 1)) + shift[r, k]``.
     """
 
@@ -35,7 +36,7 @@ class Stack:
 
     def homographies(self, view: int, others: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m 16"]:
         """Returns what maps pixels of one view to each of the others, one row for each, as compiled loops take it: turn
-        (9), shift (3), width, height, offset, noise."""
+        (9), shift (3), then width, height, offset and noise of the other view."""
         flat = self.turn[view, others].reshape(len(others), 9)
         return np.column_stack(
             [flat, self.shift[view, others], self.size[others], self.offset[others], self.noise[others]]
@@ -44,7 +45,7 @@ class Stack:
     def match_arguments(
         self, view: int, others: Int[np.ndarray, " m"], pattern: Float32[np.ndarray, "2 s"], contrast_levels: float
     ) -> Sight:
-        """Packs a view, and the other views to match it with, for compiled loops."""
+        """Packs a view, and the other views to match it with, as the argument of the compiled matching loops."""
         return Sight(
             int(self.offset[view]), float(self.noise[view]), self.homographies(view, others), self.pairs,
             self.distance_px, pattern, contrast_levels * SHADES,
@@ -54,7 +55,7 @@ class Stack:
         return len(self.size)
 
     def image(self, values: np.ndarray, view: int) -> np.ndarray:
-        """Returns one view's part of a flat array of pixel values, reshaped to an image."""
+        """Returns the part of a flat array of pixel values that belongs to one view, as an image."""
         width, height = self.size[view]
         return values[self.offset[view] : self.offset[view] + width * height].reshape(height, width, *values.shape[1:])
 

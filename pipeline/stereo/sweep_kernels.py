@@ -1,4 +1,5 @@
-"""Compiled loops of the first search: every ray is tried at places between two surfaces, and neighbours then agree."""
+"""Compiled loops of the first search: depths at even steps are tried along every ray, and neighbouring rays then
+agree."""
 
 import numpy as np
 
@@ -11,7 +12,9 @@ ALONE = 0.15  # cost of a place that a single other view speaks for
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def score_best_half(scores, count):
-    """Mean of the better half of ``scores``, of two at least: the others may be hidden. Returns a cost."""
+    """Returns a cost: 1 less the mean of the better half of the first ``count`` scores (two at least), since the point
+    may be hidden from the other views. Sorts ``scores``. A single score costs ``ALONE`` more; none costs
+    ``NOT_COMPARED``."""
     for i in range(1, count):  # insertion sort, falling
         value = scores[i]
         j = i - 1
@@ -30,7 +33,8 @@ def score_best_half(scores, count):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, inline="always")
 def cost_of(sight, loaded, z, z_x, z_y, reach, place, scores):
-    """1 minus the likeness of the loaded window with the other views, if the surface is that plane."""
+    """Returns the matching cost (0 to 2) of the loaded window with the other views if the surface is the given plane.
+    It is 2 if a view shows the point outside the subject."""
     count = 0
     for k in range(len(sight.ways)):
         score = match(sight.ways[k], sight, loaded, z, z_x, z_y, reach, place)
@@ -44,10 +48,11 @@ def cost_of(sight, loaded, z, z_x, z_y, reach, place, scores):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True, allocates=False)
 def sweep_view(sight, scratch, near, far, slopes, strides, cost):
-    """Fills ``cost`` (h, w, labels): 1 minus the likeness at ``near + share (far - near)``, mm.
+    """Fills ``cost`` (h, w, labels) with the matching costs at evenly spaced depths from ``near`` to ``far`` (h, w;
+    mm).
 
-    ``slopes`` (h, w, 4): of near by x and y, of far by x and y, mm a pixel. ``strides`` (h, w): one in so many labels
-    is matched, and the last; costs run linearly between.
+    ``slopes`` (h, w, 4) are those of near by x and y, and of far by x and y, mm per pixel. ``strides`` (h, w): only
+    every n-th depth is matched, and the last; costs between are interpolated linearly.
     """
     height, width, labels = cost.shape
     window, scores, place = scratch.window, scratch.scores, scratch.place
@@ -77,10 +82,12 @@ def sweep_view(sight, scratch, near, far, slopes, strides, cost):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def aggregate(cost, live, small, large, out):
-    """Sums the costs of the cheapest paths to every pixel from four sides into ``out``.
+    """Fills ``out`` (h, w, labels) with the sum, over four directions, of the cost of the cheapest path through the
+    image that ends at this pixel and label.
 
     Hirschmueller, Stereo processing by semiglobal matching, 2008 (https://doi.org/10.1109/TPAMI.2007.1166), eq. (13): a
-    step of one label costs ``small``, a wider one ``large``. Paths start anew where pixels are not ``live``.
+    change of one label along the path costs ``small``, a larger one ``large``. Paths start anew at pixels that are not
+    ``live``.
     """
     height, width, labels = cost.shape
     out[:] = 0.0

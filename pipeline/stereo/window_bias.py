@@ -1,9 +1,10 @@
-"""What windows of dense matching make of a surface, and how it is taken off.
+"""Describes the bias that the windows of dense matching give a surface, and subtracts it.
 
-They lie a little too deep all over, and they take a curved surface for flatter than it is: what stands out (the bridge
-of the nose, the lips) is cut off, what lies back is filled. To first order that is ``share`` times the height of the
-surface's own mean, over a window of 2.5 mm, above it. How large both are, ``pipeline.detail.depth_bias`` measures on
-the very capture."""
+All of the surface lies a little too deep, and curved parts come out too flat: what protrudes (the bridge of the nose,
+the lips) is cut off, and hollows are filled. To first order the flattening is ``share`` times the height of the
+surface's own mean, over a window of 2.5 mm, above the surface. ``pipeline.detail.depth_bias`` measures both on each
+capture.
+"""
 
 from dataclasses import dataclass
 
@@ -20,8 +21,8 @@ WINDOW_MM, REACH_MM = 2.5, 6.25  # standard deviation of the window, and where i
 
 @dataclass(frozen=True, slots=True)
 class WindowBias:
-    """Holds the bias of dense matching along the normal: ``common_mm``, the same everywhere, and ``share``, the factor
-    of the windowed height."""
+    """Holds the bias of dense matching along the surface normal: ``common_mm`` everywhere, plus ``share`` times
+    ``windowed_height``."""
 
     common_mm: float = 0.0
     share: float = 0.0
@@ -32,8 +33,8 @@ def windowed_height(
     normals: Float[np.ndarray, "v 3"],
     wanted: Bool[np.ndarray, " v"] | None = None,
 ) -> Float[np.ndarray, " v"]:
-    """Computes how far (mm, along the normal) the mean of the surface over a window lies above each vertex. Parts that
-    face another way do not count. With ``wanted``, the other vertices get 0."""
+    """Computes how far (mm, along the normal) the mean of the surface over a window lies above each vertex. Parts of
+    the window that face another way do not count. If ``wanted`` is not None, vertices outside it get 0."""
     height_mm, cells = np.zeros(len(vertices)), sorted_into_cells(vertices, REACH_MM)
     chosen = (
         np.ones(len(vertices), bool) if wanted is None else wanted.copy()

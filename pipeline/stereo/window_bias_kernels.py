@@ -1,4 +1,4 @@
-"""The mean of a surface over a window about each of its vertices (compiled)."""
+"""Compiled loop that computes the mean of a surface over a window around each of its vertices."""
 
 import numpy as np
 
@@ -20,11 +20,12 @@ def windowed_heights(
     first: int,
     last: int,
 ) -> None:
-    """Fills ``height_mm`` of the ``wanted`` vertices: how far along its normal the mean of those about each lies above.
+    """Fills ``height_mm`` (v) of the ``wanted`` vertices: how far the mean of the vertices around each lies above it,
+    along its normal.
 
-    Weights are a Gaussian of ``window_mm`` that ends at ``reach_mm``, times the cosine between the normals where that
-    is positive. ``order``, ``keys`` and ``spans`` as ``cells.Cells`` has them, cells as wide as the reach; ``first``
-    and ``last`` count in that order.
+    Weights are a Gaussian of ``window_mm`` that ends at ``reach_mm``, times the cosine between both normals where that
+    is positive. ``order``, ``keys`` and ``spans`` are those of ``cells.Cells``, with cells as wide as the reach;
+    ``first`` and ``last`` are positions in that order.
     """
     ranges, cell = np.empty((COLUMNS, 2), np.int64), -1
     falloff, most = -0.5 / (window_mm * window_mm), reach_mm * reach_mm

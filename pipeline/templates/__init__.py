@@ -1,1 +1,2 @@
-"""Results in the vertex order of somebody else's mesh: registered once to a head model, carried by it ever after."""
+"""Writes results in the vertex order of another mesh, a template. It is registered once to a head model, and from then
+on deformed with every fitted head."""

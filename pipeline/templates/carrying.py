@@ -1,8 +1,9 @@
-"""How a head carries the vertices of another mesh.
+"""Deforms a template together with a head.
 
-A vertex on the skin keeps its triangle, its barycentric coordinates there and what it is off the triangle, in the
-triangle's own frame. What lies deeper (mouth, sockets, lashes) follows the skin about it by the smooth map of
-``landmark_warp``; closed parts (eyeballs, teeth) move as wholes and grow, so that a ball stays one.
+A vertex on the skin keeps its triangle of the model, its barycentric coordinates there, and its offset in the
+triangle's own frame. Vertices that lie deeper (mouth, sockets, lashes) follow the skin around them by the smooth map of
+``landmark_warp``. Closed parts (eyeballs, teeth) move as wholes and change only their size, so that a ball stays a
+ball.
 """
 
 from dataclasses import dataclass
@@ -24,14 +25,15 @@ WHOLE_ANCHORS = 40  # that lead a closed part
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attachment:
-    """Holds points attached to a triangle surface: each by its triangle, barycentric weights and an offset."""
+    """Holds points attached to a surface of triangles: for each its triangle, its barycentric coordinates there, and
+    its offset in the triangle's frame (``frames``)."""
 
     triangles: Int[np.ndarray, " n"]  # rows of the surface's faces
     weights: Float[np.ndarray, "n 3"]  # barycentric
     offsets: Float[np.ndarray, "n 3"]  # mm, in the triangle's frame (``frames``)
 
     def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
-        """Returns where the attached points lie on the same surface with moved ``vertices``."""
+        """Returns the positions of the attached points when the surface's vertices are at ``vertices``."""
         corners = vertices[faces[self.triangles]]
         off = np.einsum("nax,na->nx", frames(corners), self.offsets)
         return np.einsum("nk,nkx->nx", self.weights, corners) + off
@@ -43,7 +45,7 @@ def bind_vertices(
     vertices: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Attachment, Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Attaches points to the nearest place of a surface that faces the same way. Returns the attachment, the distances
+    """Attaches points to the nearest point of a surface that faces the same way. Returns the attachment, the distances
     (mm), and the cosine between each point's unit normal and the surface's."""
     surface = SurfaceIndex(vertices, faces)
     hits = surface.closest(points, CANDIDATES, facing=normals)
@@ -63,7 +65,7 @@ def frames(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceBinding:
-    """Holds how a model's surface carries all vertices of another mesh. Rows are the vertices of that mesh."""
+    """Holds how all n vertices of a template follow the surface of a head model."""
 
     rest: Float[np.ndarray, "t 3"]  # where the mesh lay when it was registered, mm
     skin: Int[np.ndarray, " n"]  # rows that the surface carries, as ``attachment`` says
@@ -73,7 +75,8 @@ class SurfaceBinding:
     whole_anchors: Int[np.ndarray, "w k"]  # rows of the mesh that lead each closed part
 
     def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "t 3"]:
-        """Returns the mesh's vertices carried by a head; ``vertices`` are the model's full level, in any frame, mm."""
+        """Returns the template's vertices deformed with a head. ``vertices`` are those of the model's full level, in
+        any frame, mm."""
         out = np.empty_like(self.rest)
         out[self.skin] = self.attachment.on(vertices, faces)
         deep = self.wholes < 0
@@ -92,8 +95,8 @@ def surface_binding(
     attachment: Attachment,
     wholes: Int[np.ndarray, " t"],
 ) -> SurfaceBinding:
-    """Builds the binding and chooses its anchors: skin nearest to what lies deeper, and some spread over all of the
-    skin."""
+    """Builds a binding, and chooses the skin vertices that deeper ones follow: those nearest to them, and some spread
+    over all of the skin."""
     tree = KDTree(rest[skin])
     deep = wholes < 0
     deep[skin] = False

@@ -1,5 +1,5 @@
-"""What a template's file says of itself, read without its arrays; and whether a job may use it. Loads no model: the
-command line, the service and the console ask it before any work begins."""
+"""Reads the header of a template's file, without its arrays, and checks whether a job may use the template. Loads no
+model: the command line, the service and the console call it before any work begins."""
 
 import json
 import zipfile
@@ -49,7 +49,7 @@ class OtherModel(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class TemplateHeader:
-    """Holds which mesh was registered to which model, and figures of how well."""
+    """Holds which mesh was registered to which model, and the figures that say how well."""
 
     name: str
     source: str  # the OBJ file's name
@@ -65,7 +65,8 @@ class TemplateHeader:
 
 
 def read_header(path: Path) -> TemplateHeader:
-    """Returns the header of a template file. Raises BadTemplate."""
+    """Returns the header of a template file. Raises BadTemplate if the file cannot be read, is damaged or of another
+    kind."""
     try:
         with np.load(path, allow_pickle=False) as file:
             meta = read_meta(path, file)
@@ -87,6 +88,7 @@ def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def header_words(meta: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the text fields of a header from its decoded ``meta``. Raises KeyError if one is missing."""
     return {word: str(meta[word]) for word in WORDS}
 
 

@@ -1,9 +1,9 @@
-"""The head of a model that is most like a foreign mesh: shape and place together.
+"""Fits a head model to another mesh, shape and pose together.
 
-Gauss-Newton from the model's vertices to the planes of the mesh that they meet (Chen and Medioni 1992), under the
-prior z ~ N(0, I), with eigenheads and the smooth deformations of ``gaussian_process`` beyond them: section 3.2's
-search, with a size and without landmarks. Model to mesh, so that what else the mesh has, its shoulders say, pulls at
-nothing.
+Gauss-Newton minimises the distances from the model's vertices to the planes of the mesh that they meet (Chen and
+Medioni 1992), under the prior z ~ N(0, I), with eigenheads and the smooth deformations of ``gaussian_process``. It is
+the search of section 3.2 with a scale and without landmarks. Distances go from model to mesh, so that other parts of
+the mesh, such as shoulders, have no effect.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ from rig.mesh import vertex_normals
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Holds the limits of several steps of the search. Lengths in mm."""
+    """Holds the limits that apply to several steps of the search (lengths in mm)."""
 
     steps: int
     modes: int | None  # the first ones; None: all, the smooth deformations too
@@ -52,7 +52,7 @@ ROWS = 6000  # vertices of the model that look for the mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likeness:
-    """Holds the model fitted to a mesh, and how far it is from the mesh."""
+    """Holds the model fitted to a mesh, and the distances that remain."""
 
     vertices: Float[np.ndarray, "v 3"]  # of the full level, in the frame that the search began in
     distances: Float[np.ndarray, " s"]  # mm, of some vertices of the model from the mesh; inf where nothing was met
@@ -64,8 +64,8 @@ class Likeness:
 def fit_model_to_mesh(
     model: HeadModel, mesh: Surface, landmarks: Mapping[str, Float[np.ndarray, " 3"]] = MappingProxyType({})
 ) -> Likeness:
-    """Fits shape and pose of the model to a mesh and to landmarks of the mesh. The mesh must already lie about where
-    the model does (mm)."""
+    """Fits shape and pose of the model to a mesh and to landmarks of that mesh (mm). The mesh must already lie
+    approximately where the mean head lies."""
     wide = with_kernel(model, len(model.modes))
     full, count = model.levels["full"], len(model.modes)
     rows = np.arange(0, len(model.mean), max(1, len(model.mean) // ROWS))  # of the cage: even over the surface

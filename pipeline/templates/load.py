@@ -1,4 +1,4 @@
-"""Templates by name: what a job loads before its work, and what ``eigenhead template add`` makes."""
+"""Finds templates by name: loads one for a job, and makes one for ``eigenhead template add``."""
 
 import hashlib
 from collections.abc import Mapping
@@ -35,8 +35,8 @@ def make_template(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     report: Progress,
 ) -> tuple[Template, Registration]:
-    """Registers the mesh of an OBJ file to a model. Returns the template and the registration. Raises InputError with
-    every fault of the file."""
+    """Registers the mesh of an OBJ file to a model. Returns the template and the registration. Raises InputError that
+    lists every fault of the file."""
     mesh = read_polygons(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,6 +1,6 @@
-"""Which templates are at hand, and the files behind their names. Loads nothing: settings and the command line ask it.
+"""Lists the registered templates and their files. Loads nothing else: settings and the command line call it.
 
-Templates lie in the data folder's ``templates``, each with its picture.
+Templates lie in the folder ``templates`` of the data folder, each with its picture.
 """
 
 from pathlib import Path
@@ -27,6 +27,7 @@ class WrongName(EigenheadError):
 
 
 def is_name(name: str) -> bool:
+    """Tells whether a name is allowed for a template."""
     return TEMPLATE_NAME.fullmatch(name) is not None
 
 

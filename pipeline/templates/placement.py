@@ -1,8 +1,8 @@
-"""Where a foreign mesh lies: head_from_template, a similarity, from landmarks or by a search.
+"""Finds where a foreign mesh lies: head_from_template, a similarity, from landmarks or by a search.
 
-The search tries millimetres, centimetres, decimetres and metres, every axis convention, three starts each, and iterates
-closest points (Besl and McKay 1992; Umeyama's scale) from the model's surface to the mesh: whatever else the mesh has,
-teeth, eyeballs, shoulders, attracts nothing.
+The search tries millimetres, centimetres, decimetres and metres, every convention of axes, and three starts for each.
+It then iterates closest points (Besl and McKay 1992; with Umeyama's scale) from the model's surface to the mesh, so
+that other parts of the mesh (teeth, eyeballs, shoulders) have no effect.
 """
 
 from collections.abc import Mapping
@@ -35,18 +35,19 @@ UNLIKE_MM = 8.0  # mean distance of the face beyond which a place is none
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Holds a triangle mesh with unit vertex normals, in mm once it is placed."""
+    """Holds a triangle mesh with unit vertex normals; in mm once it has been placed."""
 
     vertices: Float[np.ndarray, "t 3"]
     faces: Int[np.ndarray, "f 3"]
     normals: Float[np.ndarray, "t 3"]
 
     def placed(self, place: Similarity) -> "Surface":
+        """Returns the surface moved by a similarity."""
         return Surface(place.apply(self.vertices), self.faces, self.normals @ place.rotation.T)
 
 
 def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
-    """Returns the mesh with all its faces turned over if they look inwards."""
+    """Returns the mesh with its normals; if its faces look inwards, all of them are turned over."""
     corners = vertices[faces] - vertices[np.unique(faces)].mean(axis=0)
     if np.einsum("fx,fx->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
         faces = faces[:, ::-1]
@@ -54,7 +55,8 @@ def outward(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -
 
 
 def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str) -> Similarity:
-    """Computes head_from_template from at least four landmarks of the mesh. Raises InputError."""
+    """Computes head_from_template from at least four landmarks of the mesh. Raises InputError, whose message begins
+    with the mesh's ``name``, if there are fewer or they determine no placement."""
     names = [each for each in landmarks if each in model.landmarks]
     if len(names) < 4:
         raise InputError(name, [compose("template-landmarks-too-few", count=len(names), names=names or ["none"])])
@@ -66,8 +68,8 @@ def place_by_landmarks(model: HeadModel, landmarks: Mapping[str, Float[np.ndarra
 
 
 def find_place(model: HeadModel, mesh: Surface, name: str) -> Similarity:
-    """Finds head_from_template by a search over units, axes and closest points. Raises InputError if the mesh does not
-    resemble a head."""
+    """Finds head_from_template by a search over units, axes and closest points. Raises InputError if the mesh does
+    not resemble a head."""
     used = mesh.vertices[np.unique(mesh.faces)]
     extent = float(np.ptp(used, axis=0).max())
     factors = [f for f in UNITS.values() if EXTENT_MM[0] < extent * f < EXTENT_MM[1]]

@@ -1,8 +1,8 @@
-"""A foreign mesh registered to a head model, once (section 3.2, the other way round).
+"""Registers a foreign mesh to a head model, once (section 3.2, the other way round).
 
-The model is made as like the mesh as it can be (``fit_model_to_mesh``), then the mesh's skin is drawn onto that head by
-the non-rigid refinement of ``correspondence``: what the two differ in is not carried on to results. Every vertex of the
-skin then has its place on the model's surface, everything deeper follows (``carrying``).
+The model is fitted to the mesh as closely as it can (``fit_model_to_mesh``). Then the mesh's skin is deformed onto that
+head by the non-rigid refinement of ``correspondence``, so that a difference between the two does not appear in results.
+Every vertex of the skin now has its point on the model's surface, and deeper ones follow (``carrying``).
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,7 +51,7 @@ class NotRegistered(InputError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """Holds a mesh bound to a model's surface, and how well it lies there."""
+    """Holds a mesh bound to a model's surface, and figures of how well it fits."""
 
     surface_binding: SurfaceBinding
     place: Similarity  # head_from_template, from the start
@@ -82,8 +82,14 @@ def register(
     landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None,
     report: Progress,
 ) -> Registration:
-    """Registers a mesh to a model: places it, fits the model to it, draws the mesh onto that head and binds it. The
-    mesh may have any unit and any axes; ``landmarks`` are in its frame.
+    """Registers a mesh to a model: places it, fits the model to it, deforms the mesh onto that head, and binds it.
+
+    Args:
+        mesh: in any unit and with any axes.
+        model: the head model.
+        name: of the mesh, for messages.
+        landmarks: in the mesh's frame; None searches for the placement.
+        report: progress.
 
     Raises InputError if the mesh is no head, and NotRegistered if the model cannot follow it.
     """
@@ -137,8 +143,10 @@ def _check(like: Likeness, name: str, *, marked: bool) -> float:
 
 
 def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
-    """Joins vertices at the same position where the surface ends, since files cut it along texture seams. Returns the
-    mesh, and the new row of each old vertex. Lashes stay separate parts, since the lid does not end where they begin.
+    """Joins vertices at the same position along open borders, since files cut surfaces along texture seams. Returns the
+    mesh and the new index of each old vertex.
+
+    Lashes stay separate parts, since the lid has no border where they begin.
     """
     ends = np.zeros(len(mesh.vertices), bool)
     ends[boundary_edges(mesh.faces)] = True
@@ -153,7 +161,7 @@ def weld(mesh: Surface) -> tuple[Surface, Int[np.ndarray, " t"]]:
 
 
 def components(mesh: Surface) -> Int[np.ndarray, " t"]:
-    """Returns the connected part that each vertex belongs to."""
+    """Returns the index of the connected part that each vertex belongs to."""
     return connected_components(_graph(mesh.faces, len(mesh.vertices)), directed=False)[1]
 
 
@@ -163,8 +171,8 @@ def _graph(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_array:
 
 
 def skin_parts(mesh: Surface, parts: Int[np.ndarray, " t"], head: Surface) -> Bool[np.ndarray, " p"]:
-    """Tells which connected parts of the mesh are skin: those that enough of the head's area meets before any other
-    part."""
+    """Tells which connected parts of the mesh are skin: those that lie nearest to the head, facing the same way, over a
+    large enough share of its area."""
     rows = slice(None, None, max(1, len(head.vertices) // 6000))
     hits = SurfaceIndex(mesh.vertices, mesh.faces).closest(head.vertices[rows], CANDIDATES, facing=head.normals[rows])
     part = parts[mesh.faces[hits.triangles, 0]]
@@ -204,8 +212,8 @@ def parting(
     faces: Int[np.ndarray, "f 3"],
     model: HeadModel,
 ) -> Bool[np.ndarray, " t"]:
-    """Tells which vertices move away from their neighbours on some random head, because they were attached to another
-    layer of the surface: the inside of a lid, or the eyeball."""
+    """Tells which vertices move away from their neighbours on some random head. They were attached to another layer of
+    the surface, such as the inside of a lid or the eyeball."""
     graph = _graph(faces[skin[faces].all(axis=1)], len(rest))
     graph = sparse.csr_array(((graph + graph.T) > 0).astype(float))
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1.0)[:, None]
@@ -218,8 +226,8 @@ def parting(
 
 
 def without_edge(skin: Bool[np.ndarray, " t"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " t"]:
-    """Returns the skin without its vertices next to deeper parts. Where a lid turns inwards it is chance which vertices
-    still meet the model's lid; without them all follow evenly."""
+    """Returns the skin without its vertices next to deeper parts. Where a lid turns inwards it is chance which of them
+    still meet the model's lid; without all of them the deeper parts follow evenly."""
     out = skin.copy()
     for _ in range(EDGE_RINGS):
         out[faces[~out[faces].all(axis=1)]] = False

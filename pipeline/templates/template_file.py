@@ -1,4 +1,4 @@
-"""Templates as files (npz with a JSON ``meta``): a mesh of somebody's, and how a head model carries it."""
+"""Reads and writes templates as files (npz with a JSON ``meta``): a mesh, and how it follows a head model."""
 
 import io
 import json

@@ -1,9 +1,10 @@
-"""Albedo: the texture with its light taken off.
+"""Estimates the albedo: the texture without the light it was photographed in.
 
 Enters: the head, its photograph-like texture, linear colours of all views. Leaves: the light
-(``pipeline.texturing.light``) and an image in the texture's layout of what the skin itself reflects. Highlights move
-with the camera, so that of each vertex' views a dim one tells what is matt; the texture is multiplied, in linear light,
-by the factor of its vertices from texture to matt colour by shading, which keeps every texel's detail.
+(``pipeline.texturing.light``), and an image in the texture's layout of what the skin itself reflects. Highlights move
+with the camera, so that the dimmer views of a vertex show its matt colour. The texture is multiplied, in linear light,
+by a factor interpolated from the vertices: from the texture's colour to the matt colour, divided by shading. That keeps
+the detail of every texel.
 """
 
 from dataclasses import dataclass
@@ -37,7 +38,7 @@ CODES = 65535
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Albedo:
-    """Holds the albedo image (sRGB, in the texture's layout) and the light that was taken off the texture."""
+    """Holds the albedo image (sRGB, in the texture's layout) and the light that was removed from the texture."""
 
     atlas: Atlas
     light: Light
@@ -53,9 +54,11 @@ def estimate_albedo(
     *,
     chart: ChartColours | None = None,
 ) -> tuple[Albedo | None, list[ReportWarning]]:
-    """Estimates the albedo of a textured head, or returns None and a warning where light and skin cannot be told apart.
-    With a ``chart`` the albedo has the skin's true level and colour; without one both are a convention
-    (``pipeline.texturing.light``)."""
+    """Estimates the albedo of a textured head. Returns None and a warning if light and skin cannot be told apart.
+
+    With a ``chart`` the albedo has the skin's true brightness and colour. Without one both follow a convention
+    (``pipeline.texturing.light``).
+    """
     if atlas is None or around is None or coloured.dim is None:
         return None, [compose("no-albedo", reason=compose("albedo-without-texture"))]
     seen = coloured.views > 0
@@ -81,8 +84,9 @@ def shine_left(
     seen: Bool[np.ndarray, " v"],
     around: Neighbourhood,
 ) -> Float[np.ndarray, " v"]:
-    """Returns the share of each vertex' light that is not highlight, from ``1 - MAX_SHINE`` to 1. Only brightness is
-    compared: a highlight has the colour of its lamp, and the colour of a dim view is mostly noise."""
+    """Returns the share of each vertex's light that is not highlight, from ``1 - MAX_SHINE`` to 1. It compares the
+    brightness of the colours ``shown`` with that of the ``dim`` views. Colour is not compared: a highlight has the
+    colour of its lamp, and the colour of a dim view is mostly noise."""
     ratio = dim.sum(axis=1) / np.maximum(shown.sum(axis=1), 1e-4)
     ratio = np.where(seen, ratio, 1.0)
     ratio = around.calmed(ratio[:, None], CALM)[:, 0]

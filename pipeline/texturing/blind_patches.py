@@ -1,8 +1,9 @@
-"""Wide triangles that cameras see although they see none of their corners.
+"""Colours wide triangles that cameras see although they see none of the corners.
 
 A model whose eyes are openings has them closed by strips from lid to lid (``close_openings`` of imports). Every vertex
-of a strip lies on the rim, which the lids hide, so that no view is asked for it, and the eyeball would be painted in
-the skin about it. Such a patch takes the one photograph that sees most of it, as it is.
+of a strip lies on the opening's rim, which the lids hide, so that no view would be chosen for it, and the eyeball would
+be painted in the colour of the skin around it. Such a patch takes its colours from the one photograph that sees most of
+it.
 """
 
 from collections.abc import Mapping

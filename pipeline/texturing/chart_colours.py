@@ -1,9 +1,9 @@
-"""True colours, from a chart in the clean plates.
+"""Corrects colours by a colour chart in the clean plates.
 
-Enters: plates, of which some show the chart; the photographs. Leaves: the photographs as a camera with true colours
-would have taken them (linear sRGB, D65, white where the chart's white is), for the texture alone; and which way the
-chart faced, so that the light taken off a head is the light that fell on the chart. A camera that saw no chart gets the
-mean of those that did: the balance of the views levels the rest.
+Enters: plates, of which some show the chart, and the photographs. Leaves: the photographs as a camera with true colours
+would have taken them (linear sRGB, D65, white where the chart's white is), for the texture alone; and the direction
+that the chart faced, so that the light removed from a head is the light that fell on the chart. A camera that saw no
+chart gets the mean correction of those that did; balancing the views against each other does the rest.
 """
 
 from collections.abc import Mapping
@@ -38,15 +38,15 @@ class ChartColours:
 
 
 def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """Finds the charts in all clean plates and returns the cameras' colour corrections. Returns None and a warning
-    where no plate shows a chart."""
+    """Finds the charts in all clean plates, and computes the colour correction of each camera. Returns None and a
+    warning if no plate shows a chart."""
     charts = map_in_threads(lambda k: charts_in(capture.backgrounds.get(rig.names[k], ())), len(rig))
     return colours_of_charts(dict(zip(rig.names, charts, strict=True)), rig)
 
 
 def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
-    """Returns the cameras' colour corrections from charts that were found, named by camera. Returns None and a warning
-    where no chart gives one."""
+    """Computes the colour correction of each camera from the charts that it saw. Returns None and a warning if no chart
+    gives one."""
     found = {name: chart_correction(visible) for name, visible in charts.items() if visible}
     cameras = {name: correction for name, correction in found.items() if correction is not None}
     if not cameras:
@@ -73,11 +73,13 @@ def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
 def in_true_colours(
     picture: UInt8[np.ndarray, "h w 3"], matrix: Float[np.ndarray, "3 3"]
 ) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns a picture (sRGB) whose linear colours are multiplied by a camera's correction matrix and clipped to 0 to
+    1."""
     linear = cv2.transform(LINEAR[picture], matrix.astype(np.float32))
     return ENCODED[(CODES * np.clip(linear, 0.0, 1.0) + 0.5).astype(np.int32)]
 
 
 def levelled_by_chart(light: Light, normal_world: Float[np.ndarray, " 3"]) -> Light:
-    """Returns the light scaled in each channel so that a white surface facing as the chart did is exactly white."""
+    """Returns the light scaled in each channel so that a white surface that faces as the chart did is exactly white."""
     on_chart = (harmonics(normal_world[None]) * BAND_FACTORS) @ light.coefficients
     return replace(light, coefficients=light.coefficients / on_chart[0], on_chart=True)

@@ -1,4 +1,5 @@
-"""Which photograph each vertex takes, and the photographs as they are read: what vertex colours and texels share."""
+"""Holds which photograph colours each vertex, and the photographs packed for compiled loops: what vertex colours and
+texels share."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,8 +19,16 @@ CODES = np.arange(256) / 255.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """Holds which photographs colour each vertex. ``slots``: the views of a vertex, the chosen one first (-1: none);
-    ``shares``: their weights in the mean; ``corrections``: codes that are added to each view at the vertex."""
+    """Holds which photographs colour each vertex.
+
+    Attributes:
+        views: the cameras of the photographs.
+        slots: the views of each vertex, the chosen one first; -1: none.
+        shares: their weights in the mean.
+        corrections: sRGB codes that are added to each view at the vertex.
+        weights: how well each view sees each vertex.
+        pictures: the photographs, packed.
+    """
 
     views: Rig
     slots: Int32[np.ndarray, "v s"]
@@ -29,16 +38,16 @@ class Decision:
     pictures: Pictures
 
     def choice(self, colours: UInt8[np.ndarray, "v 3"]) -> Choice:
-        """Returns the decision as the compiled loops read it. ``colours`` (sRGB codes) are used where no view sees a
-        triangle."""
+        """Returns the decision as the compiled loops take it. ``colours`` (sRGB codes of the vertices) are used in
+        triangles that no view sees."""
         filled = np.zeros((len(colours), 4), np.float32)
         filled[:, :3] = colours
         return Choice(self.slots, self.shares, self.corrections, filled, self.weights)
 
 
 def window_table(sigma: float) -> Float32[np.ndarray, "_ _"]:
-    """Returns the Gaussian weights of four neighbouring pixels, one row for each position between the middle two.
-    ``sigma`` is in pixels."""
+    """Returns the Gaussian weights with which four neighbouring pixels are read, one row for each sub-pixel position
+    between the middle two. ``sigma`` is in pixels."""
     phase = np.arange(PHASES + 1) / PHASES
     weights = np.exp(-0.5 * ((np.arange(TAPS) - 1 - phase[:, None]) / sigma) ** 2)
     return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -54,8 +63,8 @@ def pack_pictures(
     mesh_world: Mesh,
     footprint_px: float,
 ) -> Pictures:
-    """Returns the part of each photograph around the silhouette, with the camera's gain and offset applied, all in one
-    array one behind the other."""
+    """Packs the part of each photograph around its silhouette into one array, with the camera's gain and offset
+    applied."""
     boxes = [box_around(masks[camera.name], TAPS) for camera in views]
     parts = [image[box] for image, box in zip(images, boxes, strict=True)]
     first = np.cumsum([0] + [part.size for part in parts])

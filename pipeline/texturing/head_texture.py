@@ -1,4 +1,4 @@
-"""The texture of a result's head, where the settings ask for a file that has one."""
+"""Paints the texture of a result's head, if the settings ask for a file that has one."""
 
 import numpy as np
 from jaxtyping import Bool
@@ -16,8 +16,8 @@ from rig.messages.message import compose
 
 
 def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
-    """Returns the model's texture layout, or None where no file of the result has a texture or the model cannot be laid
-    out; and the warnings about settings and model."""
+    """Returns the model's texture layout; None if no file of the result has a texture, or if the model cannot be laid
+    flat. Also returns warnings about settings and model."""
     outputs = settings.outputs
     old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
     warnings = [compose("old-setting", setting=name) for name, is_set in old.items() if is_set]
@@ -33,7 +33,7 @@ def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | Non
 def paint_head(
     layout: ModelLayout | None, mesh: Mesh, coloured: Texture, face_region: Bool[np.ndarray, " v"], settings: Settings
 ) -> Atlas | None:
-    """Returns the texture of the head. Returns None where there is no layout or no camera saw the head."""
+    """Paints the texture of the head. Returns None if there is no layout or no camera saw the head."""
     if layout is None or coloured.decision is None:
         return None
     region = np.flatnonzero(face_region)

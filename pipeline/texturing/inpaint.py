@@ -1,5 +1,6 @@
-"""Values for the vertices that have none, smooth over the mesh: each ring takes the mean of the ring before, and the
-filled part is then relaxed towards its neighbours' mean (the harmonic fill), the known vertices staying as they are."""
+"""Fills in values at vertices that have none, smoothly over the mesh. Each ring of vertices takes the mean of the ring
+before; the filled part is then relaxed towards the mean of its neighbours (harmonic fill), with known vertices
+fixed."""
 
 import numpy as np
 import scipy.sparse as sparse
@@ -11,7 +12,8 @@ RELAXATIONS = ((60, 1.7), (10, 1.0))  # sweeps and factor: over-relaxed, then pl
 
 
 def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int32[np.ndarray, " s"], Int32[np.ndarray, " e"]]:
-    """Returns which vertices share an edge, as compressed rows: starts (count + 1) and the neighbours' indices."""
+    """Returns which vertices share an edge, as compressed rows: the neighbours of vertex i are
+    ``indices[starts[i]:starts[i + 1]]``."""
     along = np.roll(faces, -1, axis=1)
     ends = np.concatenate([faces, along]).ravel(), np.concatenate([along, faces]).ravel()
     pairs = sparse.csr_array((np.ones(len(ends[0]), bool), ends), shape=(count, count))  # adds up what is there twice
@@ -21,8 +23,8 @@ def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int32[np.ndar
 def fill_unknown(
     values: Float[np.ndarray, "v c"], known: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v c"]:
-    """Returns ``values`` (four channels at most) with those of unknown vertices filled smoothly from their neighbours.
-    A part of the mesh without any known vertex gets the mean of the known ones."""
+    """Fills in the values (at most four channels) of unknown vertices smoothly from their neighbours. A part of the
+    mesh without any known vertex gets the mean of all known ones."""
     out = values.astype(float)
     if known.all() or not known.any():
         return out

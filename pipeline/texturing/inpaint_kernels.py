@@ -9,7 +9,8 @@ LANES = 4  # channels side by side, so that a vertex is one vector register: 16 
 
 @njit(cache=True)
 def by_rings(starts: np.ndarray, indices: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Unknown vertices in the order in which a flood from the known ones meets them."""
+    """Returns the unknown vertices in the order in which a flood from the known ones reaches them. Vertices that it
+    does not reach are left out."""
     met = known.copy()
     queue = np.empty(len(known), np.int32)
     tail = 0
@@ -36,7 +37,8 @@ def by_rings(starts: np.ndarray, indices: np.ndarray, known: np.ndarray) -> np.n
 def first_guess(
     values: np.ndarray, starts: np.ndarray, indices: np.ndarray, order: np.ndarray, known: np.ndarray
 ) -> None:
-    """In that order every vertex takes the mean of the neighbours that are ``known`` by then."""
+    """Gives every vertex of ``order`` in turn the mean of its neighbours that are ``known`` by then. Changes ``values``
+    (v, LANES) and ``known`` (v) in place."""
     for v in order:
         total, count = np.zeros(LANES, np.float32), 0
         for k in range(starts[v], starts[v + 1]):
@@ -51,7 +53,8 @@ def first_guess(
 def relax(
     values: np.ndarray, starts: np.ndarray, indices: np.ndarray, order: np.ndarray, sweeps: int, factor: float
 ) -> None:
-    """Over-relaxed Gauss-Seidel sweeps there and back over ``order``; ``values`` (v, LANES) are read four at once."""
+    """Relaxes the vertices of ``order`` towards the mean of their neighbours, by over-relaxed (``factor``) Gauss-Seidel
+    sweeps forth and back. Changes ``values`` (v, LANES) in place, four numbers at once."""
     for sweep in range(sweeps):
         for step in range(len(order)):
             v = order[step] if sweep % 2 == 0 else order[len(order) - 1 - step]

@@ -1,13 +1,15 @@
-"""The light that a head was photographed in, told from its shading.
+"""Estimates the light that a head was photographed in, from its shading.
 
-Nine coefficients a channel: spherical harmonics of second order carry 98 % of what a matt surface shows of any distant
-light (Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance Environment Maps*, SIGGRAPH 2001). What the
-head hides from itself is taken off the harmonics of each vertex beforehand (Sloan, Kautz and Snyder, *Precomputed
-Radiance Transfer*, SIGGRAPH 2002), so that a dark nostril is neither light nor skin.
+There are nine coefficients for each channel: spherical harmonics of second order, which describe 98 % of what a matt
+surface shows of any distant light (Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance Environment
+Maps*, SIGGRAPH 2001). Light that the head hides from itself is first subtracted from the harmonics of each vertex
+(Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, SIGGRAPH 2002), so that a dark nostril changes neither light
+nor skin.
 
-Skin of the face is taken for one colour; brows, lips and beards are outliers. A photograph cannot tell a dark head in
-bright light from a bright one in dim light, nor a warm lamp from warm skin: by convention the light's mean over the
-sphere is 1 in each channel, grey. Light that no part of the face is turned to is unknown, and drawn to that mean.
+Skin of the face is assumed to have one colour; brows, lips and beards are outliers. A photograph cannot distinguish a
+dark head in bright light from a bright one in dim light, nor a warm lamp from warm skin. By convention the light's mean
+over the sphere is 1 in each channel, grey. Light from directions that no part of the face is turned to is unknown, and
+is drawn to that mean.
 """
 
 from dataclasses import dataclass
@@ -42,9 +44,13 @@ MIN_VERTICES = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Light:
-    """Holds the light that the head was photographed in. ``coefficients``: radiance in the order of ``harmonics``,
-    world frame, one column a channel; scaled to a mean of 1 over the sphere or, if ``on_chart``, so that white on the
-    chart is white. ``residual``: the median relative error that the light leaves in the face's linear colours."""
+    """Holds the light that a head was photographed in.
+
+    Attributes:
+        coefficients: radiance in the order of ``harmonics``, world frame, one column for each channel.
+        residual: median relative error of the face's linear colours under this light.
+        on_chart: whether the light is scaled so that white on the chart is white; else its mean over the sphere is 1.
+    """
 
     coefficients: Float[np.ndarray, "9 3"]
     residual: float
@@ -52,8 +58,8 @@ class Light:
 
 
 def harmonics(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 9"]:
-    """Returns the nine real spherical harmonics up to second order of unit vectors: 1; y, z, x; xy, yz, 3z2 - 1, xz, x2
-    - y2 (Ramamoorthi and Hanrahan, eq. (3))."""
+    """Returns the nine real spherical harmonics up to second order at unit vectors, in this order: 1; y, z, x; xy, yz,
+    3z2 - 1, xz, x2 - y2 (Ramamoorthi and Hanrahan, eq. (3))."""
     x, y, z = directions.T
     columns = (
         0.282095 * np.ones_like(x),
@@ -83,8 +89,8 @@ SURROUND = harmonics(spread_directions(DIRECTIONS)) * BAND_FACTORS  # unhidden w
 def transfer(
     mesh_world: Mesh, normals: Float[np.ndarray, "v 3"], around: Neighbourhood, directions: int = DIRECTIONS
 ) -> Float[np.ndarray, "v 9"]:
-    """Computes how bright each vertex would be, as matt white, in the light of each harmonic. Directions that the mesh
-    hides from a vertex give no light but the share that the hiding surface sends back."""
+    """Computes how bright each vertex would be if it were matt white, in a light of each harmonic alone. Light from
+    directions that the mesh hides from a vertex is missing, except for the share that the hiding surface reflects."""
     unhidden = harmonics(normals) * BAND_FACTORS
     towards = spread_directions(directions)
     basis = harmonics(towards) * (4.0 / directions)  # the sphere's 4 pi by the matt surface's pi
@@ -138,13 +144,13 @@ def _hidden(
 def fit_light(
     white: Float[np.ndarray, "v 9"], colours: Float[np.ndarray, "v 3"], skin: Bool[np.ndarray, " v"]
 ) -> Light | None:
-    """Estimates the light from the linear colours of skin, which is taken for one colour. Returns None where there are
-    too few vertices or they are black.
+    """Estimates the light from the linear colours of skin, which is assumed to have one colour. Returns None if there
+    are too few vertices or they are black.
 
     Args:
-        white: the vertices' ``transfer``.
+        white: the ``transfer`` of the vertices.
         colours: linear, without highlights.
-        skin: vertices that tell it, brows and lips among them.
+        skin: vertices to use, brows and lips among them.
     """
     rows, seen = white[skin], colours[skin]
     level = np.median(seen, axis=0) if len(seen) else np.zeros(3)

@@ -1,4 +1,4 @@
-"""Which vertices of a mesh lie beside each other, as compiled loops read it."""
+"""Holds which vertices of a mesh are neighbours, in the form that compiled loops read."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,8 @@ from jaxtyping import Float, Int32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """Holds the neighbours of each vertex as compressed rows; ``opposite`` is, for each edge, the position of the same
-    edge in the row of its other end."""
+    """Holds the neighbours of each vertex as compressed rows: those of vertex i are ``indices[starts[i]:starts[i +
+    1]]``. Every edge is stored twice, once in the row of each end; ``opposite`` is the position of the other copy."""
 
     starts: Int32[np.ndarray, " s"]
     indices: Int32[np.ndarray, " e"]
@@ -27,6 +27,7 @@ class Neighbourhood:
 
     @property
     def rows(self) -> Int32[np.ndarray, " e"]:
+        """Returns, for each entry of ``indices``, the vertex whose neighbour it is."""
         return np.repeat(np.arange(len(self.starts) - 1, dtype=np.int32), np.diff(self.starts))
 
     def calmed(self, values: Float[np.ndarray, "v c"], rounds: int) -> Float[np.ndarray, "v c"]:

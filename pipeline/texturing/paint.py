@@ -1,9 +1,9 @@
-"""The texture image: every texel of the model's layout takes the photograph of its vertices' choice.
+"""Paints the texture image: every texel of the layout is read from the photographs chosen for its triangle's vertices.
 
-A texel is a point of the fitted surface; its place in a photograph follows from those of its triangle's corners (lens
-included; edges are a few pixels), is read there with a sub-pixel window and gets the corners' correction
-(``pipeline.texturing.seam_levelling``). In triangles whose corners chose different photographs these are faded into
-each other. What no camera sees has the vertices' colours.
+A texel is a point of the fitted surface. Its pixel in a photograph is interpolated from those of the triangle's corners
+(which include lens distortion; edges are a few pixels long). The photograph is read there with a sub-pixel window, and
+the corners' correction is added (``pipeline.texturing.seam_levelling``). If the corners chose different photographs,
+these are blended across the triangle. What no camera sees gets the vertices' colours.
 """
 
 import cv2
@@ -31,9 +31,9 @@ def paint_texture(
 
     Args:
         layout: of the mesh's vertices.
-        mesh_world: the head.
-        colours: sRGB of its vertices, for what no camera sees and to pad with.
-        decision: the view of every vertex, and the photographs.
+        mesh_world: the head, mm.
+        colours: sRGB of its vertices, for what no camera sees and for the padding.
+        decision: the views of every vertex, and the photographs.
         size: of the image.
     """
     stored = np.empty((size, size, 3), np.uint8)  # blue first: encoders take it as it is
@@ -70,8 +70,8 @@ def _coarse(layout: Layout, colours: UInt8[np.ndarray, "v 3"]) -> UInt8[np.ndarr
 def texture_size(
     layout: Layout, mesh_world: Mesh, views: Rig, region: Int[np.ndarray, " n"], *, wanted: int | None = None
 ) -> int:
-    """Returns the side of the texture in texels: ``wanted`` if given, else the smallest of ``SIZES`` whose texels on
-    the face are no coarser than a photograph's pixels there."""
+    """Returns the width of the texture in texels: ``wanted`` if it is not None, else the smallest of ``SIZES`` whose
+    texels in the ``region`` (vertices of the face) are no coarser than the photographs' pixels there."""
     if wanted is not None:
         return wanted
     inside = layout.faces[np.isin(layout.source[layout.faces], region).all(axis=1)]

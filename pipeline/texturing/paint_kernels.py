@@ -11,7 +11,8 @@ TAPS = 4
 
 
 class Pictures(NamedTuple):
-    """The photographs' parts that show the head, one behind the other, and where the vertices lie in them."""
+    """Holds the parts of the photographs that show the head, one after the other, and where the vertices lie in
+    them."""
 
     codes: np.ndarray  # uint8 (n,), rows of pixels of three channels
     first: np.ndarray  # int64 (k,): where each begins
@@ -22,7 +23,7 @@ class Pictures(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What every vertex takes: views, their shares, and what their colours are raised by, in codes."""
+    """Holds the views of every vertex, their shares in the mean, and what is added to their colours (sRGB codes)."""
 
     slots: np.ndarray  # int32 (v, s), -1: no view
     shares: np.ndarray  # float32 (v, s)
@@ -33,7 +34,8 @@ class Choice(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def sample(pictures: Pictures, k: int, x: float, y: float, out: np.ndarray) -> None:
-    """Codes about (x, y) in view k, in the window; its border pixels go on outside."""
+    """Reads the codes at the point (x, y) of view k into ``out`` (3), with a window of 4 x 4 pixels. Points outside the
+    picture get those of its border."""
     width, height = pictures.width[k], pictures.height[k]
     x = min(max(x, 0.0), width - 1.0)
     y = min(max(y, 0.0), height - 1.0)
@@ -67,8 +69,12 @@ def sample(pictures: Pictures, k: int, x: float, y: float, out: np.ndarray) -> N
 def gather(
     corners: tuple[int, int, int], choice: Choice, view: np.ndarray, share: np.ndarray, added: np.ndarray
 ) -> int:  # fmt: skip
-    """The views of a triangle's corners that see all of it: ``view`` (n,), ``share`` (n, 3) of each at the corners and
-    ``added`` (3, 3), the corners' corrections. Returns n; 0 where there is none."""
+    """Collects the views that colour a triangle: those of its corners that see all three of them. Returns their number
+    n; 0 if there is none.
+
+    Fills ``view`` (n), ``share`` (n, 3), the weight of each view at each corner, and ``added`` (3, 3), the correction
+    (codes, RGB) at each corner.
+    """
     slots, weights = choice.slots, choice.weights
     n = 0
     for c in range(3):
@@ -103,7 +109,8 @@ def gather(
 
 @njit(cache=True, nogil=True, inline="always")
 def correction_of(corners: tuple[int, int, int], c: int, k: int, channel: int, choice: Choice) -> np.floating:
-    """Of view k at corner c, or at the first other corner that takes it."""
+    """Returns the correction of view k at corner c; if that corner does not use the view, at the first other corner
+    that does."""
     for turn in range(3):
         v = corners[(c + turn) % 3]
         for s in range(choice.slots.shape[1]):
@@ -114,17 +121,15 @@ def correction_of(corners: tuple[int, int, int], c: int, k: int, channel: int, c
 
 @njit(cache=True, nogil=True)
 def paint_rows(
-    image: np.ndarray,
-    row: int,
-    rows: int,
-    which: np.ndarray,
-    texels: np.ndarray,
-    faces: np.ndarray,
-    source: np.ndarray,
-    pictures: Pictures,
-    choice: Choice,
-) -> None:
-    """Paints what the faces ``which`` cover of ``rows`` rows from ``row`` on. Blue first, as encoders want it."""
+    image: np.ndarray, row: int, rows: int, which: np.ndarray, texels: np.ndarray, faces: np.ndarray,
+    source: np.ndarray, pictures: Pictures, choice: Choice,
+) -> None:  # fmt: skip
+    """Paints the triangles ``which`` of a texture's layout into ``rows`` rows of ``image`` (h, w, 3; blue, green, red),
+    from ``row`` on, in place.
+
+    ``texels`` (n, 2) are the corners' places in the image, ``faces`` (f, 3) the layout's triangles, and ``source`` (n)
+    the vertex of the head to which each corner belongs.
+    """
     width = image.shape[1]
     code = np.zeros(3, np.float32)
     most = 3 * choice.slots.shape[1]

@@ -1,4 +1,4 @@
-"""The paper's colours (section 4.5) in a texture image: what the default is compared with."""
+"""Colours a texture image as the paper does (section 4.5), for comparison with the default method."""
 
 from collections.abc import Mapping
 
@@ -24,8 +24,8 @@ def paper_texture(
     *,
     filled: UInt8[np.ndarray, "s s 3"],
 ) -> UInt8[np.ndarray, "s s 3"]:
-    """Returns an image in which every texel is the weighted mean of the photographs that see it, as in section 4.5 of
-    the paper. Texels that no photograph sees are those of ``filled``, whose size the image has."""
+    """Returns an image in which every texel is the weighted mean of all photographs that see it (the paper, section
+    4.5). Texels that no photograph sees are taken from ``filled``, whose size the image has."""
     texels, ones = len(filled) * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, len(filled), len(filled))
     values = np.concatenate([mesh_world.vertices, mesh_world.normals()], axis=1)[layout.source].astype(np.float32)

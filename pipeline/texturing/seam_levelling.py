@@ -1,12 +1,12 @@
-"""What is added to each photograph so that photographs meet without a step.
+"""Computes what is added to each photograph so that photographs meet on the head without a visible step.
 
 Waechter et al. (2014, section 4.3, after Lempitsky and Ivanov 2007) look for smooth additive corrections that make both
-sides of every seam agree; those are determined but for what all views have wrong together. Here the correction of each
-view is the smooth field that brings it to the colour on which all views agree, wherever it sees the head (screened
-Poisson equation): a view with a shadow or a shine keeps no tint far from a seam either, and any views may be faded into
-each other. What is left at a seam (noise, detail) is faded over one ring of triangles (``pipeline.texturing.paint``).
+sides of every seam agree. These are determined only up to what all views have in common. Here the correction of a view
+is a smooth field that brings it to the colour on which all views agree, wherever the view sees the head (a screened
+Poisson equation). A view with a shadow or a highlight thus has no tint far from a seam either, and any views can be
+blended. What remains at a seam (noise, detail) is blended over one ring of triangles (``pipeline.texturing.paint``).
 
-Corrections are in sRGB codes: neither dark creases nor bright skin then take more than their share.
+Corrections are in sRGB codes, so that neither dark creases nor bright skin dominate.
 """
 
 import numpy as np
@@ -26,15 +26,16 @@ def level_views(
     around: Neighbourhood,
     smoothness: float,
 ) -> Float32[np.ndarray, "k v 4"]:
-    """Computes what is added to each view at each vertex (sRGB codes; the fourth channel is empty) so that neighbouring
-    views meet without a step.
+    """Computes what is added to each view at each vertex (sRGB codes; the fourth channel is 0) so that neighbouring
+    views meet without a visible step.
 
     Args:
-        weights: 0 where a view does not see a vertex.
-        codes: of every view at every vertex.
-        agreed: codes that the views of each vertex agree on.
+        weights: how well each view sees each vertex; 0 = not seen.
+        codes: sRGB codes of every view at every vertex.
+        agreed: codes on which the views of each vertex agree.
         around: the mesh's edges.
-        smoothness: how much dearer a difference along an edge is than one to ``agreed``.
+        smoothness: weight of a difference between corrections along an edge, relative to that of a difference to
+            ``agreed``.
     """
     fields = np.zeros((*weights.shape, 4), np.float32)
     fields[:, :, :3] = (agreed - codes) * (weights > 0)[:, :, None]

@@ -1,8 +1,8 @@
-"""A head's texture read into the texture coordinates of a template that it carries.
+"""Transfers a head's texture to the texture coordinates of a template.
 
-Every texel of the template's layout lies in one of its triangles, whose corners have places in the model's layout: the
-texture is read there. Triangles over the cut of the model's layout are filled from beside them. Coordinates beyond the
-unit square are tiles of their own (UDIM).
+Every texel of the template's layout lies in one of its triangles, whose corners have positions in the model's layout;
+the texture is read there. Triangles across the cut of the model's layout are filled from the texels beside them.
+Coordinates beyond the unit square are separate tiles (UDIM).
 """
 
 import cv2
@@ -24,8 +24,8 @@ Tile = tuple[int, int]
 
 
 def corner_tiles(mesh: PolygonMesh) -> Int[np.ndarray, "p 2"]:
-    """Returns the UDIM tile that the middle of each polygon's texture coordinates lies in; (-1, -1) for a polygon
-    without texture coordinates."""
+    """Returns the UDIM tile (column, row) of each polygon: the one that the middle of its texture coordinates lies in.
+    (-1, -1) for a polygon without texture coordinates."""
     if not len(mesh.uv):
         return np.full((len(mesh.sizes), 2), -1)
     first = np.cumsum(mesh.sizes) - mesh.sizes
@@ -36,7 +36,7 @@ def corner_tiles(mesh: PolygonMesh) -> Int[np.ndarray, "p 2"]:
 
 
 def skin_polygons(mesh: PolygonMesh, surface_binding: SurfaceBinding) -> Bool[np.ndarray, " p"]:
-    """Returns which polygons of the template have all their corners on the skin."""
+    """Tells which polygons of the template have all their corners on the skin."""
     skin = np.zeros(len(surface_binding.rest), bool)
     skin[surface_binding.skin] = True
     return np.logical_and.reduceat(skin[mesh.corners], np.cumsum(mesh.sizes) - mesh.sizes)
@@ -45,7 +45,7 @@ def skin_polygons(mesh: PolygonMesh, surface_binding: SurfaceBinding) -> Bool[np
 def template_textures(
     atlas: Atlas, mesh: PolygonMesh, surface_binding: SurfaceBinding
 ) -> dict[Tile, UInt8[np.ndarray, "s s 3"]]:
-    """Returns the texture images (sRGB) of a template by UDIM tile, for the tiles that its skin lies in; none where the
+    """Returns the texture images (sRGB) of a template, by UDIM tile, for the tiles that its skin lies in; empty if the
     template has no texture coordinates."""
     tiles, on_skin = corner_tiles(mesh), skin_polygons(mesh, surface_binding)
     found = np.unique(tiles[on_skin & (tiles[:, 0] >= 0)], axis=0)

@@ -1,14 +1,15 @@
-"""Texture (section 4.5): one colour a vertex.
+"""Computes one colour for each vertex from the photographs (section 4.5).
 
-Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour a vertex and how many images gave it.
-``blend = "reference"`` is the paper's: a vertex counts in an image if it projects inside the silhouette and nothing
-lies before it; its weight is the dot product of normal and viewing direction; its colour the weighted mean.
+Enters: the fitted mesh, the photographs, the silhouettes. Leaves: a colour for each vertex, and how many images it
+comes from. ``blend = "reference"`` is the paper's method: a vertex counts in an image if it projects inside the
+silhouette and nothing lies in front of it; its weight is the dot product of normal and viewing direction; its colour is
+the weighted mean.
 
-The default departs from it, because real cameras differ and real edges are blurred: margins at contours and occluding
-edges (``pipeline.texturing.visibility``), photographs sharpened where there is detail, gain and offset of each camera
-(``pipeline.imaging.colour_balance``), a mean in linear light that gives little to what differs from the other views in
-any channel, be it brighter (a highlight moves with the camera) or darker (a shadow that only it sees), less weight for
-cameras that had to be raised or lowered much, and a smooth fill where no camera looks.
+The default differs, because real cameras differ and real edges are blurred. It has margins at contours and occluding
+edges (``pipeline.texturing.visibility``), sharpens photographs where they have detail, and corrects gain and offset of
+each camera (``pipeline.imaging.colour_balance``). Its mean is in linear light and gives little weight to a view that
+differs from the others in any channel, be it brighter (a highlight moves with the camera) or darker (a shadow that it
+alone sees), and less weight to cameras with a large correction. Where no camera sees the head it is filled smoothly.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,8 +54,8 @@ Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texture:
-    """Holds the sRGB colour of each vertex, the number of photographs it came from (0 = filled), and the gains and
-    offsets of the cameras."""
+    """Holds the sRGB colour of each vertex, the number of photographs it comes from (0 = filled), and the gains and
+    offsets of the cameras. ``dim`` is the linear colour of each vertex in its dimmer views."""
 
     colours: UInt8[np.ndarray, "v 3"]
     views: UInt8[np.ndarray, " v"]
@@ -82,8 +83,9 @@ def texture(
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
 
-    With ``around``, the edges of the mesh, the result also names a view for each vertex. With ``dim_share`` it also
-    has, for each vertex, the colour in a dim view: views that hold this share of the vertex' weight are no brighter.
+    If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
+    ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
+    weight are no brighter.
     """
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
@@ -91,14 +93,14 @@ def texture(
     if not len(views):
         return _untextured(len(normals))
 
-    def look(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
+    def read_view(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
         image = sharpened(capture.images[name], silhouettes[name].mask, settings)
         points, silhouette = mesh_world.vertices, silhouettes[name]
         sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
         return sight, image
 
-    found = map_in_threads(lambda k: look(views.cameras[k]), len(views))
+    found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
@@ -128,8 +130,8 @@ def texture(
 def underexposed_views(
     weights: Float32[np.ndarray, "k v"], colours: Float32[np.ndarray, "k v 3"], share: float
 ) -> Float32[np.ndarray, "v 3"]:
-    """Returns for each vertex the colour (linear) in a dim view: the views that are no brighter hold ``share`` of the
-    vertex' weight. Black where no view sees the vertex."""
+    """Returns the linear colour of each vertex in a dim view: the one for which views that are no brighter have
+    ``share`` of the vertex's weight. Black where no view sees the vertex."""
     order = np.argsort(np.where(weights > 0, colours.sum(axis=2), np.inf), axis=0)
     passed = np.cumsum(np.take_along_axis(weights, order, axis=0), axis=0)
     rank = np.argmax(passed >= share * passed[-1], axis=0)
@@ -139,8 +141,8 @@ def underexposed_views(
 
 
 def gain_confidence(gains: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-    """Returns the factor, 1 at most, by which a camera's weight is lowered for its gain: an image that had to be
-    brightened much brings its noise along, and is often in shadow."""
+    """Returns the factor, at most 1, by which a camera's weight is lowered because of its gain. An image that was
+    brightened much has more noise, and is often in shadow."""
     return 1.0 / (1.0 + (np.log2(gains.mean(axis=1)) / GAIN_HALVED) ** 2)
 
 
@@ -155,7 +157,7 @@ def decide(
     around: Neighbourhood,
     settings: TextureSettings,
 ) -> Decision:
-    """Chooses a view for each vertex and computes the corrections that level the seams between views."""
+    """Chooses a view for each vertex, and computes the corrections that level the seams between views."""
     chosen = settings.selection
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
@@ -168,7 +170,7 @@ def decide(
 
 
 def usable_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
-    """Returns the cameras that have a photograph and a usable silhouette, so that they may colour the head."""
+    """Returns the cameras that have a photograph and a usable silhouette, and may therefore colour the head."""
     return rig.subset(name for name in rig.names if name in capture.images and silhouettes[name].quality.usable)
 
 
@@ -222,8 +224,8 @@ def reference_colours(
     rig: Rig,
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"], UInt8[np.ndarray, " v"]]:
-    """Computes the colours of surface points as section 4.5 of the paper does. Returns their codes, the weight behind
-    each (0: no camera sees the point) and the number of images."""
+    """Computes the colours of surface points by the paper's method (section 4.5). Returns their sRGB codes, the sum of
+    weights of each (0: no camera sees the point), and the number of images."""
     total, weights = np.zeros((len(normals), 3)), np.zeros(len(normals))
     views = np.zeros(len(normals), np.uint8)
     for camera in rig:

@@ -11,11 +11,12 @@ MIN_SHARE = 0.005  # of a vertex's weight: a view with less has not coloured it
 
 @njit(cache=True, nogil=True)
 def blend_views(weights: np.ndarray, colours: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean of each vertex, views that differ from the weighted median of each channel counting less; and their
-    number.
+    """Returns the mean colour (v, 3) of each vertex over the views, weighted by ``weights`` (k, v), and the number of
+    views that contribute. Views that differ from the weighted median of a channel count less. ``colours`` (k, v, 3) are
+    linear.
 
-    ``outlier`` is the difference from the median, by its level, at which a brighter view counts half: a highlight.
-    Darker ones, shadows of what only they see, count half at twice that.
+    ``outlier`` is the difference from the median, relative to the median, at which a brighter view (a highlight) counts
+    half. A darker view (a shadow that it alone sees) counts half at twice that.
     """
     cameras, count = weights.shape
     out = np.zeros((count, 3))

@@ -1,12 +1,12 @@
-"""Which photograph each part of the head takes its detail from.
+"""Selects the photograph from which each part of the head takes its detail.
 
-After Waechter, Moehrle and Goesele, *Let There Be Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): a
-label a vertex that minimises a data term (projected area and angle, visibility of the whole neighbourhood, how far a
-view's colour is from what the others say, be it a highlight or a shadow, and how strongly the camera had to be
-corrected) and a Potts term on the edges, dearest where the views disagree, so that seams keep out of eyes and lips.
-Labels sit at vertices in place of faces: in the ring of triangles at a seam two photographs are then faded into each
-other. Minimised by belief propagation (Felzenszwalb and Huttenlocher, *Efficient Belief Propagation for Early Vision*,
-IJCV 2006), sweeping through the vertices there and back.
+After Waechter, Moehrle and Goesele, *Let There Be Color! Large-Scale Texturing of 3D Reconstructions* (ECCV 2014): each
+vertex is labelled with a view, so that the sum of two terms is least. The data term holds projected area and angle, the
+visibility of all neighbours, how far a view's colour is from that of the others (highlight or shadow), and how strongly
+the camera had to be corrected. The Potts term holds the edges between different labels, and costs most where the views
+disagree, so that seams keep out of eyes and lips. Unlike there, labels are at vertices instead of faces: in the ring of
+triangles at a seam, two photographs are then blended. The sum is minimised by belief propagation (Felzenszwalb and
+Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006), in sweeps over the vertices forth and back.
 """
 
 import numpy as np
@@ -43,10 +43,10 @@ def select_views(
 
     Args:
         weights: of the views by angle and distance, 0 = not seen.
-        codes: of every view, gains applied.
-        levelled: the same, after ``pipeline.texturing.seam_levelling``: beside a shadow's edge that helps nothing.
-        agreed: codes that the views agree on.
-        gains: of the cameras, which multiply to one.
+        codes: sRGB codes of every view at every vertex, gains applied.
+        levelled: the same after ``pipeline.texturing.seam_levelling``, which does not remove the edge of a shadow.
+        agreed: codes on which the views agree.
+        gains: of the cameras; their product is 1.
         around: the mesh's edges.
         settings: of the selection.
     """
@@ -90,14 +90,14 @@ def add_similar_views(
     settings: SelectionSettings,
 ) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
     """Adds to the chosen view of each vertex other views that differ from it by noise alone, so that their mean has
-    less noise. Views that differ by more, as in eyes, brows and lips, are left out: blending them would blur.
+    less noise. Views that differ by more, as in eyes, brows and lips, are left out, since blending them would blur.
 
     Args:
         labels: the chosen view of each vertex, -1 = none.
         views: the candidate views of each vertex.
         quality: of the candidate views.
-        detail: codes of the levelled views.
-        weights: 0 where a view does not see a vertex.
+        detail: sRGB codes of the levelled views.
+        weights: how well each view sees each vertex; 0 = not seen.
         around: the mesh's edges.
         settings: of the selection.
 

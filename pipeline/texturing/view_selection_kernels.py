@@ -10,7 +10,8 @@ RING_SHARE = 0.7  # of a view's quality that the neighbours decide: beside an oc
 
 @njit(cache=True, nogil=True)
 def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Quality of each view (k, v): its own weight, and the least of the neighbours', which ends beside occlusions."""
+    """Returns the quality (v, k) of each view at each vertex: a mixture of its own weight and the smallest weight of
+    the neighbours, which is small beside occlusions. ``weights`` is (k, v)."""
     cameras, count = weights.shape
     out = np.zeros((count, cameras), np.float32)
     for v in range(count):
@@ -27,7 +28,8 @@ def ring_quality(weights: np.ndarray, starts: np.ndarray, indices: np.ndarray) -
 
 @njit(cache=True, nogil=True)
 def best_candidates(costs: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """The ``most`` cheapest views of each vertex, cheapest first (-1 where there are fewer), and their costs."""
+    """Returns the ``most`` cheapest views (v, most) of each vertex, the cheapest first (-1 where there are fewer), and
+    their costs. ``costs`` is (v, k)."""
     count, cameras = costs.shape
     views = np.full((count, most), -1, np.int32)
     found = np.full((count, most), NEVER, np.float32)
@@ -55,10 +57,13 @@ def propagate(
     cameras: int,
     sweeps: int,
 ) -> np.ndarray:
-    """Min-sum belief propagation with a Potts term; the place of each vertex's label among its candidates.
+    """Labels each vertex with a view by min-sum belief propagation with a Potts term. Returns the position of the label
+    among the vertex's candidates, -1 without any.
 
-    ``penalty`` is what a change of view costs along each directed edge, ``opposite`` the same edge the other way. A
-    message is kept at its edge, for the candidates of its receiver, less what it says of every other label.
+    ``views`` and ``costs`` (v, candidates) are the results of ``best_candidates``. ``penalty`` (e) is the cost of
+    different views at both ends of a directed edge; ``starts``, ``indices`` and ``opposite`` are those of
+    ``Neighbourhood``. A message is stored at its edge for the candidates of its receiver, relative to that for any
+    other label.
     """
     count, most = views.shape
     messages = np.zeros((len(indices), most), np.float32)  # of edge e = (v, w): what w tells v
@@ -109,8 +114,9 @@ def level_view(
     sweeps: int,
     factor: float,
 ) -> None:
-    """Of one view: makes of ``aims`` (v, 4) what minimises ``|c_v - aim_v|^2 + strength |c_v - c_w|^2`` over the
-    vertices that are ``seen`` and their edges, by over-relaxed Gauss-Seidel. In place."""
+    """Computes the correction of one view: replaces ``aims`` (v, 4; codes) in place by the field c that minimises
+    ``|c_v - aim_v|^2 + strength |c_v - c_w|^2``, summed over the ``seen`` vertices v and their edges (v, w), by
+    over-relaxed Gauss-Seidel."""
     rows = np.flatnonzero(seen)
     fixed = aims.copy()
     s, kept = np.float32(strength), np.float32(1.0 - factor)
@@ -136,8 +142,8 @@ def differences(
     labels: np.ndarray, views: np.ndarray, detail: np.ndarray, weights: np.ndarray, starts: np.ndarray,
     indices: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Mean square by which each candidate's detail (k, v, 3) differs from that of the chosen view, over a vertex and
-    its neighbours that both see; -1 for none."""
+    """Returns, for each candidate view (v, candidates), the mean squared difference of its detail (k, v, 3; codes) from
+    that of the chosen view, over the vertex and those neighbours that both see; -1 for none."""
     count, most = views.shape
     out = np.full((count, most), np.float32(-1.0), np.float32)
     for v in range(count):
@@ -164,8 +170,8 @@ def differences(
 def fill_slots(
     labels: np.ndarray, views: np.ndarray, shares: np.ndarray, slots: int
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """The chosen view and those of the largest shares beside it: views (v, slots), -1 = none, and shares that add up
-    to one."""
+    """Returns the chosen view of each vertex and those with the largest shares beside it: views (v, slots), -1 = none,
+    and their shares, which sum to 1."""
     count, most = views.shape
     found = np.full((count, slots), -1, np.int32)
     weight = np.zeros((count, slots), np.float32)

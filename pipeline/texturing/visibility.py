@@ -1,9 +1,9 @@
-"""Which point of a surface which camera sees, how well, and in what colour: the work of section 4.5, compiled.
+"""Computes which camera sees which point of a surface, how well, and in what colour (section 4.5).
 
-The paper asks for a projection inside the silhouette and no occlusion. Real edges are blurred and fits are not exact,
-so a margin is kept: to the contour (no background reaches the mesh), and to occluding edges of the head itself (no nose
-on the cheek behind it), where the nearest surface in a small window counts, less what the surface's own slope explains.
-A view beside an occluding edge, or at a flat angle, speaks only where there is no better one.
+The paper requires a projection inside the silhouette and no occlusion. Real edges are blurred and fits are not exact,
+so a margin is kept to the contour (no background on the mesh) and to occluding edges of the head itself (no nose on the
+cheek behind it). There the nearest surface in a small window counts, less what the surface's own slope explains. A view
+beside an occluding edge, or at a flat angle, counts only where there is no better one.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ NOISE_MARGIN = 2.0  # by which the median power is multiplied: its own scatter i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """Holds how one camera sees each point: its weight (0 = not seen) and linear colour (0 to 1)."""
+    """Holds how one camera sees each point of a surface: its weight (0 = not seen) and linear colour (0 to 1)."""
 
     weights: Float32[np.ndarray, " v"]
     colours: Float32[np.ndarray, "v 3"]
@@ -57,8 +57,8 @@ def see_points(
 def unclipped(colours: Float32[np.ndarray, "v 3"]) -> Float32[np.ndarray, " v"]:
     """Returns a factor for the weight of each colour: 1 well below the end of the scale, falling to almost 0 at it.
 
-    At the end of the scale no camera says how much brighter a point is, and a view with a longer exposure would make it
-    too dark. Where all views are clipped the result is white all the same.
+    At the end of the scale nothing shows how much brighter a point is, so that a view with a longer exposure would make
+    it too dark. Where all views are clipped the result is still white.
     """
     past = (colours.max(axis=1) - CLIPS[0]) / (CLIPS[1] - CLIPS[0])
     return np.clip(1.0 - past, POOR, 1.0).astype(np.float32)
@@ -72,7 +72,8 @@ def see_weights(
     normals: Float[np.ndarray, "v 3"],
     settings: TextureSettings,
 ) -> Float32[np.ndarray, " v"]:
-    """Returns how well ``camera`` sees each point of a surface (world frame, mm), 0 where it does not see the point."""
+    """Returns how well ``camera`` sees each point of a surface (world frame, mm); 0 where it does not. ``depth`` is the
+    surface's depth map in that camera."""
     pixels, depths = project_points(camera, points), camera_depths(camera, points)
     towards = camera.centre_world - points
     facing = np.einsum("vi,vi->v", normals, towards) / np.sqrt(np.einsum("vi,vi->v", towards, towards))
@@ -90,11 +91,10 @@ def see_weights(
 def sharpened(
     image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], settings: TextureSettings
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the photograph with part of the blur of the lens and of the sampling window taken back where the
-    photograph has detail.
+    """Sharpens a photograph where it has detail, which removes part of the blur of the lens and of the sampling window.
 
-    An unsharp mask would raise the noise, too. It is therefore scaled as a Wiener filter is: by the share of the local
-    power that is more than noise. Most of a head is smooth, so the median power over the head is taken for noise.
+    Plain sharpening would amplify noise as well. It is therefore scaled as in a Wiener filter: by the share of the
+    local power that is more than noise. Most of a head is smooth, so the median power over the head is taken for noise.
     """
     box = box_around(inside, 0)
     if not settings.sharpening or not inside[box].size:

@@ -11,6 +11,7 @@ POOR = 1e-4  # weight of a view that has nothing but excuses, by that of a good 
 
 @njit(cache=True, nogil=True, inline="always")
 def nearest_sample(depth: np.ndarray, row: int, column: int, reach: int) -> float:
+    """Returns the smallest depth (mm) within ``reach`` pixels of a pixel, across and down."""
     nearest = np.inf
     for j in range(max(0, row - reach), min(depth.shape[0], row + reach + 1)):
         for i in range(max(0, column - reach), min(depth.shape[1], column + reach + 1)):
@@ -28,6 +29,22 @@ def visibility_weights(
     pixel_angle: float,
     limits: tuple[float, float, float, float],
 ) -> np.ndarray:
+    """Returns how well one camera sees each point (v), float32; 0 where it does not.
+
+    A point counts if it lies inside the silhouette by a margin, and no nearer surface of the depth map hides it. Its
+    weight is cosine^sharpness / depth^2, reduced towards the margin, and ``POOR`` times that at a flat angle or beside
+    an occluding edge.
+
+    Args:
+        pixels: of the points (v, 2).
+        depths: of the points along the camera's z axis, mm.
+        facing: cosine between normal and line of sight.
+        depth: the surface's depth map, mm.
+        distance: signed distance to the silhouette, px.
+        pixel_angle: width of a pixel at a depth of 1.
+        limits: margin to the silhouette (px), depth by which a nearer surface hides a point (mm), smallest cosine of a
+            good view, and the exponent of the cosine.
+    """
     margin, hidden, least, sharpness = limits
     height, width = depth.shape
     weights = np.zeros(len(depths), np.float32)
@@ -58,9 +75,11 @@ def visibility_weights(
 def sample_colours(
     image: np.ndarray, pixels: np.ndarray, weights: np.ndarray, table: np.ndarray, sigma: float
 ) -> np.ndarray:
-    """Linear colours in a Gaussian window of 4 x 4 pixels around each projection: less noise than one sample has.
+    """Returns the linear colours (v, 3) of the points with a weight, from a Gaussian window of 4 x 4 pixels around each
+    projection, which has less noise than a single sample.
 
-    The window averages codes: its noise is even there, and a dark crease does not drown in the light beside it.
+    The window averages sRGB codes, in which noise is even and a dark crease is not outshone by the light beside it.
+    ``table`` is the linear light of each code, ``sigma`` the window's width in px.
     """
     height, width = image.shape[:2]
     out = np.zeros((len(weights), 3), np.float32)

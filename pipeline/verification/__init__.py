@@ -1,1 +1,2 @@
-"""Is a result right, and does it repeat? Meshes and landmarks enter, judgements leave, whoever made the heads."""
+"""Judges whether a result is right, and whether it repeats. Meshes and landmarks enter, judgements leave, whatever
+program made the heads."""

@@ -1,11 +1,11 @@
-"""Laying a measured head on its reference: a rigid motion, least squares of the distances to the surface.
+"""Lays a measured head on its reference by a rigid motion: least squares of the distances to the surface.
 
-The reference has a frame of its own. The motion starts from landmarks where both have them, else from a search: turns
-spread over all of them, the head's middle at the middles of parts of the scan, each improved by iterations of closest
-points (Besl and McKay 1992, https://doi.org/10.1109/34.121791) with points of the head, and the best of them over the
-face. It ends with Gauss-Newton steps on distances along the reference's normals (Chen and Medioni 1992) over the face,
-by area: the best fit of a standard's test, in which size has no part. How much larger or smaller the measured head is,
-is found afterwards by the same steps with a scale, and reported.
+The reference has its own frame. The motion starts from landmarks where both have them, else from a search: rotations
+spread over all directions, with the head's middle at the middles of parts of the scan. Each start is improved by
+iterations of closest points (Besl and McKay 1992, https://doi.org/10.1109/34.121791), and the one with the best fit of
+the face wins. Gauss-Newton steps on distances along the reference's normals (Chen and Medioni 1992) over the face,
+weighted by area, complete the motion. It is a standard's best fit, in which size has no part. The size error is found
+afterwards by the same steps with a scale, and reported.
 """
 
 from dataclasses import dataclass
@@ -52,9 +52,12 @@ ROUNDS = (Round(50, 6, 0.7, 60), Round(100, 12, 0.7, 16), Round(240, 25, 0.6, 8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BestFit:
-    """Holds the rigid motion that lays a head on its reference. ``start``: landmarks or search. ``scale``: size of the
-    measured head relative to the reference, 1 = right. ``rms_mm``: RMS distance after the rigid motion; ``points`` of
-    the fitted points had a counterpart."""
+    """Holds the rigid motion that lays a head on its reference.
+
+    ``start`` is "landmarks" or "search". ``rms_mm`` is the RMS distance after the rigid motion, over the ``points``
+    that have a counterpart on the reference. ``scale`` is the size of the measured head relative to the reference, 1 =
+    right.
+    """
 
     reference_from_world: RigidTransform
     start: str
@@ -90,7 +93,7 @@ def best_fit(measured: Measured, reference: Reference) -> BestFit:
 
 
 def counted(hits: Hits, reference: Reference) -> Bool[np.ndarray, " n"]:
-    """Tells which closest points are valid counterparts: near, and not at the rim of the scan."""
+    """Tells which closest points are valid counterparts: near enough, and not at an open edge of the scan."""
     return (hits.distances < FAR_MM) & ~reference.beside(hits)
 
 

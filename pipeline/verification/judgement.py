@@ -35,8 +35,8 @@ MIN_FACING = 0.5  # share of the judged face where both surfaces face the same w
 
 @dataclass(frozen=True, slots=True)
 class RegionError:
-    """Holds the deviations (mm) of a region, weighted by area; ``covered`` is the share of its area that the reference
-    shows."""
+    """Holds the deviations (mm) of a region of the head, weighted by area. ``covered`` is the share of the region's
+    area that the reference shows."""
 
     covered: float
     mean_mm: float
@@ -47,8 +47,8 @@ class RegionError:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Holds the judgement of one capture. ``deviation_mm`` is NaN at vertices without a counterpart on the
-    reference."""
+    """Holds the judgement of one capture. ``deviation_mm`` is the signed distance of each vertex to the reference, NaN
+    where it has no counterpart."""
 
     name: str
     fit: BestFit
@@ -60,18 +60,23 @@ class Judged:
 
     @property
     def size_error_percent(self) -> float:
+        """Returns by how many percent the head is too large; negative if it is too small."""
         return 100.0 * (self.fit.scale - 1.0)
 
     @property
     def distance_rms_mm(self) -> float | None:
+        """Returns the RMS error (mm) of the distances between landmarks; None without any distance."""
         off = [measured - true for measured, true in self.distances_mm.values()]
         return float(np.sqrt(np.mean(np.square(off)))) if off else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judgement:
-    """Holds the judgement of all captures together. ``repeatability`` has the figures of ``Scatter`` by region, empty
-    for one capture; ``repeated`` the errors of the mean deviation over the captures."""
+    """Holds the judgement of all captures together.
+
+    ``repeated_mm`` is the mean deviation over the captures at each vertex, ``repeated`` its errors by region.
+    ``repeatability`` has the figures of ``Scatter`` by region; it is empty for a single capture.
+    """
 
     captures: tuple[Judged, ...]
     repeated_mm: Float[np.ndarray, " v"]
@@ -81,13 +86,14 @@ class Judgement:
 
     @property
     def passed(self) -> bool:
-        """Tells whether no limit is missed. Figures that could not be judged (no landmarks, a single capture) count as
-        no failure."""
+        """Tells whether all limits are kept. A figure that could not be judged (no landmarks, a single capture) does
+        not fail."""
         return all(check.passed is not False for check in self.checks)
 
 
 def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
-    """Judges heads of one model against the reference. Raises InputError if the reference is not of this head."""
+    """Judges heads of one model and one subject against the reference. Raises InputError if the reference is not of
+    this head."""
     captures = tuple(judge_one(one, reference) for one in measured)
     first = measured[0]
     deviations = np.stack([one.deviation_mm for one in captures])
@@ -106,8 +112,8 @@ def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) ->
 
 
 def judge_one(measured: Measured, reference: Reference) -> Judged:
-    """Judges one head against the reference. Raises InputError if the reference is not of this head, or is inside
-    out."""
+    """Judges one head against the reference. Raises InputError if the reference is not of this head, or its faces look
+    inwards."""
     fit = best_fit(measured, reference)
     there = fit.reference_from_world.apply(measured.mesh_world.vertices)
     hits = reference.index.closest(there)
@@ -147,7 +153,7 @@ def _region_error(deviation_mm: Float[np.ndarray, " n"], areas: Float[np.ndarray
 
 
 def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], share: float) -> float:
-    """Returns the range of the values that holds the given share of the weight, with the rest cut off half on each
+    """Returns the range of the values that holds the given share of the weight; half of the rest is cut off on each
     side."""
     low, high = weighted_quantiles(values, weights, (0.5 - share / 2, 0.5 + share / 2))
     return high - low
@@ -156,14 +162,15 @@ def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, "
 def weighted_quantiles(
     values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], shares: Sequence[float]
 ) -> list[float]:
+    """Returns the value below which each of the given shares (0 to 1) of the total weight lies, interpolated."""
     order = np.argsort(values)
     reached = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
     return np.interp(shares, reached, values[order]).tolist()
 
 
 def distance_pairs(measured: Measured, reference: Reference) -> dict[str, tuple[float, float]]:
-    """Returns every anthropometric distance whose landmarks both the head and the reference have: measured, and of the
-    reference (mm)."""
+    """Returns every anthropometric distance (mm) whose landmarks both the head and the reference have: measured on the
+    head, and on the reference."""
     found = {}
     for name, (one, other) in DISTANCES.items():
         if all(mark in marks for mark in (one, other) for marks in (measured.landmarks, reference.landmarks)):

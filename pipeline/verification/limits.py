@@ -1,6 +1,6 @@
-"""What a studio must reach: limits, each of which a user may set, and their verdicts.
+"""Holds what a studio must reach: limits, each of which a user may set, and checks of figures against them.
 
-The default limits are near one and a half times what the simulated studio reaches with a bare mannequin of another
+The default limits are about one and a half times what the simulated studio reaches with a bare mannequin of another
 population than the model's (docs/lab-notes/verification.md), so that a sound rig passes and one with a lasting fault
 does not.
 """
@@ -14,7 +14,8 @@ from pipeline.settings import read_table
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Holds the limit of each figure of a verification: the most it may be, but for ``least_covered`` the least."""
+    """Holds the limit of each figure of a verification: the largest value allowed, except for ``least_covered``, which
+    is the smallest."""
 
     face_rms_mm: float = 0.35  # deviation from the reference, of any capture
     features_rms_mm: float = 0.8  # the same of eyes, nose and mouth, the worst of them
@@ -27,7 +28,8 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Holds a figure beside its limit; ``value`` is None if the captures or the reference do not provide it."""
+    """Holds a figure beside its limit. ``value`` and ``passed`` are None if the captures or the reference do not
+    provide the figure."""
 
     name: str
     value: float | None

@@ -1,4 +1,4 @@
-"""A result folder as it is judged: the head, what it states of itself, and its landmarks."""
+"""Reads a result folder for its judgement: the head, its stated standard deviations, and its landmarks."""
 
 import json
 from collections.abc import Mapping
@@ -20,7 +20,8 @@ from rig.mesh import Mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Holds one reconstructed head. ``stated_mm``: the standard deviation along the normals that its result states."""
+    """Holds one reconstructed head. ``stated_mm`` is the standard deviation along the normal that its result states for
+    each vertex."""
 
     name: str
     mesh_world: Mesh
@@ -41,11 +42,12 @@ class ResultIdentity:
 
 
 def is_result(folder: Path) -> bool:
+    """Tells whether a folder holds the result of a reconstruction: a report.json and a head.ply."""
     return (folder / "report.json").is_file() and (folder / "head.ply").is_file()
 
 
 def identity_of(folder: Path) -> ResultIdentity:
-    """Returns which model made a result. Raises InputError if report.json does not say it."""
+    """Returns which model made a result. Raises InputError if report.json is missing, damaged or does not say it."""
     try:
         model = _report(folder)["model"]
         return ResultIdentity(str(model["name"]), str(model["sha256"]))
@@ -54,7 +56,8 @@ def identity_of(folder: Path) -> ResultIdentity:
 
 
 def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
-    """Reads a result folder that was made with ``model``. Raises InputError that names what does not fit."""
+    """Reads a result folder that was made with ``model``. Raises InputError that names each file or field that does not
+    fit."""
     report = _report(folder)
     mesh, stated_mm = read_head_ply(folder / "head.ply")
     full = model.levels["full"]

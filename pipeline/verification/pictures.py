@@ -1,4 +1,4 @@
-"""Pictures of a certificate: the reference and the result in clay, and the error on the result in colours."""
+"""Draws the pictures of a certificate: the reference and the result in clay, and the error on the result in colours."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +27,8 @@ SHOWN = 0.95  # share of the face that lies within the ends of the scale
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pictures:
-    """Holds rows of pictures from ``AZIMUTHS_DEG``; ``end_mm`` is the error (mm) at the ends of the colour scale."""
+    """Holds three rows of pictures, seen from ``AZIMUTHS_DEG``. ``end_mm`` is the error (mm) at the ends of the colour
+    scale."""
 
     reference: tuple[Resized, ...]
     result: tuple[Resized, ...]
@@ -36,8 +37,8 @@ class Pictures:
 
 
 def draw(first: Measured, reference: Reference, judgement: Judgement) -> Pictures:
-    """Draws all pictures. ``first``: the head of the first capture in ``judgement``; the error drawn on it is the one
-    that all captures have in common."""
+    """Draws all pictures. ``first`` is the head of the first capture in ``judgement``. The error drawn on it is the
+    mean error over all captures."""
     head = first.head_from_world.apply(first.mesh_world.vertices)
     fitted = Mesh(head, first.mesh_world.faces)
     head_from_reference = first.head_from_world @ judgement.captures[0].fit.reference_from_world.inverse()
@@ -53,15 +54,16 @@ def draw(first: Measured, reference: Reference, judgement: Judgement) -> Picture
 
 
 def scale_end(deviation_mm: Float[np.ndarray, " n"]) -> float:
-    """Returns the smallest of ``STEPS_MM`` that is larger than most of the deviations."""
+    """Returns the end of a colour scale (mm): the smallest of ``STEPS_MM`` that is larger than most of the
+    deviations."""
     known = np.abs(deviation_mm[np.isfinite(deviation_mm)])
     wanted = float(np.quantile(known, SHOWN)) if len(known) else 0.0
     return next((step for step in STEPS_MM if step >= wanted), STEPS_MM[-1])
 
 
 def heat_colours(deviation_mm: Float[np.ndarray, " v"], end_mm: float) -> UInt8[np.ndarray, "v 3"]:
-    """Returns a colour for each deviation: blue where the result lies inside the reference, red where outside, white
-    where they agree."""
+    """Returns a colour for each deviation: blue where the result lies inside the reference, red where it lies outside,
+    white where they agree, grey where unknown. The colours saturate at ``end_mm``."""
     place = np.clip(np.nan_to_num(deviation_mm) / end_mm, -1.0, 1.0)
     stops = np.linspace(-1.0, 1.0, len(RAMP))
     colours = np.stack([np.interp(place, stops, RAMP[:, channel]) for channel in range(3)], axis=1)

@@ -29,7 +29,8 @@ ON_EDGE = 1e-9  # a corner's share of a closest point that lies on the edge acro
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """Holds a scan (mm, in a frame of its own) with an index for closest points. ``landmarks`` may be empty."""
+    """Holds a scan of the subject (mm, in a frame of its own) with an index for closest points. ``rim`` lists the
+    scan's open edges; ``landmarks`` may be empty."""
 
     name: str
     sha256: str
@@ -42,7 +43,8 @@ class Reference:
     def of(
         cls, mesh: Mesh, landmarks: Mapping[str, Float[np.ndarray, " 3"]], name: str = "reference", sha256: str = ""
     ) -> "Reference":
-        """Checks and prepares a mesh without repeated vertices. Raises InputError with every fault."""
+        """Checks a mesh and prepares it as a reference. The mesh has no repeated vertices. Raises InputError with every
+        fault."""
         faults = [*_surface_faults(mesh), *_landmark_faults(mesh, landmarks)]
         if faults:
             raise InputError(name, faults)
@@ -50,7 +52,7 @@ class Reference:
         return cls(name, sha256, mesh, dict(landmarks), SurfaceIndex(mesh.vertices, mesh.faces, SPACING_MM), rim)
 
     def beside(self, hits: Hits) -> Bool[np.ndarray, " n"]:
-        """Tells which closest points lie on an open edge of the scan, and so are no counterparts."""
+        """Tells which closest points lie on an open edge of the scan and are therefore no counterparts."""
         corners, off = self.mesh.faces[hits.triangles], hits.weights < ON_EDGE
         found = np.zeros(len(corners), bool)
         for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
@@ -60,8 +62,8 @@ class Reference:
 
 
 def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
-    """Reads a scan with its landmarks: from the given file or, without one, from the file of the same name beside the
-    scan, if there is one. Raises InputError that names every fault."""
+    """Reads a scan with its landmarks: from the file ``landmarks`` or, if None, from the file of the same name beside
+    the scan if there is one. Raises InputError that names every fault."""
     vertices, faces = welded(read_mesh(path))
     landmarks_path = landmarks or landmark_file(path)
     marks = {} if landmarks_path is None else read_landmarks(landmarks_path)

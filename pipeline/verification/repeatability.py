@@ -1,7 +1,7 @@
-"""Repeatability: how far heads of one subject, shot several times, are from each other.
+"""Measures repeatability: how far heads of one subject, shot several times, are from each other.
 
-The heads have the model's own vertices, so that a vertex is compared with itself. Where the subject sat is taken away
-by rigid motions, never by a scale: each head is laid on the mean of all over the given vertices, and the mean is taken
+All heads have the model's own vertices, so that each vertex is compared with itself. Rigid motions, without scale,
+remove where the subject sat: each head is laid on the mean of all over the given vertices, and the mean is computed
 anew (generalised Procrustes analysis without scale; Gower 1975, https://doi.org/10.1007/BF02291478).
 """
 
@@ -21,9 +21,11 @@ STILL_MM = 1e-7  # a mean that moves by less is the mean
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """Holds how each vertex scatters over several shots of one subject, as standard deviations (mm) about the mean
-    head, which lies where the first head does: ``position_mm`` over all three directions together, ``normal_mm`` along
-    the mean head's normal."""
+    """Holds how each vertex scatters over several shots of one subject: standard deviations (mm) about the mean head.
+
+    ``position_mm`` is over all three directions together, ``normal_mm`` along the mean head's normal. The mean head
+    lies where the first head does.
+    """
 
     mean: Float[np.ndarray, "v 3"]
     position_mm: Float[np.ndarray, " v"]
@@ -32,10 +34,12 @@ class Scatter:
     def figures(
         self, stated_mm: Float[np.ndarray, " v"], weights: Float[np.ndarray, " v"], kept: Bool[np.ndarray, " v"]
     ) -> dict[str, float]:
-        """Returns figures over the ``kept`` vertices, by weight: RMS of the scatter, and beside it the stated deviation
-        (mm, along the normal). ``scatter_over_stated`` is 1 where the stated deviation is all scatter, less where part
-        of it is an error that each shot repeats; ``rank_correlation`` says whether vertices stated as worse scatter
-        more."""
+        """Returns figures over the ``kept`` vertices, weighted by ``weights``: the RMS scatter and, beside it, the
+        stated deviation (mm, along the normal).
+
+        ``scatter_over_stated`` is their ratio: 1 if the stated deviation is all scatter, less if part of it is an error
+        that each shot repeats. ``rank_correlation`` says whether vertices with a larger stated deviation scatter more.
+        """
         share = weights[kept] / weights[kept].sum()
         position, normal, stated = self.position_mm[kept], self.normal_mm[kept], stated_mm[kept]
         rms, along, said = (float(np.sqrt(share @ values**2)) for values in (position, normal, stated))
@@ -56,8 +60,8 @@ class Scatter:
 def scatter(
     heads: Float[np.ndarray, "n v 3"], faces: Int[np.ndarray, "f 3"], laid_on: Bool[np.ndarray, " v"]
 ) -> Scatter:
-    """Computes the scatter of two or more heads (mm, any frames) with the same vertices, after laying them on each
-    other over the vertices ``laid_on``."""
+    """Computes the scatter of two or more heads (mm, each in its own frame) with the same vertices. The heads are first
+    laid on each other over the vertices ``laid_on``."""
     if len(heads) < 2:
         raise ValueError(f"{len(heads)} heads have no scatter; two are needed")
     mean = heads[0]
@@ -81,5 +85,5 @@ def by_region(
     weights: Float[np.ndarray, " v"],
     regions: Mapping[str, Bool[np.ndarray, " v"]],
 ) -> dict[str, dict[str, float]]:
-    """Returns ``Scatter.figures`` of every region that has vertices."""
+    """Returns the figures of ``Scatter.figures`` for every region that has vertices."""
     return {name: found.figures(stated_mm, weights, kept) for name, kept in regions.items() if kept.any()}

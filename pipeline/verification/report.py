@@ -16,7 +16,8 @@ FORMAT = "eigenhead-verification/1"
 
 
 class RegionReport(TypedDict):
-    """Holds the errors of a region (mm); ``covered`` is the share of its area that the reference shows."""
+    """Describes the errors of a region of the head (mm); ``covered`` is the share of its area that the reference
+    shows."""
 
     covered: float
     mean_mm: float
@@ -26,7 +27,7 @@ class RegionReport(TypedDict):
 
 
 class AlignmentReport(TypedDict):
-    """Holds the motion ``x_reference = rotation @ x_world + translation``, and how it was found."""
+    """Describes the motion ``x_reference = rotation @ x_world + translation`` (mm), and how it was found."""
 
     method: str
     start: str
@@ -39,12 +40,17 @@ class AlignmentReport(TypedDict):
 
 
 class DistanceReport(TypedDict):
+    """Describes a distance between two landmarks (mm): on the measured head, on the reference, and measured minus
+    reference."""
+
     measured_mm: float
     reference_mm: float
     error_mm: float
 
 
 class CaptureReport(TypedDict):
+    """Describes the judgement of one capture. ``warnings`` are the codes of its result."""
+
     alignment: AlignmentReport
     probing_form_mm: float
     size_error_percent: float
@@ -55,7 +61,8 @@ class CaptureReport(TypedDict):
 
 
 class CheckReport(TypedDict):
-    """Holds a figure and its limit; ``passed`` is null if the captures or the reference do not provide the figure."""
+    """Describes a figure and its limit; ``value`` and ``passed`` are null if the captures or the reference do not
+    provide the figure."""
 
     value: float | None
     limit: float
@@ -63,6 +70,8 @@ class CheckReport(TypedDict):
 
 
 class ReferenceReport(TypedDict):
+    """Describes the scan that was the reference: its name and digest, its size, and the names of its landmarks."""
+
     name: str
     sha256: str
     vertices: int
@@ -71,7 +80,7 @@ class ReferenceReport(TypedDict):
 
 
 class VerificationReport(TypedDict):
-    """``report.json``."""
+    """Describes ``report.json`` of a verification."""
 
     format: str
     version: str
@@ -88,7 +97,7 @@ class VerificationReport(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Occasion:
-    """What a judgement is of, for its papers. ``date`` is the day of the test, ISO 8601."""
+    """Holds what a report says besides the judgement: the day of the test (ISO 8601), the model, and the limits."""
 
     date: str
     model: ResultIdentity
@@ -96,6 +105,7 @@ class Occasion:
 
 
 def report_document(judgement: Judgement, reference: Reference, occasion: Occasion) -> VerificationReport:
+    """Returns ``report.json`` of a verification, as JSON types."""
     return {
         "format": FORMAT,
         "version": version("eigenhead"),

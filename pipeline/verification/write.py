@@ -18,7 +18,8 @@ from rig.formats.images import write_image
 def write_verification(
     folder: Path, first: Measured, reference: Reference, judgement: Judgement, occasion: Occasion
 ) -> VerificationReport:
-    """Writes the files, report.json last, and returns what it holds. ``first``: the head of the first capture."""
+    """Writes the files of a verification, report.json last, and returns the report. ``first`` is the head of the first
+    capture."""
     document, pictures = report_document(judgement, reference, occasion), draw(first, reference, judgement)
     rows = [np.hstack(row) for row in (pictures.reference, pictures.result, pictures.error)]
     write_image(folder / "error.png", np.vstack(rows))

@@ -1,4 +1,5 @@
-"""Decides which views a job may use: pictures exchanged, cameras moved, another rig's poses, no head's size.
+"""Decides which views a job may use. Finds exchanged pictures, cameras that moved, a calibration of another rig, and
+outlines too large or small for a head.
 
-Enters: silhouettes and the rig. Leaves: the views that agree, put right where one reading is certain, and warnings.
+Enters: silhouettes and the rig. Leaves: the views that agree, corrected where the correction is certain, and warnings.
 """

@@ -1,12 +1,12 @@
-"""Does every camera hold its own picture? Asked of the silhouettes and the calibration, before anything is fitted.
+"""Checks whether every picture is filed under the camera that took it, before anything is fitted.
 
-Cables are plugged in the wrong way, files are renamed: then two cameras hold each other's pictures, or three in a ring,
-or all of them are off by one. The planes through two camera centres that touch the subject touch both silhouettes (Wong
-and Cipolla, *Structure and motion from silhouettes*, ICCV 2001), and they do so only where each silhouette stands under
-the camera that saw it: right pictures miss by tenths of a pixel, exchanged ones by tens.
+If cables are plugged in wrongly or files renamed, two cameras hold each other's pictures, or three in a ring, or all
+are off by one. The planes through two camera centres that touch the subject touch both silhouettes (Wong and Cipolla,
+*Structure and motion from silhouettes*, ICCV 2001), but only if each silhouette belongs to its camera: right pictures
+miss by tenths of a pixel, exchanged ones by tens.
 
 Enters: silhouettes and the rig. Leaves: which picture each camera should have, and how sure that is. A camera that was
-knocked, or whose mask is bad, contradicts the others under every picture and keeps its own.
+moved, or whose mask is bad, contradicts the others with every picture, and keeps its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,11 +50,11 @@ MIN_CAMERAS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assignment:
-    """Holds which cameras hold each other's pictures. ``pictures``: for every camera that holds another's picture, the
-    name under which its own is filed.
+    """Holds which cameras hold each other's pictures. ``pictures`` has an entry for every camera that holds another's
+    picture: the name under which its own is filed.
 
-    ``gain`` is how much less misfit the tangent planes have after the exchange; ``overwhelming`` whether that leaves no
-    doubt.
+    ``gain`` is how much smaller the misfit of the tangent planes is after the exchange; ``overwhelming`` whether that
+    leaves no doubt.
     """
 
     pictures: Mapping[str, str]
@@ -73,15 +73,15 @@ NOTHING = Assignment({})
 
 
 def find_assignment(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Assignment:
-    """Finds the exchange of pictures among cameras of one image size that makes the tangent planes of the silhouettes
-    agree.
+    """Finds the exchange of pictures among cameras of the same image size that makes the tangent planes of the
+    silhouettes agree.
 
     Args:
-        silhouettes: by camera; views without a mask are left out of the question.
+        silhouettes: by camera; views without a mask are ignored.
         rig: the cameras as calibrated.
 
     Returns:
-        An empty assignment where every camera holds its own picture, or where no exchange explains what is wrong.
+        An empty assignment if every camera holds its own picture, or if no exchange explains the disagreement.
     """
     seen = with_masks(silhouettes, rig)
     if len(seen) < MIN_CAMERAS:
@@ -104,7 +104,7 @@ def own_misfit(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, flo
 
 
 def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
-    """Returns the rings of an exchange: in (a, b, c) camera a's picture is filed under b, b's under c, and c's under
+    """Returns the cycles of an exchange. In (a, b, c) camera a's picture is filed under b, b's under c, and c's under
     a."""
     left, found = dict(pictures), []
     while left:
@@ -118,7 +118,7 @@ def rings(pictures: Mapping[str, str]) -> list[tuple[str, ...]]:
 
 
 def ring_messages(pictures: Mapping[str, str], what: Message) -> list[Message]:
-    """Returns one message for each ring of an exchange."""
+    """Returns one message for each cycle of an exchange; ``what`` names the things that were exchanged."""
     return [_ring_message(ring, what) for ring in rings(pictures)]
 
 
@@ -134,7 +134,7 @@ def _ring_message(ring: tuple[str, ...], what: Message) -> Message:
 
 
 def with_masks(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Rig:
-    """Returns the cameras whose mask is thicker than a few pixels somewhere."""
+    """Returns the rig with only those cameras whose mask is thicker than a few pixels somewhere."""
     return rig.subset(
         name for name in rig.names if name in silhouettes and silhouettes[name].distance.min() < -INSET_PX
     )
@@ -146,8 +146,8 @@ def _any_suspect(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> bool:
 
 
 def tangency_errors_px(hulls: Sequence[Float[np.ndarray, "_ 2"]], rig: Rig) -> Float[np.ndarray, "n n 2"]:
-    """Returns how far (px of both images together) the tangent planes of every two cameras miss each other, with all
-    pictures as filed."""
+    """Returns by how much (px of both images together) the two tangent planes of every pair of cameras miss each other,
+    with all pictures as filed. ``hulls`` are the outlines' convex hulls, px."""
     cameras = list(rig)
     touches = [_touches(camera, hulls[i : i + 1], i, cameras) for i, camera in enumerate(cameras)]
     angle, step = (np.stack([touch[k][0] for touch in touches]) for k in range(2))
@@ -161,8 +161,8 @@ def _miss_px(gap: Float[np.ndarray, "*n"], step: Float[np.ndarray, "*n"]) -> Flo
 
 
 def mean_misfit(errors_px: Float[np.ndarray, "n n 2"], cut_off: float | None = None) -> Float[np.ndarray, " n"]:
-    """Returns the mean robust misfit of each camera's tangent planes. Planes hidden by the image border count as
-    ``cut_off`` or, if None, not at all."""
+    """Returns the mean robust misfit of each camera's tangent planes. Planes that the image border hides count as
+    ``cut_off``; if that is None they do not count."""
     there = np.isfinite(errors_px)
     of_each = np.where(there, _robust(errors_px, ROBUST_SIGMAS * _noise_px(errors_px[there])), cut_off or 0.0)
     count = there.sum(axis=(1, 2)) if cut_off is None else 2 * (len(errors_px) - 1)

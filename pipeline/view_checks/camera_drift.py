@@ -1,16 +1,17 @@
-"""Has a camera moved since the calibration? Asked of every capture, before the fit, of the silhouettes alone.
+"""Checks whether a camera has moved since the calibration, for every capture before the fit, from the silhouettes
+alone.
 
 The planes through two camera centres that touch the subject touch both silhouettes: epipolar tangency, at frontier
 points (Ramanathan, Steinbach and Girod 2000, the paper's reference for calibration from silhouettes). Hair and
-shoulders are as good as skin, since the subject is rigid within a shot. Eleven cameras give about fifty such equations,
-good to 0.2 px. A camera that was turned by a small angle shifts its whole image; its equations then agree on one shift,
-and only its own do.
+shoulders serve as well as skin, since the subject is rigid within a shot. Eleven cameras give about fifty such
+equations, exact to 0.2 px. A camera that was turned by a small angle shifts its whole image; all equations of that
+camera then agree on one shift.
 
-A loose mask reaches too far on every side, a shifted image on one side only: tangencies on opposite sides tell them
-apart. A close-up has most of them on one side and twice the pixels a millimetre; there both explain what is seen, the
-camera is named with both, and its view is kept. Strands of hair that one camera resolves and another does not would be
-misses of several pixels: planes touch a line inside the outline, which no strand reaches, equally deep in space for
-every camera.
+A loose mask is too large on every side, while a shifted image is off in one direction: tangencies on opposite sides
+distinguish the two. In a close-up most of them are on one side, with twice the pixels per millimetre; there both
+explain the observation, the camera is reported with both, and its view is kept. Strands of hair that one camera
+resolves and another does not would be misses of several pixels. So the planes touch a curve inside the outline, which
+no strand reaches, at the same depth in mm for every camera.
 
 Enters: silhouettes and the rig. Leaves: the cameras that have moved, how far, how sure.
 """
@@ -47,9 +48,16 @@ CHANCE = 0.01  # that a good camera disagrees so much with the rest (F test)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """Holds a camera whose silhouette lies off where the calibration predicts: the shift (px) and its standard
-    deviation, the turn (degrees) that would explain it, and the shift in standard deviations, all assuming a tight
-    mask. ``moved``: a loose mask cannot explain the shift, and the other cameras agree better without this camera."""
+    """Holds a camera whose silhouette lies off the position that the other cameras predict.
+
+    Attributes:
+        camera: its name.
+        shift_px: the shift of its image, assuming a tight mask.
+        deviation_px: standard deviation of the shift.
+        turn_deg: rotation of the camera that would cause it.
+        sigmas: the shift in standard deviations.
+        moved: whether a loose mask cannot explain the shift, and the other cameras agree better without this one.
+    """
 
     camera: str
     shift_px: Float[np.ndarray, " 2"]
@@ -60,11 +68,11 @@ class Drift:
 
     @property
     def code(self) -> str:
-        """Returns the code of the warning for this camera."""
+        """Returns the code of the warning about this camera."""
         return "camera-moved" if self.moved else "mask-loose"
 
     def warning(self) -> Message:
-        """Returns the warning for the report."""
+        """Returns the warning about this camera."""
         shift_px = float(np.linalg.norm(self.shift_px))
         if not self.moved:
             return compose("mask-loose", camera=self.camera, shift_px=shift_px, turn_deg=self.turn_deg)
@@ -78,8 +86,8 @@ class Drift:
 
 
 def find_drift(silhouettes: Mapping[str, Silhouette], rig: Rig) -> tuple[Drift, ...]:
-    """Finds cameras that have moved since the calibration, or seem to because of a loose mask; the largest shift comes
-    first.
+    """Finds cameras that have moved since the calibration, or seem to have because of a loose mask, in the order of
+    their shifts (largest first).
 
     The worst camera is removed before the next one is searched, since it disturbs the equations of its neighbours.
     """
@@ -125,9 +133,12 @@ def _normalised(tangencies: list[Tangency]) -> Float[np.ndarray, " n"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShiftEquations:
-    """Holds the equations ``normal . shift + outward * loose = excess`` of one camera's tangencies, in its pixels.
-    ``pixels`` is the error of each equation for an error of one pixel in both pictures; ``contour_noise_px`` is the
-    error of the contours."""
+    """Holds the equations ``normal . shift + outward * loose = excess`` of one camera's n tangencies, in its pixels.
+    Unknown are the shift of its image and by how many pixels its mask is too large all around (``loose``).
+
+    ``outward`` is 1 where ``normal`` points out of the subject, else -1. ``pixels`` is the error of each equation if
+    contours in both pictures are wrong by one pixel; ``contour_noise_px`` is the standard deviation of the contours.
+    """
 
     normals: Float[np.ndarray, "n 2"]
     outward: Float[np.ndarray, " n"]
@@ -137,10 +148,12 @@ class ShiftEquations:
 
     @property
     def noise_px(self) -> Float[np.ndarray, " n"]:
+        """Returns the standard deviation of each equation, px."""
         return self.contour_noise_px * self.pixels
 
     @classmethod
     def of(cls, name: str, tangencies: list[Tangency], contour_noise_px: float) -> "ShiftEquations":
+        """Builds the equations of the camera ``name`` from those tangencies in which it takes part."""
         involved = [(t, side) for t in tangencies for side in range(2) if t.cameras[side] == name]
         ratio = np.array([t.steepness[1 - side] / t.steepness[side] for t, side in involved])
         return cls(
@@ -152,8 +165,8 @@ class ShiftEquations:
         )
 
     def missed(self, shift_px: Float[np.ndarray, " 2"], loose_px: float) -> Float[np.ndarray, " n"]:
-        """Returns the residual of each equation, in standard deviations, for a shift (px) and a looseness of the mask
-        (px)."""
+        """Returns the residual of each equation, in standard deviations, if the image is shifted by ``shift_px`` and
+        the mask is too large by ``loose_px``."""
         return (self.normals @ shift_px + self.outward * loose_px - self.excess_px) / self.noise_px
 
 
@@ -165,6 +178,7 @@ class ShiftTerm:
     equations: ShiftEquations
 
     def at(self, shift_px: Float[np.ndarray, " 2"]) -> Residuals:
+        """Returns the residuals and their derivatives for a shift of the camera's image (px)."""
         equations = self.equations
         miss = equations.missed(shift_px, 0.0)
         return Residuals(miss[:, None], lambda: (equations.normals / equations.noise_px[:, None])[:, None], _LOSS)

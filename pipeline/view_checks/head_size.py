@@ -1,11 +1,11 @@
-"""How large is the head that the outlines show, against a head? Asked before a fit, of silhouettes and cameras alone.
+"""Checks the size of the head that the outlines show, before a fit, from silhouettes and cameras alone.
 
-Cameras of another program have any unit where nobody gave a length. A model that is fitted to a head three times too
-large lies inside the face as a doll's, and every outline is called clutter. Each outline has a diameter that needs no
-model: going down from the crown it is wider than twice the way, until it is a round head's diameter wide. At the place
-where the views' heads meet that is 150 to 290 mm for people, hair included.
+Cameras from another program have an arbitrary unit if no length was given. A model fitted to a head three times too
+large lies inside the face, and every outline counts as clutter. Each outline has a diameter that needs no model: going
+down from the crown, an outline is wider than twice the distance from the crown until it is as wide as a round head's
+diameter. At the distance of the subject that is 150 to 290 mm for people, hair included.
 
-Enters: silhouettes and the rig. Leaves: the diameter, and what to say of it.
+Enters: silhouettes and the rig. Leaves: the diameter, and the message about it.
 """
 
 from collections.abc import Mapping
@@ -29,10 +29,10 @@ MIN_VIEWS = 3  # whose crown is in the picture
 
 
 def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float | None:
-    """Returns the median over the views of the head's diameter (mm); None where too few show the crown.
+    """Returns the median over the views of the head's diameter (mm); None if too few views show the crown.
 
     Args:
-        silhouettes: by camera; those that are not usable have no say.
+        silhouettes: by camera; unusable ones are ignored.
         rig: the cameras as calibrated.
     """
     seen: list[tuple[Camera, Float[np.ndarray, " 2"], float]] = []
@@ -54,19 +54,19 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float |
 
 
 class WrongScale(EigenheadError):
-    """Reports outlines whose head has a size that no head has, so that the cameras are probably not in millimetres."""
+    """Reports outlines of a size that no head has, so that the cameras are probably not in millimetres."""
 
     def __init__(self, diameter_mm: float, *, masks_given: bool = False) -> None:
         part = masks_given and diameter_mm < HEAD_MM
         remedy = compose("advice-whole-masks") if part else compose("advice-known-length")
-        super().__init__(compose("size-refused", size=_size_told(diameter_mm), remedy=remedy))
+        super().__init__(compose("size-refused", size=_size_message(diameter_mm), remedy=remedy))
 
 
 def judge_head_size(
     silhouettes: Mapping[str, Silhouette], rig: Rig, *, masks_given: bool = False
 ) -> list[ReportWarning]:
     """Returns a warning if the outlined head is unusually large or small. Raises WrongScale if its size is impossible.
-    ``masks_given``: the masks are the operator's and may show only a part of the head."""
+    With ``masks_given``, the masks are the operator's and may show only a part of the head."""
     diameter = head_diameter_mm(silhouettes, rig)
     if diameter is None:
         return []
@@ -80,17 +80,17 @@ def judge_head_size(
 def _outline_size(diameter_mm: float) -> Message:
     unless = compose("much-hair") if diameter_mm > HEAD_MM else compose("small-child")
     remedy = compose("advice-known-length")
-    return compose("outline-size", size=_size_told(diameter_mm), unless=unless, remedy=remedy)
+    return compose("outline-size", size=_size_message(diameter_mm), unless=unless, remedy=remedy)
 
 
-def _size_told(diameter_mm: float) -> Message:
+def _size_message(diameter_mm: float) -> Message:
     factor = diameter_mm / HEAD_MM
     ratio = f"{factor:.1f}" if factor >= 0.95 else f"{factor:.2f}"
     return compose("head-times-as-large", ratio=ratio, diameter_mm=diameter_mm)
 
 
 def crown_disc(mask: Bool[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, " 2"], float] | None:
-    """Returns the middle (px) and diameter (px) of the head in a mask; None if its crown is not in the picture."""
+    """Returns the middle (px) and diameter (px) of the head in a mask; None if its crown is not inside the picture."""
     turns = _turns_to_upright(mask)
     upright = np.rot90(_without_strands(mask), turns)
     rows = np.flatnonzero(upright.any(axis=1))

@@ -1,8 +1,8 @@
-"""Every camera's own picture under its own name, before anything is measured in it.
+"""Files every picture under the camera that took it, before anything is measured in it.
 
-Enters: a capture as it is filed, and a way to segment it. Leaves: capture and silhouettes as they should be filed, and
-what was found. A plate that belongs to another camera's picture makes no mask of use, so that plates are matched to
-pictures first, by what they show beside the subject; then the pictures, with their plates, are matched to cameras
+Enters: a capture as it is filed, and a function that segments it. Leaves: capture and silhouettes as they should be
+filed, and what was found. The clean plate of another camera gives no useful mask, so plates are matched to pictures
+first, by the background that both show. Then the pictures, with their plates, are matched to cameras
 (``pipeline.view_checks.camera_assignment``).
 """
 
@@ -48,7 +48,7 @@ Segmentation = Callable[[Capture], dict[str, Silhouette]]
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageAssignment:
     """Holds a capture and its silhouettes with every picture filed under the right camera. ``pictures`` and ``plates``
-    give, for each camera that had another's, the name under which its own was filed."""
+    have an entry for each camera that had another's: the name under which its own was filed."""
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -58,7 +58,7 @@ class ImageAssignment:
 
 
 class ExchangedPictures(EigenheadError):
-    """Reports pictures filed under other cameras' names that were not put right, because that was not wanted or the
+    """Reports pictures filed under other cameras' names that were not corrected, because the settings refuse it or the
     evidence is not sure enough."""
 
     def __init__(self, found: Sequence[Message], *, doubtful: bool) -> None:
@@ -67,7 +67,7 @@ class ExchangedPictures(EigenheadError):
 
 
 class SamePictures(EigenheadError):
-    """Reports that so many cameras hold the same picture that too few different ones are left."""
+    """Reports that several cameras hold the same picture, so that too few different ones are left."""
 
     def __init__(self, duplicates: Mapping[str, str], count: int) -> None:
         names = some_of(sorted({*duplicates, *duplicates.values()}))
@@ -86,13 +86,13 @@ def assign_images(
     Args:
         capture: as it was read.
         rig: the cameras as calibrated.
-        segmented: computes the silhouettes of a capture; called again after every change of the files.
-        exchanged: what to do about an exchange that is beyond doubt.
+        segmented: computes the silhouettes of a capture; called again after every change.
+        exchanged: whether to repair or refuse an exchange that is beyond doubt.
 
     Raises:
-        ExchangedPictures: an exchange that may not be repaired, or is not sure enough to be.
+        ExchangedPictures: an exchange that may not be repaired, or is not certain enough.
         SamePictures: fewer than three pictures are different.
-        WrongRig: no exchange explains that most cameras contradict the others.
+        WrongRig: most cameras contradict the others, and no exchange explains it.
     """
     plates = misplaced_plates(capture, rig)
     if plates and exchanged == "refuse":
@@ -166,7 +166,8 @@ def thumbnail(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "r c 3"]
 
 
 def common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarray, "_ _ 3"]) -> float:
-    """Returns the share of the picture's pixels that show the plate, apart from a difference in exposure."""
+    """Returns the share of the picture's pixels that show the same as the plate, apart from a difference in exposure.
+    Both are results of ``thumbnail``."""
     if picture.shape != plate.shape:
         return 0.0
     ratio = (picture - plate).reshape(-1, 3)
@@ -176,10 +177,10 @@ def common_share(picture: Float32[np.ndarray, "r c 3"], plate: Float32[np.ndarra
 
 
 def duplicate_views(capture: Capture, silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
-    """Returns cameras whose picture equals another camera's in every pixel, each with that other camera: two shots
+    """Returns the cameras whose picture equals another camera's in every pixel, each with that other camera. Two shots
     never have the same noise.
 
-    The picture is left to the camera whose silhouette contradicts the others least, if it contradicts them little.
+    The picture stays with the camera whose silhouette contradicts the others least, if it contradicts them little.
     """
     groups: list[list[str]] = []
     for name in (name for name in rig.names if name in capture.images):

@@ -1,10 +1,11 @@
-"""Were the pictures undistorted, and the coefficients left in the file, or the other way round? Do the principal points
-count pixels from 1? Outlines hardly tell: the tops of heads lie equally far from the middle in all views, and where
-planes touch them all move alike.
+"""Checks whether the pictures are undistorted while the rig has distortion coefficients, or the other way round,
+and whether the principal points count pixels from 1. Outlines hardly show that: the tops of heads are equally far from
+the middle of all views, and all their tangencies move alike.
 
-Points of the subject in three views or more tell by how much their rays miss. All coefficients times one share (1 where
-they are the pictures', 0 where these were undistorted), or where there are none one radial coefficient of all cameras,
-is estimated with its standard deviation. So is one shift of all principal points, as much to the right as down.
+Points of the subject in three views or more show it by how much their rays miss. One number is estimated with its
+standard deviation: the share of all coefficients (1 if they belong to the pictures, 0 if these were undistorted) or, if
+there are none, one radial coefficient for all cameras. So is one shift of all
+principal points, as much to the right as down.
 
 Enters: photographs, silhouettes and the rig. Leaves: a warning, or none.
 """
@@ -56,8 +57,8 @@ class Estimate:
 def judge_distortion(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> list[ReportWarning]:
-    """Returns a warning if the pictures have no distortion though the rig has, or have one and the rig has none, or if
-    the principal points are counted from another corner."""
+    """Returns a warning if the pictures have no distortion although the rig has, or the other way round, or if the
+    principal points are counted from another corner."""
     usable = [name for name in rig.names if name in images and silhouettes[name].quality.usable]
     seen = _around_front(rig.subset(usable))
     if len(seen) < MIN_VIEWS or any(camera.recorded is not None for camera in seen):
@@ -105,7 +106,8 @@ def _around_front(rig: Rig) -> Rig:
 
 
 def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence[float] | np.ndarray) -> Estimate:
-    """Estimates the number with which ``read`` gives the rig whose rays miss least, searched from ``values`` on."""
+    """Estimates one number on which a rig depends: the one at which the tracks' reprojection errors are smallest.
+    ``read`` returns the rig for a number. The search starts at the best of ``values``."""
     from scipy.optimize import fminbound  # a quarter of a second
 
     def missed(value: float) -> Float[np.ndarray, "n 2"]:

@@ -1,10 +1,10 @@
-"""By what intrinsics do outlines agree that contradict the calibrated ones? Asked where a whole rig is wrong.
+"""Finds intrinsics with which the outlines agree, if those of the calibration contradict them for the whole rig.
 
-Pictures that were cropped, made smaller or taken at another zoom than the calibration's leave the poses right: one
-factor on all focal lengths and one shift of all principal points, in shares of the pictures, put such a rig right.
-Another rig's has none.
+If pictures were cropped, reduced, or taken at another zoom than those of the calibration, the poses are still right.
+One factor on all focal lengths and one shift of all principal points (relative to the picture's size) then correct the
+rig. For another rig there is no such correction.
 
-Enters: the outlines' hulls and the rig. Leaves: the intrinsics that they ask for, to be judged.
+Enters: the convex hulls of the outlines, and the rig. Leaves: the intrinsics that fit, to be judged.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,8 +29,8 @@ MIN_SHIFT = 0.02  # of the picture's width; less is not told
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensReading:
-    """Holds the rig with all focal lengths multiplied by ``factor`` and all principal points moved by ``shift`` (shares
-    of the pictures' width and height)."""
+    """Holds the rig with all focal lengths multiplied by ``factor`` and all principal points moved by ``shift``
+    (relative to the pictures' width and height)."""
 
     rig: Rig
     factor: float
@@ -43,7 +43,7 @@ class LensReading:
         return bool(abs(np.log(self.factor)) >= OTHER_FACTOR or max(map(abs, self.shift)) >= OTHER_SHIFT)
 
     def message(self) -> Message:
-        """Returns the message that refuses the rig and names the differences of its lenses."""
+        """Returns the message that refuses the rig and says by how much its lenses differ."""
         k = self.rig.cameras[0].intrinsics
         changes = []
         if abs(self.factor - 1.0) >= MIN_FACTOR:
@@ -55,13 +55,13 @@ class LensReading:
 
 
 def find_lens_reading(hulls: Sequence[Pixels], rig: Rig, misfit: Callable[[Rig], float]) -> LensReading:
-    """Searches from several focal lengths (``FACTORS``) for the focal factor and principal shift with the least
-    ``misfit``.
+    """Searches for the focal factor and principal shift with the smallest ``misfit``, starting from several focal
+    lengths (``FACTORS``).
 
     Args:
-        hulls: of the outlines, in the rig's order.
+        hulls: convex hulls of the outlines (px), in the order of the rig.
         rig: the cameras as calibrated.
-        misfit: what a rig is judged by.
+        misfit: returns how badly a rig fits.
     """
     from scipy.optimize import minimize  # a quarter of a second, and few rigs are wrong
 

@@ -1,11 +1,12 @@
-"""Do ready masks follow what the photographs show? Nothing else tells that all masks of a capture are too large by as
-much, for such outlines agree with each other, or that masks lie under each other's names beside pictures that do not.
+"""Checks whether given masks follow the edges in the photographs. Only this shows that all masks of a capture are too
+large by the same amount, for such outlines agree with each other; or that masks are filed under each other's names
+beside pictures that are not.
 
-Across an outline, the photograph's edge is where its brightness changes most. Averaged along the outline the change has
-a peak, as high as 2 to 10 times the mean where the mask is of this picture, and at most 2 where it is another's; where
-the peak lies beside the outline, the mask is too large or too small by as much.
+The edge of the photograph near an outline is where its brightness changes most. Averaged along the outline, the change
+has a peak 2 to 10 times as high as its mean if the mask belongs to the picture, and at most 2 times if not. If the peak
+lies beside the outline, the mask is too large or too small by that distance.
 
-Enters: photographs and silhouettes. Leaves: the place and height of the peak, and what to say of it.
+Enters: photographs and silhouettes. Leaves: position and height of the peak, and messages about it.
 """
 
 from collections.abc import Collection, Mapping
@@ -34,9 +35,14 @@ OWN_GAIN = 1.5  # how much higher the peaks must be where masks are given to oth
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """Holds the edge that the photograph shows along a silhouette's outline. ``offset_px``: how far outside the outline
-    the edge lies; ``height``: strength of the edge there, ``height_at_outline``: on the outline itself, both relative
-    to the mean; ``size_px``: root of the mask's area."""
+    """Holds the edge that a photograph shows along the outline of a silhouette.
+
+    Attributes:
+        offset_px: how far outside the outline the edge lies.
+        height: change of brightness there, relative to its mean near the outline.
+        height_at_outline: the same on the outline itself.
+        size_px: square root of the mask's area.
+    """
 
     offset_px: float
     height: float
@@ -51,8 +57,8 @@ class Edge:
 
 
 def edge_beside(image: ImageRgb, silhouette: Silhouette) -> Edge | None:
-    """Finds the photograph's strongest edge parallel to an outline; None if too little of the outline is inside the
-    picture."""
+    """Finds the strongest edge of the photograph parallel to an outline; None if too little of the outline is inside
+    the picture."""
     size = float(np.sqrt(np.count_nonzero(silhouette.mask)))
     reach = max(4, round(REACH * size))
     pixels, normals = _outline(silhouette, reach)
@@ -87,11 +93,11 @@ def _outline(silhouette: Silhouette, reach: int) -> tuple[Float32[np.ndarray, "n
 def masks_off_edges(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
 ) -> list[ReportWarning]:
-    """Returns a warning if most ready masks lie too far outside, or most too far inside, the edges that the photographs
-    show.
+    """Returns a warning if most given masks are too large, or most too small, compared with the edges in the
+    photographs.
 
     Args:
-        images: by camera.
+        images: RGB, by camera.
         silhouettes: by camera.
         ready: cameras whose mask was given.
     """
@@ -109,7 +115,7 @@ def masks_off_edges(
 def masks_alone_exchanged(
     images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], pictures: Mapping[str, str]
 ) -> bool:
-    """Tells whether ready masks are filed under other cameras' names while the photographs are filed right.
+    """Tells whether given masks are filed under other cameras' names although the photographs are filed right.
 
     Args:
         images: as they are filed.

@@ -1,7 +1,8 @@
-"""What is wrong with the picture itself of a view that contradicts the others or its clean plate?
+"""Finds faults of the picture itself, for a view that contradicts the others or its clean plate.
 
-A blurred picture has loose outlines, and a turned one has outlines elsewhere: both look like a camera that moved, or a
-backdrop that does not differ. The picture tells which, so that the remedy is the right one.
+The outlines of a blurred picture are loose, and those of a turned one are elsewhere. Both look like a camera that
+moved, or a backdrop that does not differ from the subject. The picture shows which it is, so that the right remedy is
+named.
 
 Enters: photographs, clean plates, silhouettes. Leaves: the fault of each picture that has one.
 """
@@ -36,8 +37,8 @@ MIN_PIXELS, MIN_COMPARED = 500, 3  # of a subject, and views, that tell anything
 def with_picture_faults(
     silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str]
 ) -> dict[str, Silhouette]:
-    """Returns silhouettes in which the fault of a suspect's picture replaces the remarks that follow from it; views of
-    turned pictures are not usable."""
+    """Returns silhouettes in which the fault of a suspect's picture replaces the warnings that follow from it. Views
+    with a turned picture are not usable."""
     found = dict(silhouettes)
     blurred = blurred_views(capture.images, silhouettes) if suspects else {}
     for name in suspects:

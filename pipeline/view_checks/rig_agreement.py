@@ -1,13 +1,12 @@
-"""Are these the cameras that took the pictures? Asked of the silhouettes and the calibration, before the fit.
+"""Checks whether these cameras took the pictures, from silhouettes and calibration, before the fit.
 
-Where most cameras contradict the others, other readings are tried: all pictures reflected about their principal points,
-as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 where they are
-square; poses that were written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
-sphere about the world's origin does not show by itself; and intrinsics of other pictures (``lens_reading``). The
-reading under which tangent planes touch both outlines of each pair is named. Where there is none, the calibration is
-another rig's, or of this one before it was rearranged; unless a good part of all planes meet closely nevertheless: then
-the masks are loose, with a shadow on the wall or hair that some of them miss.
-Where one camera alone contradicts the others, it is named.
+If most cameras contradict the others, other interpretations are tried: all pictures reflected about their principal
+points, as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 if they
+are square; poses written in another convention (``rig.plausibility``), which a rig whose cameras stand on a sphere
+around the world's origin does not reveal by itself; and intrinsics of other pictures (``lens_reading``). The one under
+which tangent planes touch both outlines of each pair is named. If there is none, the calibration is another rig's, or
+older than a change of this one; unless many planes meet closely nevertheless, for then the masks are loose, with a
+shadow on the wall or hair that some of them lack. If a single camera contradicts the others, it is named.
 
 Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothing.
 """
@@ -51,12 +50,12 @@ Turn = Callable[[Pixels, Intrinsics], Pixels]
 
 
 def wrong_rig(silhouettes: Mapping[str, Silhouette], rig: Rig) -> Message | None:
-    """Finds out why most cameras contradict each other: pictures turned or mirrored, another convention or other lenses
-    in the file, or another rig. Returns a message with the remedy; None if most cameras agree or the outlines are
+    """Finds out why most cameras contradict each other: pictures turned or mirrored, a file with another convention or
+    other lenses, or another rig. Returns a message with the remedy; None if most cameras agree or the outlines are
     merely loose.
 
     Args:
-        silhouettes: by camera; views without a usable mask are left out of the question.
+        silhouettes: by camera; views without a usable mask are ignored.
         rig: the cameras as calibrated.
     """
     usable = {name for name, s in silhouettes.items() if s.quality.usable}
@@ -102,8 +101,8 @@ def _judged_misfit(hulls: Sequence[Pixels], rig: Rig) -> float:
 
 
 def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
-    """Tells whether most outlines contradict the others. Meant for rigs that ``wrong_rig`` finds right, where the cause
-    is loose masks."""
+    """Tells whether most outlines contradict the others because of loose masks. Meant for rigs with which ``wrong_rig``
+    finds no fault."""
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MIN_CAMERAS:
         return False
@@ -111,7 +110,7 @@ def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
-    """Returns the one camera that contradicts all others while these agree without it; None if there is none. The
+    """Returns the one camera that contradicts all others while these agree without it; None if there is none. That
     camera was moved farther than ``camera_drift`` can measure, or its pose or mask is wrong."""
     seen = with_masks({name: s for name, s in silhouettes.items() if s.quality.usable}, rig)
     if len(seen) < MISPLACED_AMONG:

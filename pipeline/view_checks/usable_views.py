@@ -1,8 +1,8 @@
-"""Which views of a capture take part, and what is said of the others: all that can be known before a fit.
+"""Decides which views of a capture take part, and why the others do not: all that can be known before a fit.
 
-Enters: a capture, its rig, and a way to segment it. Leaves: every picture under its own camera, silhouettes of which
-those that may not be believed are marked, and the warnings that say why. ``reconstruct`` begins with it; ``eigenhead
-check`` asks nothing else.
+Enters: a capture, its rig, and a function that segments it. Leaves: every picture under its own camera, silhouettes of
+which the unreliable ones are marked, and the warnings that say why. ``reconstruct`` begins with it; ``eigenhead check``
+does nothing else.
 """
 
 from collections.abc import Callable, Mapping
@@ -57,8 +57,8 @@ class TooFewViews(EigenheadError):
 @dataclass(frozen=True, slots=True, eq=False)
 class UsableViews:
     """Holds a capture with every picture under the right camera, and its silhouettes; views that take no part are
-    marked unusable. ``pictures``: for each camera that had another's picture, the name under which its own was filed.
-    """
+    marked as not usable. ``pictures`` has an entry for each camera that had another's picture: the name under which its
+    own was filed."""
 
     capture: Capture
     silhouettes: Mapping[str, Silhouette]
@@ -73,18 +73,18 @@ def usable_views(
     *,
     exchanged: Literal["repair", "refuse"],
 ) -> UsableViews:
-    """Segments a capture, files exchanged pictures right, and marks views that contradict the others as unusable.
+    """Segments a capture, files exchanged pictures right, and marks views that contradict the others as not usable.
 
     Args:
         capture: as it was read.
         rig: the cameras as calibrated.
         segmented: computes the silhouettes of a capture.
-        exchanged: what to do about an exchange of pictures that is beyond doubt.
+        exchanged: whether to repair or refuse an exchange of pictures that is beyond doubt.
 
     Raises:
-        ExchangedPictures, WrongRig: of ``assign_images``.
-        WrongScale: of ``judge_head_size``.
-        TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are of use.
+        ExchangedPictures, WrongRig: as of ``assign_images``.
+        WrongScale: as of ``judge_head_size``.
+        TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are usable.
     """
     assigned = assign_images(capture, rig, segmented, exchanged=exchanged)
     doubted = [name for name, s in assigned.silhouettes.items() if s.quality.warnings or not s.quality.usable]
@@ -106,8 +106,8 @@ def usable_views(
 def without_moved_cameras(
     silhouettes: Mapping[str, Silhouette], rig: Rig
 ) -> tuple[dict[str, Silhouette], dict[str, ReportWarning]]:
-    """Marks the views of cameras that moved since the calibration as unusable. Also returns a warning for each of them,
-    and for each camera whose mask may be loose instead, by camera."""
+    """Marks the views of cameras that moved since the calibration as not usable. Also returns warnings by camera: for
+    each of these, and for each camera whose mask may be loose instead."""
     kept, warnings = dict(silhouettes), dict[str, ReportWarning]()
     for drift in find_drift(silhouettes, rig):
         if drift.moved:
@@ -122,8 +122,8 @@ def without_moved_cameras(
 
 
 def view_warnings(silhouettes: Mapping[str, Silhouette]) -> list[ReportWarning]:
-    """Returns the remarks on the views' quality as warnings of the report; a remark that holds for many views becomes
-    one warning."""
+    """Returns the warnings about the quality of single views as warnings of the report. One that holds for many views
+    is given once."""
     remarks_by_code: dict[str, list[Message]] = {"view-left-out": [], "view": [], "mask-doubtful": []}
     for name, silhouette in silhouettes.items():
         code = "view" if silhouette.quality.usable else "view-left-out"

@@ -137,8 +137,8 @@ def board_shot(session: RigSession) -> Shot:
     """Takes one shot of a calibration board with a session that is open and warm. Needs neither calibration nor clean
     plates.
 
-    Returns the pictures of the cameras that deliver, and the faults but those that the board itself causes by hiding
-    the background. Raises ShotFailed where no camera delivers.
+    Returns the pictures of the cameras that deliver, and the faults except those that the board itself causes by hiding
+    the background. Raises ShotFailed if no camera delivers.
     """
     shot = session.shoot()
     faults = tuple(fault for fault in shot.faults if fault.code not in HIDDEN_BY_BOARD)

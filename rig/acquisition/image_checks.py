@@ -93,12 +93,13 @@ def disturbed(plates: Sequence[ImageRgb], noise: float) -> bool:
 
 
 def blur_px(image: ImageRgb) -> float | None:
-    """Measures the standard deviation of the edge spread (px). Returns None where the picture has no edges.
+    """Measures how blurred a picture is: the standard deviation (px) of a Gaussian that would spread a sharp edge as
+    much. Returns None where the picture has no edges.
 
     A step of height A blurred to a standard deviation s has the gradient energy A^2 / (2 sqrt(pi) s) across it. Two
     more blurs of known size, s1 and s2, give energies whose ratio q = sqrt((s^2 + s2^2) / (s^2 + s1^2)) no longer
-    depends on A; it is solved for s. Only the strongest gradients count, where the steps are, and the energy that the
-    noise has everywhere is taken off.
+    depends on A; it is solved for s. Only the strongest gradients count, where the steps are. The energy of the noise,
+    measured elsewhere in the picture, is subtracted first.
     """
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32)
     small, large = _gradient_energy(grey, _GAUSS_SMALL_PX), _gradient_energy(grey, _GAUSS_LARGE_PX)
@@ -119,10 +120,10 @@ def blur_px(image: ImageRgb) -> float | None:
 
 
 def register(image: ImageRgb, plate: ImageRgb) -> Registration:
-    """Finds the background of ``plate`` in ``image``, which a subject may hide in part, and returns how far it moved.
+    """Finds the background of ``plate`` in ``image``, which a subject may partly hide, and returns how far it moved.
 
-    Textured patches of the plate are searched for near their places by normalised correlation, which brightness and
-    contrast do not change; those that a common similarity explains (RANSAC) were found.
+    Textured patches of the plate are searched near their positions by normalised correlation, which brightness and
+    contrast do not change. Those that one similarity explains (RANSAC) count as found.
     """
     if image.shape != plate.shape:
         return Registration(_PATCHES_MOST, 0.0, 0.0)

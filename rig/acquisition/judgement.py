@@ -61,8 +61,11 @@ def judge_checks(
     """Returns the faults that follow from the measurements of pictures.
 
     Args:
-        levels: mean value that each camera's picture should have; the light of those that are absent is not judged.
-        whose_view: the camera whose clean plate fits better than a camera's own one does.
+        checks: the measurements by camera.
+        levels: mean value that each camera's picture should have; without one its light is not judged.
+        shot: limits of rig.toml.
+        whose_view: for each camera whose picture fits another camera's clean plate better than its own, that other
+            camera.
     """
     faults, lit = _light_faults(checks, levels, shot)
     for name, check in checks.items():

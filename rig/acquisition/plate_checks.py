@@ -20,7 +20,8 @@ SEEN_SHARE = 0.5  # of the cameras: all see a person in the seat; a change seen 
 
 
 class PlatesRefused(ShotFailed):
-    """Reports that new clean plates show somebody. They are kept as ``version``, and the old plates stay in use."""
+    """Reports that new clean plates show a person. They are kept as the version ``version``; the old plates stay in
+    use."""
 
     def __init__(self, faults: Sequence[Fault], version: str) -> None:
         super().__init__(faults)

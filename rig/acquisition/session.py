@@ -49,7 +49,7 @@ class _Release:
 
 
 class RigSession:
-    """Owns the devices of a rig while a block runs. ``close`` ends all threads but those that hang in a driver."""
+    """Owns the devices of a rig while a block runs. ``close`` ends all threads except those that hang in a driver."""
 
     def __init__(self, config: RigConfig, make_driver: MakeDriver = driver_for) -> None:
         self.config = config
@@ -121,17 +121,18 @@ class RigSession:
             for feed in self._feeds.values():
                 # a camera that waits for triggers sends nothing by itself, so it is not waited for
                 feed.wait_frames(self.config.shot.warm_up_frames, deadline_s)
-            self._look(deadline_s + self.config.shot.timeout_s)
+            self._next_frames(deadline_s + self.config.shot.timeout_s)
 
     def look(self, only: Collection[str] | None = None) -> Mapping[str, ImageRgb]:
-        """Returns a picture of each camera that shows one, of no given moment. ``only``: cameras to ask (None: all)."""
+        """Returns a current picture of each camera that delivers one, without synchronisation. ``only`` names the
+        cameras; None takes all."""
         with self._busy:
             self._lights_on()
-            frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s, only)
+            frames = self._next_frames(time.monotonic() + 2 * self.config.shot.timeout_s, only)
             return {name: frame.image for name, frame in frames.items()}
 
     def shoot(self) -> Shot:
-        """Takes one synchronised shot. No device makes it raise: what is wrong is told by the shot's faults."""
+        """Takes one synchronised shot. It raises nothing for a failing device: the shot's faults say what is wrong."""
         with self._busy:
             self._lights_on()
             self._glance()
@@ -151,7 +152,7 @@ class RigSession:
             pause_s = self.config.shot.plates_over_s / max(self.config.shot.plates - 1, 1)
             for number in range(self.config.shot.plates):
                 time.sleep(pause_s if number else 0.0)
-                frames = self._look(time.monotonic() + 2 * self.config.shot.timeout_s)
+                frames = self._next_frames(time.monotonic() + 2 * self.config.shot.timeout_s)
                 for name, frame in frames.items():
                     taken[name].append(frame.image)
             faults = [*self._box_faults(), *self._plate_faults(taken)]
@@ -226,7 +227,7 @@ class RigSession:
             if frame is not None:
                 self._last_seen[name] = frame
 
-    def _look(self, deadline_s: float, only: Collection[str] | None = None) -> dict[str, Frame]:
+    def _next_frames(self, deadline_s: float, only: Collection[str] | None = None) -> dict[str, Frame]:
         """Returns the next frame of every camera. Cameras that wait for a trigger get one if they have no live view.
 
         A camera that sent nothing last time is not waited for during ``_SILENT_S``; its frames are taken if they

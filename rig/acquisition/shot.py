@@ -247,7 +247,7 @@ class PictureCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """Holds what one release of the rig gave: pictures, certificate, measurements and faults."""
+    """Holds the result of one release of the rig: pictures, certificate of their timing, measurements and faults."""
 
     images: Mapping[str, ImageRgb]
     certificate: SyncCertificate
@@ -256,7 +256,7 @@ class Shot:
 
     @property
     def complete(self) -> bool:
-        """Tells whether the shot is worth reconstructing: no fault is more than a warning."""
+        """Tells whether the shot can be reconstructed: no fault is more than a warning."""
         return not any(fault.is_error for fault in self.faults)
 
     def document(self) -> ShotDocument:

@@ -45,9 +45,14 @@ class ViewDocument(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class ViewCheck:
-    """Holds the check of one camera's picture. ``picture``: measurements (None where the shot has them); ``level``:
-    mean value that it should have (None without a clean plate); ``place``: the subject; ``looked``: whether there was a
-    clean plate or a mask to find the subject by."""
+    """Holds the check of one camera's picture.
+
+    Attributes:
+        picture: measurements; None if the shot has them.
+        level: mean value that the picture should have; None without a clean plate.
+        place: where the subject is.
+        looked: whether there was a clean plate or a mask to find the subject by.
+    """
 
     picture: PictureCheck | None
     level: float | None
@@ -85,16 +90,16 @@ def view_faults(views: Mapping[str, ViewCheck], limits: ShotConfig) -> list[Faul
 
 
 def without_consequences(faults: Iterable[Fault]) -> list[Fault]:
-    """Returns the faults but those that another fault of the same camera explains: before another background nobody is
-    found."""
+    """Returns the faults without those that another fault of the same camera explains: with a wrong background, for
+    example, no subject is found."""
     known = [*faults]
     displaced = {fault.camera for fault in known if fault.code in DISPLACED} - {None}
     return [fault for fault in known if not (fault.code in PLACE_FAULTS and fault.camera in displaced)]
 
 
 def verdict_of(faults: Iterable[Fault], cameras: Collection[str]) -> Verdict:
-    """Returns the verdict on a capture: ``good`` without a fault; ``poor`` where the rig itself has one, or too few of
-    the ``cameras`` are without one; else ``usable``."""
+    """Returns the verdict on a capture: ``good`` without a fault; ``poor`` if the rig as a whole has a fault, or if too
+    few of the ``cameras`` have none; else ``usable``."""
     named = {fault.camera for fault in faults}
     if not named:
         return "good"

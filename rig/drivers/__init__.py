@@ -1,1 +1,2 @@
-"""One module a kind of camera, behind ``base.Driver``; a vendor's library is imported on use, inside its driver."""
+"""Drives cameras: one module for each kind, behind the interface ``base.Driver``. A vendor's library is imported only
+when its driver is used."""

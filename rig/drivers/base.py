@@ -1,8 +1,8 @@
-"""What every camera driver offers, and how it fails.
+"""Defines the interface of camera drivers, and their errors.
 
-``grab`` waits for the camera's next frame and says when it came; ``retrieve`` decodes that frame. They are two calls
-because a stream delivers many frames that nobody looks at: decoding them all would cost the time that the arrival
-stamps must not lose. ``grab_frame`` is both. A driver belongs to one thread at a time (rig.drivers.feed).
+``grab`` waits for the camera's next frame and returns when it arrived; ``retrieve`` decodes that frame. They are two
+calls because most frames of a stream are never used, and decoding them all would make the arrival times late.
+``grab_frame`` does both. A driver belongs to one thread at a time (``rig.drivers.feed``).
 """
 
 from dataclasses import dataclass
@@ -37,14 +37,14 @@ class Frame:
 
 @runtime_checkable
 class Driver(Protocol):
-    """Drives one camera. Everything but ``close`` may raise DriverError; ``close`` never does and may be called
-    twice."""
+    """Describes the driver of one camera. Every method but ``close`` may raise DriverError; ``close`` raises nothing
+    and may be called twice."""
 
     live: bool
     """Its pictures come from a sensor, so that two equal ones mean a frozen stream."""
 
     def open(self, timeout_s: float) -> None:
-        """Finds the camera that has the identity in rig.toml and starts it."""
+        """Finds the camera with the identity that rig.toml gives, and starts it. Raises CameraNotFound."""
         ...
 
     def configure(self) -> tuple[Message, ...]:
@@ -53,9 +53,9 @@ class Driver(Protocol):
 
     def grab(self, timeout_s: float) -> Arrival:
         """Waits for the next frame and returns when it arrived. Raises GrabTimeout, after which ``grab`` may be called
-        again, or CameraLost.
+        again, and CameraLost.
 
-        It may take up to a second longer than ``timeout_s`` where a vendor's library knows no such timeout.
+        It may take a second longer than ``timeout_s`` if the vendor's library has no such timeout.
         """
         ...
 
@@ -88,14 +88,14 @@ class CameraNotFound(DriverError):
 
 
 class CameraLost(DriverError):
-    """Reports that the camera went away, or that what it sends is no picture."""
+    """Reports that a camera was disconnected, or that what it sends is no picture."""
 
     def __init__(self, camera: CameraConfig, why: Message | str) -> None:
         super().__init__(camera.name, compose("camera-lost", reason=why))
 
 
 class GrabTimeout(DriverError):
-    """Reports that no frame arrived in time. The camera may still be well."""
+    """Reports that no frame arrived in time. The camera may still work."""
 
     def __init__(self, camera: CameraConfig, timeout_s: float) -> None:
         super().__init__(camera.name, compose("no-frame-within", seconds=timeout_s))

@@ -1,7 +1,7 @@
-"""One camera in its own thread: opened, grabbed from without pause, its frames handed over when they are wanted.
+"""Runs one camera in its own thread: opens it, grabs frames without pause, and hands them over when they are wanted.
 
-A driver may hang in a vendor's library, and nothing can stop it there. So every camera has its thread, nobody waits
-for it without a deadline, and one that does not come back is left alone: it is a daemon, and its feed says so.
+A driver may hang inside a vendor's library, where nothing can stop it. So every camera has its own thread, nobody waits
+for it without a deadline, and a thread that does not end is abandoned: it is a daemon, and its feed reports that.
 """
 
 import contextlib
@@ -24,7 +24,8 @@ _KEPT = 32  # frames that wait to be collected: half a second at 60 a second
 
 @dataclass(frozen=True, slots=True)
 class FeedState:
-    """Holds what is known of one camera at a moment. Times are those of time.monotonic, in seconds."""
+    """Holds what is known of one camera at a moment. Times are in seconds of time.monotonic. ``unmet`` are the settings
+    that the camera did not take."""
 
     opened: bool
     frames: int  # since it was opened
@@ -35,8 +36,8 @@ class FeedState:
 
 
 class CameraFeed:
-    """Runs one camera's driver in a thread. ``start`` returns at once; methods that wait take a deadline
-    (time.monotonic, s)."""
+    """Runs one camera's driver in a thread. ``start`` returns at once. Methods that wait take a deadline, in seconds of
+    time.monotonic."""
 
     def __init__(self, camera: CameraConfig, driver: Driver, open_timeout_s: float) -> None:
         self.camera = camera
@@ -65,7 +66,7 @@ class CameraFeed:
         self._stop.set()
 
     def close(self, deadline_s: float) -> bool:
-        """Ends the thread. Returns False where the driver hangs and had to be left behind."""
+        """Ends the thread. Returns False if the driver hangs, so that its thread had to be abandoned."""
         self.stop()
         if self._thread.ident is not None:
             self._thread.join(max(0.0, deadline_s - time.monotonic()))
@@ -104,19 +105,19 @@ class CameraFeed:
             self._wanted_from_s, self._due_s = from_s, None
 
     def due(self, earliest_s: float) -> None:
-        """Declares that the first frame that arrives at ``earliest_s`` (time.monotonic) or later is the wanted one.
-        Frames after it are not decoded."""
+        """Declares that the first frame that arrives at ``earliest_s`` (time.monotonic) or later is the one that is
+        wanted. Later frames are not decoded."""
         with self._changed:
             self._due_s = earliest_s
 
     def unwant(self) -> None:
-        """Drops the frames that were kept; from now on frames are not decoded."""
+        """Drops the frames kept so far, and stops decoding frames."""
         with self._changed:
             self._frames.clear()
             self._wanted_from_s = self._due_s = None
 
     def collect(self, earliest_s: float, deadline_s: float) -> Frame | None:
-        """Returns the first kept frame that arrived at ``earliest_s`` or later. Returns None where none has come by the
+        """Returns the first kept frame that arrived at ``earliest_s`` or later; None if none has arrived by the
         deadline."""
 
         def first() -> Frame | None:

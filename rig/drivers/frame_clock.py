@@ -1,11 +1,11 @@
-"""The beat of a camera that is no device: frames at a steady rate."""
+"""Gives a camera that is no real device its steady frame rate."""
 
 import time
 
 
 class Pace:
-    """Beats ``fps`` times a second from the moment it is made. Beats that nobody waited for are lost, as frames of a
-    camera are."""
+    """Ticks ``fps`` times a second from its creation on. Ticks that nobody waited for are lost, as frames of a camera
+    are."""
 
     def __init__(self, fps: float) -> None:
         self._period_s = 1.0 / fps
@@ -13,7 +13,7 @@ class Pace:
         self.beat = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Sleeps until the next beat, or for ``timeout_s``. Tells whether there was a beat."""
+        """Sleeps until the next tick, or for ``timeout_s``. Tells whether there was a tick."""
         passed = int((time.monotonic() - self._started_s) / self._period_s)
         due = max(self.beat + 1, passed)
         wait_s = self._started_s + due * self._period_s - time.monotonic()

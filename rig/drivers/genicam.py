@@ -52,7 +52,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class GenicamDriver:
-    """Drives one camera through Aravis."""
+    """Drives one GigE Vision or USB3 Vision camera through Aravis."""
 
     live = True
 
@@ -66,6 +66,7 @@ class GenicamDriver:
         self._sequence = 0
 
     def open(self, timeout_s: float) -> None:
+        """Finds the camera, applies the settings of rig.toml, and starts its stream. Raises CameraNotFound."""
         self.close()
         try:
             self._device = self._aravis.call("arv_camera_new", self._find().encode())
@@ -76,9 +77,12 @@ class GenicamDriver:
             raise CameraNotFound(self._camera, str(error)) from error
 
     def configure(self) -> tuple[Message, ...]:
+        """Returns one message for each setting that the camera did not take. ``open`` has applied them, since picture
+        sizes cannot change once the stream runs."""
         return self._unmet  # applied before the acquisition started: sizes cannot change after it
 
     def grab(self, timeout_s: float) -> Arrival:
+        """Waits for the next complete frame; frames that lost packets are skipped. Raises GrabTimeout, CameraLost."""
         if self._stream is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         deadline_s = time.monotonic() + timeout_s
@@ -96,6 +100,8 @@ class GenicamDriver:
         raise GrabTimeout(self._camera, timeout_s)
 
     def retrieve(self) -> ImageRgb:
+        """Decodes the frame of the last ``grab``. Raises CameraLost if there is none, and DriverError for a pixel
+        format that is not known."""
         if self._buffer is None:
             raise CameraLost(self._camera, compose("no-frame-grabbed"))
         width = self._aravis.call("arv_buffer_get_image_width", self._buffer)
@@ -104,6 +110,7 @@ class GenicamDriver:
         return self._decode(self._aravis.pixels(self._buffer), width, height, pixel_format)
 
     def trigger(self) -> None:
+        """Sends the command that takes a picture, if rig.toml sets a software trigger. Raises CameraLost."""
         if self._camera.trigger != "software" or self._device is None:
             return
         try:
@@ -112,6 +119,7 @@ class GenicamDriver:
             raise CameraLost(self._camera, compose("camera-does-not-release", reason=str(error))) from error
 
     def close(self) -> None:
+        """Stops the stream and releases the camera."""
         device, stream = self._device, self._stream
         self._give_back()
         self._device = self._stream = None

@@ -34,7 +34,7 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class GphotoDriver:
-    """Drives one camera through libgphoto2."""
+    """Drives one DSLR, or another camera with PTP, through libgphoto2."""
 
     live = True
 
@@ -46,6 +46,7 @@ class GphotoDriver:
         self._sequence = 0
 
     def open(self, timeout_s: float) -> None:
+        """Finds the camera by its serial number or network address and opens it. Raises CameraNotFound."""
         self.close()
         try:
             with _bus:
@@ -55,6 +56,8 @@ class GphotoDriver:
             raise CameraNotFound(self._camera, str(error)) from error
 
     def configure(self) -> tuple[Message, ...]:
+        """Applies the settings of rig.toml. Returns one message for each that the camera refused; gain cannot be
+        set."""
         camera = self._camera
         wanted: list[tuple[str, str, Any]] = [("capturetarget", "capturetarget", "Internal RAM")]
         if camera.pixel_format is not None:
@@ -70,6 +73,8 @@ class GphotoDriver:
         return tuple(unmet)
 
     def grab(self, timeout_s: float) -> Arrival:
+        """Waits until the camera adds a picture. Its arrival is when libgphoto2 reports it. Raises GrabTimeout,
+        CameraLost."""
         deadline_s = time.monotonic() + timeout_s
         try:
             while (left_s := deadline_s - time.monotonic()) > 0:
@@ -83,6 +88,8 @@ class GphotoDriver:
         raise GrabTimeout(self._camera, timeout_s)
 
     def retrieve(self) -> ImageRgb:
+        """Downloads and decodes the picture of the last ``grab``. Raises CameraLost, and DriverError for a damaged
+        file."""
         if self._file is None:
             raise CameraLost(self._camera, compose("no-picture-grabbed"))
         try:
@@ -92,6 +99,7 @@ class GphotoDriver:
             raise CameraLost(self._camera, str(error)) from error
 
     def trigger(self) -> None:
+        """Releases the shutter, if rig.toml sets a software trigger. Raises CameraLost."""
         if self._camera.trigger != "software":
             return
         try:
@@ -100,6 +108,7 @@ class GphotoDriver:
             raise CameraLost(self._camera, compose("camera-does-not-release", reason=str(error))) from error
 
     def close(self) -> None:
+        """Ends the connection to the camera."""
         device, self._device = self._device, None
         if device is not None:
             # the result is of no use: the cable may be out already

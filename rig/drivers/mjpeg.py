@@ -1,8 +1,7 @@
-"""Motion JPEG over HTTP: a reader of multipart/x-mixed-replace bodies (RFC 2046, section 5.1).
+"""Reads motion JPEG over HTTP: multipart/x-mixed-replace bodies (RFC 2046, section 5.1).
 
-It stands in for OpenCV's own reader because that one decodes every frame before it tells of it; here a frame's arrival
-is when the kernel received its header, not when this program found the time to look, and nothing is decoded until
-somebody wants to see it.
+OpenCV's own reader decodes every frame before it reports it. Here a frame's arrival is when the kernel received its
+header, whenever this program reads it, and a frame is decoded only if it is wanted.
 """
 
 import base64
@@ -26,7 +25,7 @@ _STALE_S = 5.0  # a kernel stamp further from now than this is of a clock that w
 
 
 class StreamTimeout(Exception):
-    """Reports that nothing arrived in time. Reading may go on."""
+    """Reports that nothing arrived in time. Reading may continue."""
 
 
 class StreamBroken(Exception):
@@ -58,8 +57,8 @@ class MjpegStream:
         self._socket.close()
 
     def next_part(self, timeout_s: float) -> tuple[float, bytes]:
-        """Returns when the next part of the stream arrived (time.monotonic, s), and its body. A part that a timeout cut
-        is resumed by the next call."""
+        """Returns when the next part of the stream arrived (time.monotonic, s), and its body. A part that a timeout
+        interrupted is completed by the next call."""
         deadline_s = time.monotonic() + timeout_s
         if self._part is None:
             self._take_until(self._boundary, deadline_s, HEAD_MOST)

@@ -40,6 +40,7 @@ class MjpegDriver:
         self._sequence = 0
 
     def open(self, timeout_s: float) -> None:
+        """Connects to the camera's address. Raises CameraNotFound."""
         self.close()
         try:
             self._stream = MjpegStream(self._camera.identity, timeout_s)
@@ -47,12 +48,15 @@ class MjpegDriver:
             raise CameraNotFound(self._camera, _reason(error, compose("no-answer"))) from error
 
     def configure(self) -> tuple[Message, ...]:
+        """Returns one message for each setting in rig.toml of exposure, gain or white balance: none of them can be set
+        over HTTP."""
         requested = [
             key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None
         ]
         return tuple(compose("not-set-over-http", setting=key) for key in requested)
 
     def grab(self, timeout_s: float) -> Arrival:
+        """Waits for the next JPEG file of the stream, without decoding it. Raises GrabTimeout, CameraLost."""
         if self._stream is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         try:
@@ -65,12 +69,15 @@ class MjpegDriver:
         return Arrival(time_s, self._sequence)
 
     def retrieve(self) -> ImageRgb:
+        """Decodes the JPEG file of the last ``grab``. Raises DriverError if it is damaged."""
         return decode_jpeg(self._camera, self._jpeg)
 
     def trigger(self) -> None:
+        """Does nothing: such a stream has no software trigger."""
         return
 
     def close(self) -> None:
+        """Ends the connection."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None
@@ -88,6 +95,7 @@ class VideoCaptureDriver:
         self._is_device = camera.identity.startswith("/")
 
     def open(self, timeout_s: float) -> None:
+        """Opens the device or address. Raises CameraNotFound."""
         self.close()
         target, backend = self._camera.identity, cv2.CAP_FFMPEG
         if self._is_device:
@@ -103,6 +111,8 @@ class VideoCaptureDriver:
         self._capture = capture
 
     def configure(self) -> tuple[Message, ...]:
+        """Applies the settings of rig.toml. Returns one message for each that the device did not take; 5 % off counts
+        as taken."""
         capture = self._opened()
         unmet = [
             compose("setting-not-taken", setting=key, value=str(wanted), actual=capture.get(prop))
@@ -112,6 +122,8 @@ class VideoCaptureDriver:
         return tuple(unmet)
 
     def grab(self, timeout_s: float) -> Arrival:
+        """Waits for the next frame, at most about a second whatever ``timeout_s`` is. Raises GrabTimeout,
+        CameraLost."""
         capture = self._opened()
         started_s = time.monotonic()
         if not capture.grab():
@@ -123,15 +135,18 @@ class VideoCaptureDriver:
         return Arrival(self._stamp_s(capture), self._sequence)
 
     def retrieve(self) -> ImageRgb:
+        """Decodes the frame of the last ``grab``. Raises DriverError if that fails."""
         done, image = self._opened().retrieve()
         if not done or image is None:
             raise DriverError(self._camera.name, compose("frame-not-decoded"))
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.ndim == 3 else cv2.COLOR_GRAY2RGB)
 
     def trigger(self) -> None:
+        """Does nothing: these sources have no software trigger."""
         return
 
     def close(self) -> None:
+        """Releases the device or connection."""
         if self._capture is not None:
             self._capture.release()
             self._capture = None

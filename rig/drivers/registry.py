@@ -1,4 +1,5 @@
-"""The driver that rig.toml names for a camera; its module, and with it any vendor's package, is imported on use."""
+"""Finds the driver that rig.toml names for a camera. Its module, and with it any vendor's library, is imported only
+then."""
 
 import importlib
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""A capture folder in place of a camera: its picture comes again and again at the camera's rate.
+"""Delivers a picture of a recorded capture instead of a camera's, repeatedly at the camera's rate.
 
-``identity`` is the folder, relative to rig.toml, and after a # the camera in it if it has another name there. With
-``plates = "FOLDER/background"`` in rig.toml a recorded shot goes through the whole session.
+``identity`` is the capture's folder, relative to rig.toml, and after a # the name of the camera there if it differs.
+With ``plates = "FOLDER/background"`` in rig.toml, a recorded shot can be taken through a whole session.
 """
 
 import time
@@ -37,6 +37,7 @@ class ReplayDriver:
         self._pace: Pace | None = None
 
     def open(self, timeout_s: float) -> None:
+        """Reads the camera's picture from the capture folder. Raises CameraNotFound."""
         paths = [self._images / (self._recorded + suffix) for suffix in IMAGE_SUFFIXES]
         path = next((path for path in paths if path.is_file()), None)
         if path is None:
@@ -50,9 +51,11 @@ class ReplayDriver:
         self._pace = Pace(self._camera.fps or _FPS)
 
     def configure(self) -> tuple[Message, ...]:
+        """Returns no message: a recorded picture has no settings."""
         return ()
 
     def grab(self, timeout_s: float) -> Arrival:
+        """Waits for the next frame at the camera's rate. Raises GrabTimeout, CameraLost."""
         if self._pace is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         if not self._pace.wait(timeout_s):
@@ -60,12 +63,15 @@ class ReplayDriver:
         return Arrival(time.monotonic(), self._pace.beat)
 
     def retrieve(self) -> ImageRgb:
+        """Returns the recorded picture."""
         if self._image is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         return self._image
 
     def trigger(self) -> None:
+        """Does nothing: a recorded picture comes at its own rate."""
         return
 
     def close(self) -> None:
+        """Forgets the recorded picture."""
         self._image = self._pace = None

@@ -1,8 +1,8 @@
-"""A camera of the simulated studio inside this process: no network, no box.
+"""Drives a camera of the simulated studio inside this process, without network or trigger box.
 
-``identity`` is a head's mesh file, relative to rig.toml, and after a # the studio's camera if it has another name:
-the head sits in the default studio, and each camera photographs it at its rate. For cameras that are devices, with a
-trigger box, serve the studio (rig.studio.devices.serve).
+``identity`` is a head's mesh file, relative to rig.toml, and after a # the name of the studio's camera if it differs.
+The head sits in the default studio, and each camera photographs it at its rate. For cameras that act as devices with a
+trigger box, serve the studio (``rig.studio.devices.serve``).
 """
 
 import time
@@ -26,8 +26,8 @@ def make(camera: CameraConfig, folder: Path) -> Driver:
 
 
 class SimulatedDriver:
-    """Photographs an ``ImageSource``, or the simulated studio with the head of ``mesh_file`` in it; the studio is built
-    when the driver is opened."""
+    """Photographs an ``ImageSource`` or, if there is none, the simulated studio with the head of ``mesh_file`` in it.
+    The studio is built when the driver is opened."""
 
     live = True
 
@@ -41,17 +41,21 @@ class SimulatedDriver:
         self._pace: Pace | None = None
 
     def open(self, timeout_s: float) -> None:
+        """Builds the studio if needed, and starts the camera's rate. Raises CameraNotFound."""
         if self._source is None:
             self._source = self._build()
         self._pace = Pace(self._camera.fps or _FPS)
 
     def configure(self) -> tuple[Message, ...]:
+        """Returns one message for each setting in rig.toml of exposure, gain or white balance, which a simulated camera
+        lacks."""
         requested = [
             key for key in ("exposure_ms", "gain_db", "white_balance_k") if getattr(self._camera, key) is not None
         ]
         return tuple(compose("no-setting-of-simulated", setting=key) for key in requested)
 
     def grab(self, timeout_s: float) -> Arrival:
+        """Waits for the next frame at the camera's rate. Raises GrabTimeout, CameraLost."""
         if self._pace is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         if not self._pace.wait(timeout_s):
@@ -59,14 +63,17 @@ class SimulatedDriver:
         return Arrival(time.monotonic(), self._pace.beat)
 
     def retrieve(self) -> ImageRgb:
+        """Renders and returns the picture that the camera sees now. Raises CameraLost if it is not open."""
         if self._source is None or self._pace is None:
             raise CameraLost(self._camera, compose("camera-not-open"))
         return self._source(self._view, time.monotonic())
 
     def trigger(self) -> None:
+        """Does nothing: a simulated camera runs at its own rate."""
         return
 
     def close(self) -> None:
+        """Stops the camera; the studio is kept."""
         self._pace = None
 
     def _build(self) -> ImageSource:

@@ -70,7 +70,8 @@ def find_rig_file(folder: Path) -> Path | None:
 
 
 def rig_files(folder: Path) -> Iterator[Path]:
-    """Yields the files in ``folder`` that may hold the rig, one a program; the first is the one that is read.
+    """Yields the files in ``folder`` that may hold the rig, at most one for each program. The first is the one that is
+    read.
 
     In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
     ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;

@@ -23,6 +23,8 @@ PIXELS_MOST = 20_000  # a side; larger is a damaged or hostile file, not a camer
 
 
 class PoseDocument(TypedDict):
+    """Describes a pose in JSON: rotation matrix, by rows, and translation (mm)."""
+
     rotation: list[list[float]]
     translation: list[float]
 

@@ -66,15 +66,15 @@ def dataset_documents(rig: Rig, form: DatasetFormat, *, with_points: bool) -> di
         frames[camera.name] = frame
     if form == "nerfstudio":
         return {"transforms.json": _encoded(head, frames.values())}
-    kept_back = camera_kept_back(rig)
-    train = [frame for name, frame in frames.items() if name != kept_back]
-    divisions = {"": list(frames.values()), "_train": train, "_val": [frames[kept_back]], "_test": [frames[kept_back]]}
+    held_out = held_out_camera(rig)
+    train = [frame for name, frame in frames.items() if name != held_out]
+    divisions = {"": list(frames.values()), "_train": train, "_val": [frames[held_out]], "_test": [frames[held_out]]}
     return {f"transforms{end}.json": _encoded(head | _indices(part), part) for end, part in divisions.items()}
 
 
-def camera_kept_back(rig: Rig) -> str:
-    """Returns the camera that is not trained on: the one whose two nearest neighbours are nearest, which is missed
-    least."""
+def held_out_camera(rig: Rig) -> str:
+    """Returns the camera that is left out of training, to test the result: the one whose two nearest neighbours are
+    nearest, and which is therefore missed least."""
     centres = np.stack([camera.centre_world for camera in rig])
     distances = np.sort(np.linalg.norm(centres[:, None] - centres[None], axis=2), axis=1)
     return rig.names[int(np.argmin(distances[:, 1:3].sum(axis=1)))]

@@ -18,7 +18,7 @@ OUTSIDE_LEAST, OUTSIDE_SHARE = 3, 0.2  # points outside their pictures, and of a
 
 
 class FeaturesDocument(TypedDict):
-    """Pixels by point and camera."""
+    """Describes ``features.json``: pixels by point and camera."""
 
     format: str
     points: dict[str, dict[str, list[float]]]

@@ -14,9 +14,12 @@ Treatment = Literal["read", "refused", "told", "nothing"]
 
 
 class ForeignKey(NamedTuple):
-    """Holds the rule of one key. ``why``: what the key is read as, or why it is not read (a message if a reader reports
-    it). ``silent``: values at which a refused or told key has no effect, as if it were missing; of a list, all elements
-    must be among them."""
+    """Holds the rule for one key.
+
+    ``why`` says as what the key is read, or why it is not read (a message if a reader reports it). ``silent`` lists
+    values at which a refused or reported key has no effect, as if it were missing; of a list, all elements must be
+    among them.
+    """
 
     treatment: Treatment
     why: str | Message

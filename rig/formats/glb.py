@@ -22,10 +22,12 @@ VERTICES, INDICES = 34962, 34963
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skin:
-    """Holds a texture: one coordinate a vertex (from the image's upper left corner, v downwards) and the encoded image.
+    """Holds a texture: coordinates for each vertex (from the image's upper left corner, v downwards) and the encoded
+    image.
 
-    With a normal map (PNG, linear, +Y up) ``tangents`` are the tangents that it refers to, with the bitangents'
-    signs."""
+    With a normal map (PNG, linear, +Y up), ``tangents`` are the tangents to which it refers, with the signs of the
+    bitangents.
+    """
 
     uv: Float[np.ndarray, "v 2"]
     image: bytes
@@ -44,15 +46,15 @@ def glb_bytes(
 ) -> bytes:
     """Encodes a glTF 2.0 binary of a mesh in the head frame (mm): metres, y up, face towards +z.
 
-    glTF's ``COLOR_0`` is linear, ours is sRGB, so it is converted, as 16 bits so that dark tones survive.
+    glTF's ``COLOR_0`` is linear and ours is sRGB. It is converted, to 16 bits so that dark tones are kept.
     https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes
 
     Args:
         mesh: the surface.
         normals: unit, of its vertices.
-        colours: sRGB, where there is no texture.
+        colours: sRGB, if there is no texture.
         skin: the texture.
-        extras: what the asset says of itself.
+        extras: written as ``asset.extras``.
     """
     parts, attributes = _parts(mesh, normals, colours, skin)
     views, payload = [], bytearray()

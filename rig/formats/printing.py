@@ -23,7 +23,8 @@ RELATIONS = (
 
 
 def stl_bytes(mesh: Mesh) -> bytes:
-    """Encodes a binary STL. Its vertices are rounded before anything is derived, so that equal corners stay equal."""
+    """Encodes a mesh as a binary STL. The vertices are rounded to float32 before the normals are computed, so that both
+    agree in the file."""
     vertices = mesh.vertices.astype("<f4")
     normals = face_normals(vertices.astype(float), mesh.faces)
     length = np.linalg.norm(normals, axis=1, keepdims=True)

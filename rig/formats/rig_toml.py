@@ -51,7 +51,7 @@ _SHOT_MOST = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfig:
-    """Holds one [[cameras]] table. Settings that are left out stay as they are in the camera."""
+    """Holds one table [[cameras]] of rig.toml. Settings that are left out stay as they are in the camera."""
 
     name: str
     driver: DriverName
@@ -72,7 +72,8 @@ class CameraConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriggerConfig:
-    """Holds [trigger], the trigger box. ``port`` is a path under /dev/serial/by-id, or a link made by a udev rule."""
+    """Holds the table [trigger] of rig.toml, the trigger box. ``port`` is a path under /dev/serial/by-id, or a link
+    made by a udev rule."""
 
     port: str
     baud: int = 115200
@@ -82,7 +83,7 @@ class TriggerConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightsConfig:
-    """Holds [lights]: which light outputs of the box are on during a shot."""
+    """Holds the table [lights] of rig.toml: which light outputs of the trigger box are on during a shot."""
 
     outputs: tuple[int, ...] = ()
     settle_s: float = 0.3  # halogen and LED drivers reach their level well within it
@@ -91,7 +92,7 @@ class LightsConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShotConfig:
-    """Holds [shot]: waiting times, and limits beyond which a shot has a fault."""
+    """Holds the table [shot] of rig.toml: waiting times, and limits beyond which a shot has a fault."""
 
     timeout_s: float = 2.0
     open_timeout_s: float = 10.0

@@ -1,7 +1,7 @@
-"""Every code with its English template. A code is stable; its template may be worded anew at any time.
+"""Lists every code with its English template. A code is stable; its template may be reworded at any time.
 
-A new message: its code and template in a module of ``rig/messages/english``, its German in
-``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is said. Tests hold the three together.
+A new message needs: its code and template in a module of ``rig/messages/english``, its German in
+``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used. Tests hold the three together.
 """
 
 from collections.abc import Mapping

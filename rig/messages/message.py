@@ -1,4 +1,4 @@
-"""The one value of everything that the program tells somebody: warnings, faults, refusals, failures."""
+"""Defines the one type of everything that the program reports to somebody: warnings, faults, refusals, failures."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -16,11 +16,13 @@ VERBATIM = "verbatim"  # the code of text that another program or an earlier ver
 
 @runtime_checkable
 class Scalar(Protocol):
-    """Stands for a number of NumPy, which this room does not load: a command line that only refuses something starts at
-    once."""
+    """Describes a number of NumPy. NumPy itself is not imported here, so that a command that only prints a message
+    starts at once."""
 
     @property
-    def dtype(self) -> Any: ...
+    def dtype(self) -> Any:
+        """Returns NumPy's type of the number."""
+        ...
 
     def item(self) -> Any:
         """Returns the plain number."""
@@ -37,8 +39,8 @@ class MessageDocument(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """``code``: of the catalogue, stable, for programs; ``parameters``: by their names in its template; ``text``: the
-    English sentence."""
+    """Holds a message: its stable ``code`` in the catalogue, the ``parameters`` by their names in the template, and the
+    English ``text``."""
 
     code: str
     parameters: Mapping[str, Parameter]
@@ -57,19 +59,19 @@ class Message:
 
 
 def compose(code: str, /, **parameters: Raw) -> Message:
-    """Makes the message of a code. Its parameters are exactly those that the template names."""
+    """Makes the message of a code. Its parameters must be exactly those that the template names."""
     template, values = CATALOGUE[code], {name: _parameter(value) for name, value in parameters.items()}
     assert values.keys() == fields_of(template).keys(), f"{code}: {sorted(values)} for {template!r}"
     return Message(code, values, render(template, values))
 
 
 def verbatim(text: str) -> Message:
-    """Makes a message of text that has no code: another program's, or an earlier version's."""
+    """Makes a message from a text without a code: another program's, or an earlier version's."""
     return Message(VERBATIM, {"text": text}, text)
 
 
 def message_of(message: Message | str) -> Message:
-    """Returns the message; a text becomes a verbatim one."""
+    """Returns the message unchanged; a text becomes a message without a code."""
     return message if isinstance(message, Message) else verbatim(message)
 
 
@@ -90,7 +92,7 @@ def texts_of(messages: Iterable[Message]) -> list[str]:
 
 
 def documents_of(messages: Iterable[Message]) -> list[MessageDocument]:
-    """Returns messages for JSON."""
+    """Returns messages as JSON types."""
     return [message.document() for message in messages]
 
 

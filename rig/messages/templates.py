@@ -1,7 +1,8 @@
-"""Templates of sentences: ``{name}`` is filled in, ``{name:.1f}`` as a number; "one | several" are forms of a count.
+"""Fills in templates of sentences: ``{name}`` is replaced by a parameter, ``{name:.1f}`` by a number; "one | several"
+are the forms for a count.
 
-Format specifications are those of Python that the console's ``messages.js`` knows, too (``SPECIFICATIONS``); ``word``
-marks a value that is a word of the language, such as the state of a job, and no name.
+Format specifications are those of Python that the console's ``messages.js`` knows, too (``SPECIFICATIONS``). ``word``
+marks a value that is translated, such as the state of a job, unlike a name.
 """
 
 import re
@@ -14,7 +15,7 @@ FORMS = " | "
 
 
 def fields_of(template: str) -> dict[str, str]:
-    """Returns the format specification of every field; "" where it has none, ``count`` where forms ask for it."""
+    """Returns the format specification of every field: "" without one, ``count`` if the template has forms for it."""
     fields = {name: specification or "" for name, specification in FIELD.findall(template)}
     return {"count": "", **fields} if FORMS in template else fields
 

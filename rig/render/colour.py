@@ -1,4 +1,4 @@
-"""Meshes with their vertex colours, to look at: results from new viewpoints, overlays, turntables."""
+"""Draws meshes with their vertex colours: results from new viewpoints, overlays, turntables."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ GREY = 190
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Holds one distant light. ``towards``: unit direction to it, world frame; None shines along the line of sight."""
+    """Holds one distant light. ``towards`` is the unit direction to it, world frame; None puts it at the camera."""
 
     towards: tuple[float, float, float] | None = None
     ambient: float = 0.0
@@ -29,7 +29,8 @@ HEADLIGHT = Light(ambient=0.15)
 def draw_colour(
     context: GlContext, rig: Rig, mesh: Mesh, samples: int, light: Light
 ) -> dict[str, UInt8[np.ndarray, "_ _ 4"]]:
-    """Draws RGB and coverage (alpha) per camera; RGB is the covered part's own colour, not mixed with a background."""
+    """Draws a mesh in each camera: RGB and coverage (alpha). RGB is the colour of the covered part of a pixel, not
+    mixed with a background."""
     if not len(mesh.faces):
         return {c.name: np.zeros((c.intrinsics.height, c.intrinsics.width, 4), np.uint8) for c in rig}
     origin = rig.centre_world()
@@ -59,7 +60,8 @@ def draw_colour(
 def draw_antialiased(
     context: GlContext, draw: moderngl.VertexArray, page: Page, samples: int
 ) -> UInt8[np.ndarray, "h w 4"]:
-    """Returns the mean of ``samples`` coverage samples a pixel; the colour is multiplied by the coverage (alpha)."""
+    """Draws one page and returns the mean over ``samples`` samples of each pixel. Its colours are multiplied by the
+    coverage (alpha)."""
     gl, size = context.gl, (page.width, page.height)
     with Owned() as owned:
         image = owned(gl.renderbuffer(size, 4, samples=samples))

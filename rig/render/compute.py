@@ -1,7 +1,7 @@
-"""Compute shaders: the GPU as a calculator, for whoever has a shader and arrays.
+"""Runs compute shaders: calculations on arrays on the GPU.
 
-OpenGL 4.3 on EGL, as silhouettes use it, so that no other driver is needed; Mesa's software renderer runs the same
-shaders where there is no GPU, slower than compiled loops do.
+It uses OpenGL 4.3 on EGL, as the silhouettes do, so that no other driver is needed. Without a GPU, Mesa's software
+renderer runs the same shaders, slower than compiled loops.
 """
 
 import contextlib
@@ -39,9 +39,10 @@ class DeviceArray:
 
 
 class ComputeDevice:
-    """Runs compute shaders in an OpenGL context of its own, for any thread of one process: one at a time, others wait.
+    """Runs compute shaders in an OpenGL context of its own. Any thread of the process may call it; one runs at a time,
+    others wait.
 
-    ``with ComputeDevice.create() as device: ...``. Raises ComputeUnavailable where there is no OpenGL 4.3.
+    ``with ComputeDevice.create() as device: ...``. Raises ComputeUnavailable if there is no OpenGL 4.3.
     """
 
     def __init__(self) -> None:
@@ -58,6 +59,7 @@ class ComputeDevice:
 
     @classmethod
     def create(cls) -> "ComputeDevice":
+        """Returns a new device. Raises ComputeUnavailable if there is no OpenGL 4.3."""
         return cls()
 
     def __enter__(self) -> "ComputeDevice":
@@ -93,14 +95,16 @@ class ComputeDevice:
         constants: Mapping[str, int],
         uniforms: Uniforms,
     ) -> None:
-        """Runs a shader over ``groups`` of invocations across and down.
+        """Runs a shader with ``groups`` groups of invocations across and down.
 
         Args:
-            shader: file of its source; ``#include`` reads beside it.
-            arrays: of the bindings from 0 on; an array of NumPy is copied there for this run.
-            written: bindings of arrays of NumPy, contiguous, that receive what the shader wrote.
-            constants: defined for the preprocessor; each choice is compiled once.
-            uniforms: by name.
+            shader: file of its source; ``#include`` reads files beside it.
+            groups: numbers of groups across and down.
+            arrays: bound to the shader's bindings 0, 1, 2 and so on; a NumPy array is copied to the device for this
+                run.
+            written: bindings of those NumPy arrays (contiguous) that receive what the shader wrote.
+            constants: defined for the preprocessor; each combination is compiled once.
+            uniforms: values by name.
         """
         with self._current(), Owned() as owned:
             program = self._program(shader, constants)
@@ -129,14 +133,14 @@ class ComputeDevice:
 
 
 def open_device(name: DeviceName, renderer: str) -> ComputeDevice | None:
-    """Returns the device to compute on; None for the processor.
+    """Returns the device to compute on; None stands for the processor.
 
     Args:
-        name: ``gl`` is any OpenGL, ``auto`` a GPU where there is one.
+        name: ``gl`` takes any OpenGL, ``auto`` a GPU if there is one.
         renderer: description of the OpenGL that draws.
 
     Raises:
-        ComputeUnavailable: where ``gl`` is asked for and cannot be had.
+        ComputeUnavailable: ``gl`` is requested and not available.
     """
     if name == "cpu" or (name == "auto" and is_software(renderer)):
         return None
@@ -149,5 +153,5 @@ def open_device(name: DeviceName, renderer: str) -> ComputeDevice | None:
 
 
 def is_software(renderer: str) -> bool:
-    """Tells whether a renderer's description is of a program that draws with the processor."""
+    """Tells whether a renderer's description is that of a program that draws on the processor."""
     return any(word in renderer.lower() for word in SOFTWARE)

@@ -1,12 +1,13 @@
-"""The one EGL context, its programs, and OpenGL's two conventions that differ from ours.
+"""Provides the one EGL context and its shader programs, and bridges two conventions in which OpenGL differs from this
+project.
 
-Row flip. OpenGL counts rows from below. Everything in ``rig.render`` draws image row v into framebuffer row v (the
-projection in ``shaders/camera.glsl`` maps v = 0 to y = -1), so that what is read back, lowest row first, has our row 0
-on top, and no image is ever turned over. The price is paid here alone: counter-clockwise triangles arrive clockwise,
-so the context counts clockwise as front.
+Row order: OpenGL counts rows from below. Everything in ``rig.render`` draws image row v into framebuffer row v (the
+projection in ``shaders/camera.glsl`` maps v = 0 to y = -1). What is read back, lowest row first, then has row 0 on top,
+and no image is ever flipped. In exchange anticlockwise triangles arrive clockwise, so that the context takes clockwise
+as front.
 
-Pixel centre. A fragment's centre is at half-integer window coordinates; our pixel (0, 0) is a centre, so the shader
-adds 1/2 on the way in.
+Pixel centre: a fragment's centre is at half-integer window coordinates, while pixel (0, 0) of this project is a centre,
+so that the shader adds 1/2.
 """
 
 import contextlib
@@ -27,7 +28,11 @@ CLIP_PLANES = range(0x3000, 0x3006)  # GL_CLIP_DISTANCE0 and on, as many as shad
 
 @runtime_checkable
 class Releasable(Protocol):
-    def release(self) -> None: ...
+    """Describes a GPU resource that must be freed."""
+
+    def release(self) -> None:
+        """Frees the resource."""
+        ...
 
 
 Resource = TypeVar("Resource", bound=Releasable)
@@ -48,15 +53,17 @@ class WrongThread(EigenheadError):
 
 
 class Owned(contextlib.ExitStack):
-    """Releases what is passed through a call of this, in reverse order: moderngl frees nothing by itself."""
+    """Frees every GPU resource that was passed through a call of it, in reverse order, when the block ends. moderngl
+    frees nothing by itself."""
 
     def __call__(self, resource: Resource) -> Resource:
+        """Returns the resource, which will be freed when the block ends."""
         self.callback(resource.release)
         return resource
 
 
 class GlContext:
-    """Holds a moderngl context of this thread, and its compiled programs by the names of their shader files."""
+    """Holds the moderngl context of one thread, and its compiled shader programs."""
 
     def __init__(self) -> None:
         try:
@@ -74,7 +81,7 @@ class GlContext:
 
     @contextlib.contextmanager
     def current(self) -> Iterator[moderngl.Context]:
-        """Makes the context current for a while. Raises WrongThread."""
+        """Makes the context current during the block. Raises WrongThread."""
         if self._closed:
             raise WrongThread(compose("renderer-closed"))
         if (os.getpid(), threading.get_ident()) != self._owner:
@@ -86,7 +93,8 @@ class GlContext:
     def drawing(
         self, target: moderngl.Framebuffer, *, clip: bool = True, cull: bool = False, depth: bool = False
     ) -> Iterator[None]:
-        """Draws into ``target``: clipped at tiles and near planes, without back faces, with a depth test, as wanted."""
+        """Directs drawing in the block to ``target``: with ``clip`` only inside tiles and beyond near planes, with
+        ``cull`` without back faces, with ``depth`` with a depth test."""
         planes = CLIP_PLANES if clip else ()
         for plane in planes:
             self.gl.enable_direct(plane)
@@ -100,7 +108,7 @@ class GlContext:
             self._rest.use()  # moderngl keeps binding the last target, and fails once that is released
 
     def program(self, vertex: str, fragment: str, geometry: str | None = None) -> moderngl.Program:
-        """Returns the program of these files of ``shaders/``, compiled once."""
+        """Returns the shader program made of these files of ``shaders/``; it is compiled once."""
         key = (vertex, fragment, geometry or "")
         if key not in self._programs:
             self._programs[key] = self.gl.program(
@@ -112,19 +120,22 @@ class GlContext:
 
     @property
     def largest_texture(self) -> int:
+        """Returns the largest width and height of a texture, px."""
         return int(self._info["GL_MAX_TEXTURE_SIZE"])
 
     @property
     def most_samples(self) -> int:
+        """Returns the largest number of samples for each pixel."""
         return int(self.gl.max_samples)
 
     @property
     def description(self) -> str:
-        """Returns renderer and version, for reports: ``llvmpipe (LLVM 15.0.6, 256 bits), 4.5 (Core Profile) Mesa
+        """Returns renderer and version, for example ``llvmpipe (LLVM 15.0.6, 256 bits), 4.5 (Core Profile) Mesa
         22.3.6``."""
         return f"{self._info['GL_RENDERER']}, {self._info['GL_VERSION']}"
 
     def close(self) -> None:
+        """Frees the programs and the context. May be called twice. Raises WrongThread."""
         if not self._closed:
             with self.current():
                 for program in self._programs.values():
@@ -134,6 +145,6 @@ class GlContext:
 
 
 def shader_source(name: str, folder: Path = SHADERS) -> str:
-    """Returns the text of a file of ``folder``; a line ``#include FILE`` stands for that file."""
+    """Returns the text of a file in ``folder``, with each line ``#include FILE`` replaced by that file's text."""
     lines = (folder / name).read_text(encoding="utf-8").splitlines()
     return "\n".join(shader_source(line.split()[1], folder) if line.startswith("#include") else line for line in lines)

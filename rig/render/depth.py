@@ -12,7 +12,8 @@ from rig.rig import Rig
 def draw_depth(
     context: GlContext, rig: Rig, vertices_world: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> dict[str, Float[np.ndarray, "_ _"]]:
-    """Returns the camera-frame z (mm, float32) at each pixel's centre; inf where nothing is."""
+    """Draws the depth map of a mesh in each camera: the camera-frame z (mm, float32) at each pixel's centre; inf where
+    there is nothing."""
     if not len(faces):
         return {c.name: np.full((c.intrinsics.height, c.intrinsics.width), np.inf, np.float32) for c in rig}
     origin = rig.centre_world()

@@ -1,10 +1,11 @@
-"""Light that reaches the lens from a painted and lit subject: what the simulated studio photographs.
+"""Draws what the simulated studio photographs: the light that a painted and lit subject sends to the lens.
 
-Paint and irradiance come per vertex from the caller; finer structure is a function of place on the subject, evaluated
-per pixel (``shaders/grain.glsl``), so that all views agree on every pore; a mild highlight moves with the view.
-Radiance is linear, edges are the mean of several samples.
+Colour and irradiance come from the caller, for each vertex. Finer structure is a function of the position on the
+subject, evaluated at each pixel (``shaders/grain.glsl``), so that all views agree on every pore. A mild highlight moves
+with the view. Radiance is linear, and a pixel is the mean of several samples.
 
-llvmpipe runs both sides of every branch: shading brows and lips per pixel cost 2.5 us a pixel, three times this.
+llvmpipe computes both sides of every branch: shading brows and lips at each pixel would take 2.5 us a pixel, three
+times as long as now.
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,8 @@ Vector4 = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Grain:
-    """Cell sizes of the two octaves along the axes of ``Part.places`` (mm), and what their four values add."""
+    """Describes the fine structure of a surface: cell sizes of its two octaves along the axes of ``Part.places`` (mm),
+    and the weights of their four values."""
 
     coarse_mm: tuple[float, float, float]
     coarse_weights: Vector4
@@ -39,8 +41,11 @@ class Grain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Holds a piece of the subject, in the world frame. ``places`` are what its grain is a function of; ``paint`` is
-    linear albedo and strength of the grain; ``irradiance`` is linear RGB (1: white paper comes out white)."""
+    """Holds a piece of the subject, in the world frame.
+
+    ``places`` are the coordinates on which its fine structure depends. ``paint`` is linear albedo and the strength of
+    the fine structure. ``irradiance`` is linear RGB, in which white paper is 1.
+    """
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -55,8 +60,8 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gallery:
-    """Holds what all parts share: the noise volume, and the two lamps that make highlights (world frame, linear
-    RGB)."""
+    """Holds what all parts of a subject share: the noise volume, and the two lamps that cause highlights (world frame,
+    linear RGB)."""
 
     noise: UInt8[np.ndarray, "64 64 64 4"]
     lamps: Float[np.ndarray, "2 3"]
@@ -66,8 +71,8 @@ class Gallery:
 def draw_photographs(
     context: GlContext, rig: Rig, parts: Sequence[Part], gallery: Gallery, samples: int
 ) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
-    """Returns linear RGB multiplied by coverage, and coverage, per camera (float32). One camera at a time: 25 MB of
-    samples."""
+    """Draws the parts in each camera: linear RGB multiplied by coverage, and coverage (float32). Cameras are drawn one
+    at a time, since the samples of one take 25 MB."""
     origin = rig.centre_world()
     box = np.concatenate([box_points(part.vertices) for part in parts])
     found = {}
@@ -83,7 +88,7 @@ def draw_photographs(
 
 
 def draw_vertex_radiance(context: GlContext, part: Part, gallery: Gallery) -> Float[np.ndarray, "v 3"]:
-    """Returns what ``draw_photographs`` shows of each vertex, without highlights: linear RGB (float32)."""
+    """Returns the linear RGB (float32) that ``draw_photographs`` shows of each vertex, without highlights."""
     count = len(part.vertices)
     size = (VERTEX_ROW, -(-count // VERTEX_ROW))
     with context.current() as gl, Owned() as owned:

@@ -1,12 +1,13 @@
-"""Model silhouettes of all cameras, and the boundary-weighted XOR with the input's (section 4.3, eqs. 4 and 5).
+"""Draws the model's silhouettes in all cameras, and computes their boundary-weighted XOR with the input's (section 4.3,
+eqs. 4 and 5).
 
-All cameras share one atlas that one instanced draw fills. The sum of ``w |S - Sm|`` is taken in two levels: the GPU
-adds blocks of 8 x 8 pixels in single precision, in a fixed order; what is read back, one number a block, is added in
+All cameras share one atlas, which a single instanced draw fills. The sum of ``w |S - Sm|`` is taken in two steps: the
+GPU adds blocks of 8 x 8 pixels in single precision, in a fixed order; the blocks' sums are read back and added in
 double precision. So the relative error of a cost is below 64 * 2^-24 = 4e-6, equal masks cost exactly 0, and the same
-input gives the same number every time. Blocks outside the box that the model can reach cost what an empty model costs.
+input always gives the same number. Blocks that the model cannot reach cost what they cost an empty model.
 
 Measured on two cores with Mesa's llvmpipe, eleven views of 512 x 384 and 4,900 triangles: 8 ms to draw, 2 ms to add.
-Atomic adds (an order that changes), a compute shader over a copied mask and mipmaps were slower or no better.
+Atomic additions (in a varying order), a compute shader over a copied mask, and mipmaps were slower or no better.
 """
 
 from collections.abc import Mapping
@@ -50,7 +51,8 @@ class _Surface:
 
 
 class SilhouetteSet:
-    """Prepares cameras and triangles for many evaluations; only the vertices change. Close it, or use ``with``."""
+    """Prepares cameras and triangles for many evaluations in which only the vertices change. Close it, or use
+    ``with``."""
 
     def __init__(self, context: GlContext, rig: Rig, faces: Int[np.ndarray, "f 3"]) -> None:
         """``rig`` at the resolution to draw in."""
@@ -75,13 +77,13 @@ class SilhouetteSet:
         self.close()
 
     def close(self) -> None:
-        """Gives the GPU's memory back."""
+        """Frees the GPU's memory."""
         with self._context.current():
             self._owned.close()
         self._surfaces = []
 
     def masks(self, vertices_world: Float[np.ndarray, "v 3"]) -> dict[str, Bool[np.ndarray, "_ _"]]:
-        """Marks where the mesh covers a pixel's centre, per camera (H, W)."""
+        """Returns the mask of the mesh in each camera: which pixel centres it covers."""
         found = {}
         with self._context.current():
             self._draw(vertices_world)
@@ -96,9 +98,9 @@ class SilhouetteSet:
     def set_inputs(
         self, masks: Mapping[str, Bool[np.ndarray, "_ _"]], weights: Mapping[str, Float[np.ndarray, "_ _"]]
     ) -> None:
-        """Uploads the input silhouettes and the weight of each pixel, eq. (5)'s ``1 / d^2``; once per capture.
+        """Uploads the input silhouettes and the weight of each pixel, ``1 / d^2`` of eq. (5); done once for a capture.
 
-        Raises InputError where a camera of the rig has no mask or weight of its size.
+        Raises InputError if a camera of the rig has no mask or weights of its size.
         """
         check_images(self.rig, masks, "mask")
         check_images(self.rig, weights, "weight")
@@ -116,7 +118,7 @@ class SilhouetteSet:
                 self._empty_sums.append(sums[:, :, 0])
 
     def xor_costs(self, vertices_world: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " k"]:
-        """``sum w |S - Sm|`` per camera, in the rig's order. ``set_inputs`` comes first."""
+        """Returns ``sum w |S - Sm|`` for each camera, in the order of the rig. ``set_inputs`` must have been called."""
         if not self._empty_sums:
             raise InputError("xor_costs", [compose("no-input-silhouettes")])
         costs = np.zeros(len(self.rig))
@@ -203,9 +205,11 @@ class SilhouetteSet:
 
 
 def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
-    """Marks where every edge has its counterpart: then front faces alone make the whole silhouette.
+    """Tells whether a mesh is closed: every edge has its counterpart. Its front faces alone then make the whole
+    silhouette.
 
-    Along any line the surface is entered as often as it is left, so where a back face covers a pixel a front face does.
+    Along any line such a surface is entered as often as it is left, so that where a back face covers a pixel a front
+    face does, too.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     base = int(edges.max(initial=0)) + 1
@@ -213,7 +217,8 @@ def is_closed(faces: Int[np.ndarray, "f 3"]) -> bool:
 
 
 def check_images(rig: Rig, images: Mapping[str, np.ndarray], kind: str) -> None:
-    """Raises InputError where a camera's image is missing or is not as large as the camera says."""
+    """Raises InputError if the image of a camera is missing or not of the camera's size. ``kind`` names the images in
+    messages."""
     faults = []
     for camera in rig:
         wanted = (camera.intrinsics.height, camera.intrinsics.width)

@@ -1,4 +1,5 @@
-"""Packing the images of all cameras into as few textures as OpenGL allows, and what a shader must know of a camera."""
+"""Packs the images of all cameras into as few textures as OpenGL allows, and prepares what a shader must know of a
+camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ INSTANCE_NAMES = ("pose_x", "pose_y", "pose_z", "projection", "lens", "lens_more
 
 
 class ImageTooLarge(EigenheadError):
-    """An image does not fit into the largest texture of the driver."""
+    """Reports that an image does not fit into the largest texture of the driver."""
 
     def __init__(self, name: str, width: int, height: int, limit: int) -> None:
         super().__init__(compose("image-beyond-driver", camera=name, width=width, height=height, most=limit))
@@ -26,8 +27,7 @@ class ImageTooLarge(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Page:
-    """Holds one texture: which cameras (by index) have a tile on it, and where. ``tiles`` holds left, top, width,
-    height."""
+    """Holds one texture that several cameras share: their indices, and their tiles on it (left, top, width, height)."""
 
     width: int
     height: int
@@ -41,7 +41,8 @@ class Page:
 
 
 def pack(cameras: Sequence[Camera], largest_side: int) -> tuple[Page, ...]:
-    """Shelves of tiles, tallest first; a new page where one is full. Raises ImageTooLarge."""
+    """Packs the cameras' images onto pages: in rows, the tallest first, with a new page when one is full. Raises
+    ImageTooLarge."""
     side = min(largest_side, PAGE_PX)
     for camera in cameras:
         k = camera.intrinsics
@@ -77,7 +78,8 @@ def _page(placed: list[tuple[int, tuple[int, int, int, int]]]) -> Page:
 
 
 def lens_limit(camera: Camera) -> float:
-    """Radius (of ``X / Z``) past which no point lies in the image, with a wide margin: twice the farthest corner's."""
+    """Returns the radius of a ray (``X / Z``) beyond which no point appears in the image: twice that of the farthest
+    corner."""
     k = camera.intrinsics
     corners = np.array([(x, y) for x in (-0.5, k.width - 0.5) for y in (-0.5, k.height - 0.5)])
     radii = np.linalg.norm(camera.undistort(corners), axis=1)
@@ -92,9 +94,10 @@ def instances(
     origin_world: Float[np.ndarray, " 3"],
     depth_ranges: Float[np.ndarray, "n 2"] | None = None,
 ) -> Float[np.ndarray, "k 30"]:
-    """Returns a row of shader inputs per tile of ``page``, for points given relative to ``origin_world``.
+    """Returns a row of shader inputs for each tile of ``page``. The shader then takes points relative to
+    ``origin_world``.
 
-    ``depth_ranges``: nearest and farthest depth of the scene per camera (mm); None draws without a depth buffer.
+    ``depth_ranges``: nearest and farthest depth of the scene in each camera (mm); None draws without a depth buffer.
     """
     rows = np.zeros((len(page.cameras), 30), np.float32)
     for row, index, tile in zip(rows, page.cameras, page.tiles, strict=True):
@@ -111,8 +114,8 @@ def instances(
 
 
 def box_points(vertices: Float[np.ndarray, "v 3"], per_edge: int = 9) -> Float[np.ndarray, "p 3"]:
-    """Returns points on the twelve edges of the vertices' bounding box: seen from outside, their outline holds the
-    mesh's."""
+    """Returns points on the twelve edges of the vertices' bounding box. Seen from outside the box, their outline
+    contains that of the mesh."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     steps = np.linspace(0.0, 1.0, per_edge)
     corners = np.array([(a, b) for a in (0.0, 1.0) for b in (0.0, 1.0)])
@@ -121,7 +124,7 @@ def box_points(vertices: Float[np.ndarray, "v 3"], per_edge: int = 9) -> Float[n
 
 
 def depth_range(camera: Camera, box: Float[np.ndarray, "p 3"]) -> tuple[float, float]:
-    """Returns the nearest and farthest depth (mm) that the points of a bounding box allow, a little widened."""
+    """Returns the nearest and the farthest depth (mm) of the points of a bounding box, slightly widened."""
     depth = camera.camera_from_world.apply(box)[:, 2]
     near = max(0.99 * float(depth.min()), NEAR_MM)
     return near, max(1.01 * float(depth.max()), near + 1.0)

@@ -1,1 +1,1 @@
-"""The simulated studio, which the tests and the demo photograph."""
+"""Simulates a studio, which tests and the demo photograph."""

@@ -29,8 +29,8 @@ NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class BatchCapture:
-    """Holds one capture of a batch. ``name``: name of the result's folder; ``settings``: settings of this capture,
-    which override those of the batch."""
+    """Holds one capture of a batch. ``name``: name of the result's folder, relative to ``OUT``; ``settings``: those of
+    this capture, which override the batch's."""
 
     name: str
     path: Path
@@ -40,9 +40,10 @@ class BatchCapture:
 
 
 def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
-    """Finds all captures below a folder, sorted by name; ``out`` and folders of results are skipped.
+    """Finds all captures below a folder, sorted by name. ``out`` and folders of results are skipped.
 
-    Raises InputError where there is none, where the folder itself is one, and naming all that would share a name.
+    Raises InputError if there is none, if the folder itself is one, and naming all captures whose results would share a
+    folder.
     """
     if is_capture(folder) and (find_rig_file(folder) is not None or (folder / "images").is_dir()):
         raise InputError(folder.name, [compose("batch-folder-is-capture")])
@@ -56,7 +57,8 @@ def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
 
 
 def is_capture(path: Path) -> bool:
-    """Tells whether a path is a capture: an archive, or a folder with cameras or enough photographs."""
+    """Returns whether a path is a capture: an archive, or a folder with cameras or at least ``MIN_PICTURES``
+    photographs."""
     if path.is_file():
         return is_archive(path)
     if find_rig_file(path) is not None or (path / "images").is_dir():
@@ -65,13 +67,13 @@ def is_capture(path: Path) -> bool:
 
 
 def is_archive(path: Path) -> bool:
-    """Tells whether a file is an archive, by the ending of its name."""
+    """Returns whether a file's name ends like that of an archive."""
     return path.name.lower().endswith(ARCHIVES)
 
 
 def read_list(path: Path) -> tuple[BatchCapture, ...]:
-    """Reads a list of captures and returns them in the list's order. Raises InputError naming every
-    fault with its line."""
+    """Reads a list of captures and returns them in the list's order. Raises InputError naming every fault with its
+    line."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:

@@ -1,14 +1,15 @@
-"""Decides through files alone which process works on what: a claim is a symbolic link of the claimed name to its
-owner's file.
+"""Decides, by files alone, which process works on what. A claim is a symbolic link of the claimed name to its owner's
+file.
 
-Making a link is atomic and fails where one exists, on local disks as on NFS and Lustre, where ``flock`` may not reach
-other machines; and the link names its owner. An owner is one process. It touches its file every ``BEAT_S`` seconds. An
-owner loses its claims if its file is untouched for ``HEARTBEAT_TIMEOUT_S``, if its process is gone (same machine), or
-if its file is gone.
+Making a link is atomic and fails if one exists, on local disks as on NFS and Lustre, where ``flock`` may not reach
+other machines. The link also names its owner. An owner is one process. It touches its file every ``BEAT_S`` seconds. It
+loses its claims if the file is untouched for ``HEARTBEAT_TIMEOUT_S`` seconds, if its process is gone (on the same
+machine), or if the file is gone.
 
 A lost claim is removed by one process only: the one that first claims the removal (a claim named by the claim and the
 loser's token). So a newer claim is never removed by mistake. A process that was suspended for longer than
-``HEARTBEAT_TIMEOUT_S`` and continues asks ``Claims.holds`` before it publishes a result."""
+``HEARTBEAT_TIMEOUT_S`` and continues asks ``Claims.holds`` before it publishes a result.
+"""
 
 import json
 import os
@@ -26,7 +27,8 @@ SUFFIX = ".json"
 
 
 class Claims:
-    """Manages the claims of this process in a folder that all processes of a batch share. Thread-safe."""
+    """Takes and releases claims for this process, so that no two processes work on the same thing. ``folder`` is shared
+    by all processes of a batch. Thread-safe."""
 
     def __init__(self, folder: Path, *, silent_s: float = HEARTBEAT_TIMEOUT_S) -> None:
         self.token = secrets.token_hex(8)
@@ -37,8 +39,8 @@ class Claims:
 
     @contextmanager
     def beating(self) -> Iterator[None]:
-        """Keeps this process's owner file and its heartbeat while the block runs. Claims can be
-        taken only inside it."""
+        """Writes this process's owner file and touches it regularly while the block runs. Claims can be taken only
+        inside it; they end with it."""
         self._show()
         beat = threading.Thread(target=self._beat, name="claims", daemon=True)
         beat.start()
@@ -50,20 +52,21 @@ class Claims:
             self._owner.unlink(missing_ok=True)
 
     def take(self, name: str) -> bool:
-        """Claims a name and tells whether that succeeded; it fails where another process holds the name."""
+        """Claims a name and returns whether that succeeded. It fails if another live process holds the name."""
         return self._take(self._folder / name)
 
     def holds(self, name: str) -> bool:
-        """Tells whether this process still holds the claim on a name."""
+        """Returns whether this process still holds the claim on a name."""
         return _holder(self._folder / name) == self.token
 
     def release(self, name: str) -> None:
-        """Gives up this process's claim on a name, if it still holds it."""
+        """Releases this process's claim on a name. Does nothing if another process holds it by now."""
         if self.holds(name):
             (self._folder / name).unlink(missing_ok=True)
 
     def is_alive(self, token: str) -> bool:
-        """Tells whether the process with this token may still be at work."""
+        """Returns whether the process with this token may still be at work. Raises nothing: if the file server does not
+        answer, it counts as alive."""
         if token == self.token:
             return True
         path = self._owners / f"{token}{SUFFIX}"

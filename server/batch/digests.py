@@ -1,4 +1,4 @@
-"""Computes the sha256 of what a result depends on: a capture's files, settings, and the model."""
+"""Computes the SHA-256 of a capture, so that a later run can tell whether its result is up to date."""
 
 import hashlib
 import os
@@ -17,7 +17,7 @@ def capture_sha256(path: Path) -> str:
 
 
 def files_sha256(files: Mapping[str, str]) -> str:
-    """Computes the SHA-256 of a folder from that of each of its files, by name."""
+    """Computes one SHA-256 of a whole folder from the SHA-256 of each of its files, by name."""
     digest = hashlib.sha256()
     for name, file_digest in sorted(files.items()):
         digest.update(f"{name}\0{file_digest}\n".encode("utf-8", "surrogateescape"))

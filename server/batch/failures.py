@@ -1,4 +1,4 @@
-"""Describes why a capture of a batch failed, in messages fit for a batch."""
+"""Describes why a capture of a batch failed, with messages that say what to do in a batch."""
 
 from pathlib import Path
 
@@ -11,7 +11,8 @@ SIGKILL = 9
 
 
 def failure_of(error: EigenheadError | OSError, capture: Path, attempt: str, origin: Origin | None) -> FailureRecord:
-    """Returns the record of a failure for the error that caused it. ``origin`` None: the capture could not be read."""
+    """Returns the failure record for an error. ``attempt``: token of the process (``Claims.token``); ``origin``: None
+    if the capture could not be read."""
     if isinstance(error, WorkFailed):
         return FailureRecord(attempt, error.kind, _of_work(error), error.faults, origin, error.trace)
     if isinstance(error, EigenheadError):

@@ -1,8 +1,8 @@
 """Manages the folder that a batch fills: results by name, each complete or absent, and records of work in progress.
 
-NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it follows from
+NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it was made from
 heads.csv heads.parquet sheet.html
-.batch/           claims/, attempts/ (results on their way), failures/: gone when nothing is at work and none failed
+.batch/           claims/, attempts/ (results being made), failures/: gone when nothing is at work and none failed
 """
 
 import hashlib
@@ -27,7 +27,7 @@ FOUND_FILES = ("cameras.json", "calibration.json", "calibration.html", "masks") 
 
 
 class ForeignFiles(EigenheadError):
-    """Reports that the folder of a result holds files that belong to no result."""
+    """Reports that the folder of a result holds files that are no part of a result, so that it must not be replaced."""
 
     def __init__(self, folder: Path, names: list[str]) -> None:
         super().__init__(compose("batch-foreign-files", folder=str(folder), names=names[:5]))
@@ -35,7 +35,8 @@ class ForeignFiles(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Holds what a result follows from, as SHA-256. Another ``version`` alone is no reason to make the result again."""
+    """Holds what a result was made from, as SHA-256 of the capture's files, the settings and the model, and the
+    program's version. A result is not made again for another ``version`` alone."""
 
     input_sha256: str
     settings_sha256: str
@@ -43,7 +44,7 @@ class Origin:
     version: str
 
     def is_of(self, other: "Origin") -> bool:
-        """Tells whether two results follow from the same input, settings and model, whatever their version."""
+        """Returns whether two results were made from the same input, settings and model, whatever the version."""
         return (self.input_sha256, self.settings_sha256, self.model_sha256) == (
             other.input_sha256,
             other.settings_sha256,
@@ -53,7 +54,8 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class FailureRecord:
-    """Holds why the latest attempt at a capture failed. ``attempt``: token of the process that made it."""
+    """Holds why the latest attempt at a capture failed. ``attempt``: token of the process that made it
+    (``Claims.token``)."""
 
     attempt: str
     kind: str
@@ -64,8 +66,8 @@ class FailureRecord:
 
 
 class BatchFolder:
-    """Manages the paths and records of the folder ``out`` that a batch fills. Claims decide which process may write
-    what."""
+    """Manages the paths and records of the folder ``out`` that a batch fills. Claims (server.batch.claims) decide which
+    process may write what."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
@@ -77,7 +79,7 @@ class BatchFolder:
         return self.out / name
 
     def origin(self, name: str) -> Origin | None:
-        """Reads what a result follows from. Returns None where there is no complete result."""
+        """Reads what a result was made from. Returns None if there is no complete result."""
         folder = self.result(name)
         with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
             record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
@@ -92,7 +94,8 @@ class BatchFolder:
         return json.loads((self.result(name) / REPORT).read_text(encoding="utf-8"))
 
     def new_attempt(self, token: str) -> Path:
-        """Makes an empty folder for one attempt at a result, with the folders ``result`` and ``scratch`` in it."""
+        """Makes a folder for one attempt at a result, with the empty folders ``result`` and ``scratch`` in it.
+        ``token`` names the process that makes the attempt (``Claims.token``)."""
         number = 0
         while True:
             attempt = self.attempts / f"{token}.{number}"
@@ -106,9 +109,10 @@ class BatchFolder:
             return attempt
 
     def publish(self, name: str, attempt: Path, origin: Origin) -> None:
-        """Moves the finished result of an attempt to its final place, replacing an earlier result of that name.
+        """Renames the finished result of an attempt to its final place, replacing an earlier result of that name, and
+        removes the failure record.
 
-        Raises ForeignFiles, and OSError where another process has just published the same result.
+        Raises ForeignFiles, and OSError if another process has just published the same result.
         """
         made, target = attempt / "result", self.result(name)
         self.check_replaceable(name)
@@ -123,8 +127,7 @@ class BatchFolder:
         self.failure_file(name).unlink(missing_ok=True)
 
     def check_replaceable(self, name: str) -> None:
-        """Raises ForeignFiles where the folder of a result holds files that belong to no result, so that it must not be
-        replaced."""
+        """Raises ForeignFiles if the folder of a result holds files that are no part of a result."""
         try:
             entries = sorted(path.name for path in self.result(name).iterdir())
         except FileNotFoundError:
@@ -133,13 +136,13 @@ class BatchFolder:
             raise ForeignFiles(self.result(name), foreign)
 
     def remove_attempts(self, is_alive: Callable[[str], bool]) -> None:
-        """Removes the attempts of processes that are no longer alive."""
+        """Removes the attempts of processes that have ended. ``is_alive`` is asked for each process by its token."""
         for path in self._attempts():
             if not is_alive(path.name.partition(".")[0]):
                 shutil.rmtree(path, ignore_errors=True)
 
     def failure(self, name: str) -> FailureRecord | None:
-        """Reads why the latest attempt at a capture failed. Returns None where there is no such record."""
+        """Reads why the latest attempt at a capture failed. Returns None if there is no such record."""
         with suppress(OSError, ValueError, KeyError, TypeError):
             record = json.loads(self.failure_file(name).read_text(encoding="utf-8"))
             origin = None if record["origin"] is None else Origin(**record["origin"])
@@ -148,7 +151,7 @@ class BatchFolder:
         return None
 
     def note_failure(self, name: str, failure: FailureRecord) -> None:
-        """Writes why the latest attempt at a capture failed. Raises OSError."""
+        """Writes why the latest attempt at a capture failed, replacing an earlier record atomically. Raises OSError."""
         document = {
             "format": FAILURE_FORMAT,
             "capture": name,
@@ -166,7 +169,8 @@ class BatchFolder:
         return self.work / "failures" / f"{file_name(name)}.json"
 
     def forget_failures_but_of(self, names: set[str]) -> None:
-        """Removes the failure records of all captures but those named, and files that a kill left half written."""
+        """Removes the failure records of all captures that are not in ``names``, and files that a kill left half
+        written."""
         retained = {self.failure_file(name).name for name in names}
         with suppress(FileNotFoundError):
             for path in (self.work / "failures").iterdir():

@@ -17,8 +17,8 @@ from server.tasks.stage_durations import StageDurations
 
 @dataclass(frozen=True, slots=True)
 class BatchTask:
-    """Holds one capture of a batch with all that its result follows from except its files. ``expected_s``: expected
-    seconds of each stage."""
+    """Holds one capture of a batch with everything that its result depends on, except the content of its files.
+    ``expected_s``: expected seconds of each stage."""
 
     capture: BatchCapture
     settings: Mapping[str, object]
@@ -32,9 +32,11 @@ class BatchTask:
 def plan_batch(
     captures: Iterable[BatchCapture], settings: Mapping[str, object], model: str | None
 ) -> tuple[BatchTask, ...]:
-    """Plans a batch: one task for each capture. ``settings`` apply to all captures; a capture's settings override them.
+    """Makes one task for each capture, and checks settings, model and template of each. ``settings`` apply to all
+    captures; a capture's own settings override them.
 
-    Raises UnknownModel, the error of a wrong template, and InputError naming the captures whose settings are wrong.
+    Raises UnknownModel, BadTemplate or UnknownTemplate for what all captures share, and InputError naming the captures
+    with wrong settings.
     """
     path = model_path(model or "default")
     check_template(settings_from_document(settings).outputs.template, model or "default")

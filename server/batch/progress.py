@@ -1,4 +1,4 @@
-"""Measures how far a batch is, and estimates its remaining time."""
+"""Computes how much of a batch is done, and estimates its remaining time."""
 
 import time
 from collections.abc import Callable
@@ -7,13 +7,13 @@ Clock = Callable[[], float]
 
 
 class BatchProgress:
-    """Counts the captures that are done and estimates the remaining time from their mean.
+    """Counts the captures that are done and estimates the remaining time from their mean duration.
 
     Args:
-        captures: number still to be made.
-        workers: number of captures at once.
-        expected_s: of one capture, before one was made.
-        clock: seconds that only grow.
+        captures: how many are to be made.
+        workers: how many are made at once.
+        expected_s: seconds of one capture, used before the first is done.
+        clock: returns seconds and never goes back.
     """
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
@@ -32,7 +32,7 @@ class BatchProgress:
             self._running[name] = self._running[name][0], min(1.0, max(0.0, share))
 
     def end(self, name: str, *, failed: bool) -> None:
-        """Records that a capture ended. The time of one that failed does not count for the estimate."""
+        """Records that a capture has ended. The duration of one that failed does not count for the estimate."""
         since, _ = self._running.pop(name, (self._clock(), 0.0))
         self.ended += 1
         self.failed += failed
@@ -40,7 +40,7 @@ class BatchProgress:
             self._took.append(self._clock() - since)
 
     def leave(self, name: str) -> None:
-        """Records that another process has this capture."""
+        """Records that another process works on this capture."""
         self._running.pop(name, None)
 
     def share(self) -> float:
@@ -58,7 +58,7 @@ class BatchProgress:
 
 
 def told_time(seconds: float) -> str:
-    """Returns a time as text, in seconds, minutes or hours, no more exact than an estimate is."""
+    """Formats a duration in seconds, minutes or hours, as coarsely as an estimate deserves."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

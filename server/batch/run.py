@@ -48,12 +48,16 @@ class FolderWork(Protocol):
         scratch: str,
         model: str | None,
         settings: Mapping[str, object],
-    ) -> None: ...
+    ) -> None:
+        """Reconstructs ``capture`` into the new folder ``result``, with temporary files in ``scratch``; ends with the
+        process ``parent``."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Holds how a capture ended: ``made`` now, ``kept`` from before or from another process, or ``failed``."""
+    """Holds how a capture ended: ``made`` by this process, ``kept`` from an earlier run or another process, or
+    ``failed``."""
 
     name: str
     state: Literal["made", "kept", "failed"]
@@ -62,20 +66,31 @@ class Outcome:
 
 
 class Observer(Protocol):
-    """Declares the methods that are called as a batch proceeds, from several threads but never two at a time.
+    """Declares the methods that are called as a batch proceeds, from several threads but never two at a time."""
 
-    ``begin`` gets the number of captures to make; ``start``, ``report`` (share done, 0 to 1) and ``end`` follow each
-    capture; ``leave`` tells that another process has it."""
+    def begin(self, pending: int) -> None:
+        """Receives how many captures are to be made, once, before the first."""
+        ...
 
-    def begin(self, pending: int) -> None: ...
-    def start(self, name: str) -> None: ...
-    def report(self, name: str, share: float) -> None: ...
-    def leave(self, name: str) -> None: ...
-    def end(self, outcome: Outcome) -> None: ...
+    def start(self, name: str) -> None:
+        """Receives that work on a capture begins."""
+        ...
+
+    def report(self, name: str, share: float) -> None:
+        """Receives which share of a capture is done, 0 to 1."""
+        ...
+
+    def leave(self, name: str) -> None:
+        """Receives that this process stops working on the capture because another one has it."""
+        ...
+
+    def end(self, outcome: Outcome) -> None:
+        """Receives how a capture ended."""
+        ...
 
 
 class BatchRun:
-    """Runs one process's share of a batch."""
+    """Makes the missing results of a batch, or of one share of it, in this process and its children."""
 
     def __init__(
         self,
@@ -97,10 +112,11 @@ class BatchRun:
         self._outcomes: dict[str, Outcome] = {}
 
     def run(self, publish_table: Callable[[], object]) -> list[Outcome]:
-        """Makes the results that are missing and returns how each capture ended, in the order of the tasks.
+        """Makes the results that are missing and returns how each capture ended, in the order of the tasks. It may be
+        killed at any moment; the next run makes what is missing then.
 
-        ``publish_table`` is called at the end, never by two processes at a time. Raises OSError where the folder cannot
-        be written.
+        ``publish_table`` is called at the end, never by two processes at a time. Raises OSError if the folder cannot be
+        written.
         """
         try:
             with self._claims.beating():

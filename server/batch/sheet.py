@@ -2,7 +2,8 @@
 
 Each head has three views of its turntable, its name, figures and warnings. Red marks warnings that question the head
 itself, amber those about missing input, grey the rest. The sheet contains no times, so that equal results give equal
-bytes."""
+bytes.
+"""
 
 import base64
 import html
@@ -58,8 +59,8 @@ ul { margin: 4px 0 0; padding-left: 1.1em; font-size: 13px; } code { font-size: 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Holds what the sheet shows of one capture. ``messages``: warnings, or why it failed; ``turntable``: file of its
-    views; ``link``: address of its result, relative to the sheet."""
+    """Holds what the sheet shows of one capture. ``of``: subject and session; ``messages``: its warnings, or why it
+    failed; ``turntable``: the picture of its views; ``link``: address of its result, relative to the sheet."""
 
     name: str
     of: str
@@ -76,8 +77,7 @@ def severity(code: str) -> str:
 
 
 def card_class(card: Card) -> str:
-    """Returns the class by which a card is coloured: the state of a capture that is not done, else
-    its worst warning."""
+    """Returns the class by which a card is coloured: its worst warning, or the state of a capture that is not done."""
     if card.state != "done":
         return card.state
     found = {severity(message["code"]) for message in card.messages}
@@ -90,7 +90,8 @@ def sheet_html(title: str, cards: Sequence[Card]) -> str:
 
 
 def sheet_lines(title: str, cards: Sequence[Card]) -> Iterator[str]:
-    """Yields the parts of ``sheet_html``, so that the pictures of a thousand heads need not be held at once."""
+    """Yields the parts of ``sheet_html`` one by one, so that the pictures of a thousand heads are never held at
+    once."""
     order = ("failed", "severe", "warning", "good", "missing")
     ranked = sorted(cards, key=lambda card: (order.index(card_class(card)), card.name))
     yield '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -113,8 +114,8 @@ def summary(cards: Iterable[Card]) -> str:
 
 
 def views_of(turntable: Path) -> bytes | None:
-    """Returns right profile, front and left profile from a result's turntable.png as one JPEG file. Returns None where
-    the picture cannot be read."""
+    """Returns right profile, front and left profile from a result's turntable.png as one JPEG file. Returns None if the
+    picture cannot be read."""
     drawn = cv2.imread(str(turntable), cv2.IMREAD_COLOR)
     if drawn is None:
         return None
@@ -126,7 +127,8 @@ def views_of(turntable: Path) -> bytes | None:
 
 
 def figures_of(row: Mapping[str, object]) -> str:
-    """Returns the figures of a head that people ask for first, as one line: breadth, length and deviation (mm)."""
+    """Returns the most requested figures of a head as one line: breadth, length and deviation (mm). ``row`` is the
+    head's row of the table."""
     names = {"head_breadth_mm": "breadth", "head_length_mm": "length", "quality_median_mm": "deviation"}
     found = [(word, row.get(name)) for name, word in names.items()]
     return ", ".join(f"{word} {value:.1f} mm" for word, value in found if isinstance(value, float))

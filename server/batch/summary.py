@@ -1,4 +1,4 @@
-"""Writes table and contact sheet of all results in a batch's folder, whichever process made them."""
+"""Writes the table and the contact sheet of all results in a batch's folder, whichever process made them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ SHEET = "sheet.html"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Holds what became of a capture: its ``report`` and ``origin`` where it is done, its ``failure`` where it failed,
-    neither where it is not made yet. ``result``: folder of the result; ``link``: address of it on the sheet."""
+    """Holds what became of a capture: ``report`` and ``origin`` if it is done, ``failure`` if it failed, neither if it
+    is not made yet. ``link``: address of its result on the sheet."""
 
     capture: BatchCapture
     result: Path
@@ -33,10 +33,8 @@ class Outcome:
 
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
-    """Writes the table and the sheet of all captures of a batch, other shards' included. Returns the files.
-
-    Raises OSError.
-    """
+    """Writes the table and the sheet of all captures of a batch, including those of other shares, and returns the
+    files. Each file is replaced atomically. Raises OSError."""
     folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(expressions_of(task.model for task in tasks))
     outcomes = [_outcome(folder, task) for task in tasks]
@@ -48,12 +46,12 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
 
 
 def table_row(outcome: Outcome, columns: Sequence[Column]) -> Row:
-    """Returns the table's row of a capture."""
+    """Returns the row of the batch's table that describes a capture. ``columns``: all columns of the table."""
     return row_of(outcome.capture, columns, report=outcome.report, origin=outcome.origin, failure=outcome.failure)
 
 
 def sheet_card(outcome: Outcome, row: Row) -> Card:
-    """Returns the sheet's card of a capture from its row of the table."""
+    """Returns the card of the contact sheet that shows a capture. ``row``: the capture's row of the table."""
     capture, report = outcome.capture, outcome.report
     of = " / ".join(text for text in (capture.subject, capture.session) if text)
     turntable = None if report is None else outcome.result / "turntable.png"
@@ -88,7 +86,8 @@ def _why(failure: FailureRecord | None) -> tuple[MessageDocument, ...]:
 
 
 def expressions_of(models: Iterable[str | None]) -> list[str]:
-    """Returns the names of the expressions of all models, each once. None: the default model. Raises UnknownModel."""
+    """Returns the names of all expressions that the models have, each name once. ``models`` are names or files; None
+    stands for the default model. Raises UnknownModel."""
     names = [name for model in dict.fromkeys(models) for name in _of_model(model)]
     return list(dict.fromkeys(names))
 

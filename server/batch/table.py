@@ -1,7 +1,8 @@
 """Builds the table of a batch: one row for each capture, with the columns of ``columns_of``.
 
 Enters: reports of results and records of failures. Leaves: plain values. Lengths are mm, in the world frame; there are
-no angles. A cell is None if its row has no such value."""
+no angles. A cell is None if the capture has no such value.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,8 +21,8 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Describes one column of the table. ``unit``: "" where there is none; ``words``: its
-    description in docs/batch.md."""
+    """Describes one column of the table. ``unit`` is empty if it has none; ``words`` is its description in
+    docs/batch.md."""
 
     name: str
     kind: Literal["text", "number", "count", "flag"]
@@ -63,7 +64,8 @@ ORIGIN = (
 
 
 def measurement_columns() -> tuple[Column, ...]:
-    """Returns two columns for each of Farkas's distances: the value and its standard deviation (mm)."""
+    """Returns two columns for each of Farkas's distances (*Anthropometry of the Head and Face*): the value and its
+    standard deviation (mm)."""
     return tuple(
         column
         for name, (first, second) in DISTANCES.items()
@@ -113,8 +115,8 @@ def row_of(
     origin: Origin | None = None,
     failure: FailureRecord | None = None,
 ) -> Row:
-    """Returns the table's row of a capture that is done (``report`` and ``origin``), that failed (``failure``), or
-    neither."""
+    """Returns the table's row of a capture. One that is done has ``report`` and ``origin``; one that failed has
+    ``failure``; one that is missing has neither."""
     row: Row = {column.name: None for column in columns}
     row |= {"capture": capture.name, "subject": capture.subject or None, "session": capture.session or None}
     row["state"] = "missing"

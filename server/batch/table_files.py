@@ -14,7 +14,7 @@ CSV, PARQUET = "heads.csv", "heads.parquet"
 
 
 def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) -> list[Path]:
-    """Writes the table as CSV and, where pyarrow is installed, as Parquet. Returns the files. Raises OSError."""
+    """Writes the table as CSV and, if pyarrow is installed, as Parquet. Returns the files. Raises OSError."""
     files = [folder / CSV]
     write_atomically(files[0], csv_bytes(columns, rows))
     if has_parquet():
@@ -26,7 +26,7 @@ def write_table(folder: Path, columns: Sequence[Column], rows: Sequence[Row]) ->
 
 
 def has_parquet() -> bool:
-    """Tells whether Parquet files can be written here."""
+    """Returns whether Parquet files can be written here, which needs pyarrow."""
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError:
@@ -35,13 +35,12 @@ def has_parquet() -> bool:
 
 
 def csv_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
-    """Returns the table as CSV (RFC 4180, UTF-8), with all digits of every number. An empty cell
-    stands for no value."""
+    """Returns the table as CSV (RFC 4180, UTF-8), with all digits of every number. A missing value is an empty cell."""
     return b"".join(csv_lines(columns, rows))
 
 
 def csv_lines(columns: Sequence[Column], rows: Iterable[Row]) -> Iterator[bytes]:
-    """Yields the rows of ``csv_bytes`` one by one, the names of the columns first."""
+    """Yields the lines of ``csv_bytes`` one by one, the names of the columns first."""
     cells = ([_cell(row[column.name]) for column in columns] for row in rows)
     for line in itertools.chain([[column.name for column in columns]], cells):
         stream = io.StringIO(newline="")
@@ -50,7 +49,7 @@ def csv_lines(columns: Sequence[Column], rows: Iterable[Row]) -> Iterator[bytes]
 
 
 def parquet_bytes(columns: Sequence[Column], rows: Sequence[Row]) -> bytes:
-    """Returns the table as a Parquet file; the metadata of each field has its unit and description. Needs pyarrow."""
+    """Returns the table as a Parquet file. The metadata of each field has its unit and description. Needs pyarrow."""
     import pyarrow
     import pyarrow.parquet
 

@@ -15,7 +15,7 @@ def worker_count(cores: int, free_bytes: int, captures: int) -> int:
 
 
 def threads_of_worker(cores: int, workers: int) -> int:
-    """Computes how many threads each worker's loops may use, so that all workers together fill the cores."""
+    """Computes how many threads each worker's loops may use, so that all workers together use every core once."""
     return max(1, cores // workers)
 
 
@@ -25,7 +25,8 @@ def usable_cores() -> int:
 
 
 def free_memory(meminfo: Path = Path("/proc/meminfo"), cgroup: Path | None = None) -> int:
-    """Returns the free bytes of memory: of the machine, or of this process's control groups if these have less."""
+    """Returns the free bytes of memory: of the machine, or of this process's control groups (such as a container's) if
+    these have less."""
     free = [_available(meminfo)]
     group = _own_group() if cgroup is None else cgroup
     while group.is_relative_to(CGROUP) or cgroup is not None:

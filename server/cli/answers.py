@@ -1,4 +1,4 @@
-"""Holds what all commands share: types of options, the service's settings, a progress bar, and the answer on stdout."""
+"""What all commands share: types of options, the service's settings, a progress bar, and the answer on stdout."""
 
 import errno
 import json
@@ -30,14 +30,14 @@ class CannotWrite(EigenheadError):
 
 
 class SpoilsCapture(EigenheadError):
-    """Reports an output path that lies within the capture, where the next run would read the result as input."""
+    """Reports an output path within the capture, where the next run would read the result as input."""
 
     def __init__(self, path: Path, option: str = "--out") -> None:
         super().__init__(f"{path} lies where the capture's own pictures do; name another place with {option}")
 
 
 class Overwrites(EigenheadError):
-    """Reports an output file that exists already, where ``--overwrite`` was not given."""
+    """Reports an output file that exists already while ``--overwrite`` was not given."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path} is there already; name another place, or replace it with --overwrite")
@@ -64,10 +64,11 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is th
 
 
 def service_settings(**overrides: Any) -> Any:
-    """Returns the service's ``ServiceSettings``. Options that are not None go before variables, variables before
-    defaults.
+    """Returns the service's ``ServiceSettings``. An option that is not None overrides the environment variable, and
+    that the default.
 
-    Raises typer.BadParameter (exit status 2) naming every option or variable with a wrong value."""
+    Raises typer.BadParameter (exit status 2) naming every option or variable with a wrong value.
+    """
     from pydantic import ValidationError
     from pydantic_settings import SettingsError
 
@@ -92,9 +93,10 @@ def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
 
 
 def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str | None]:
-    """Returns a callback that refuses a value which is not among the choices.
+    """Returns a typer callback that refuses a value which is none of the choices.
 
-    ``choices`` is called only when the option is given: listing them may import heavy modules."""
+    ``choices`` is called only if the option is given, since listing them may import heavy modules.
+    """
 
     def check(value: str | None) -> str | None:
         if value is not None and value not in choices():
@@ -105,7 +107,7 @@ def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str
 
 
 def completing(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Returns a function that lists the choices beginning with what was typed so far, for completion by the shell."""
+    """Returns a function for completion by the shell: it lists the choices that begin with what was typed."""
     # The parameter's name tells typer what to pass.
     return lambda incomplete: [choice for choice in choices() if choice.startswith(incomplete)]
 
@@ -135,7 +137,8 @@ def model_names() -> tuple[str, ...]:
 
 @contextmanager
 def wrong_usage(option: str) -> Iterator[None]:
-    """Turns an InputError of the block into typer.BadParameter of ``option``, which ends the command with status 2."""
+    """Turns an InputError raised in the block into typer.BadParameter of ``option``, which ends the command with status
+    2."""
     try:
         yield
     except InputError as error:
@@ -172,7 +175,8 @@ def prepare_folder(path: Path) -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Yields a function that reports progress as a bar on standard error; without a terminal it reports nothing."""
+    """Yields a function that shows progress (stage, fraction 0 to 1) as a bar on standard error. If that is no
+    terminal, it shows nothing."""
     if not sys.stderr.isatty():
         yield lambda stage, fraction: None
         return

@@ -1,4 +1,4 @@
-"""Shows the progress of a batch: as a bar on a terminal, otherwise as one line a capture, for a scheduler's log."""
+"""Shows the progress of a batch: a bar on a terminal, otherwise one line for each capture, for a scheduler's log."""
 
 import sys
 import time
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 
 class BatchDisplay:
-    """Shows the events of a batch run, as its ``Observer``. ``bar`` is rich's progress bar, None without a terminal."""
+    """Shows the events of a batch run, as its ``Observer``. ``bar`` is rich's progress bar, or None if standard error
+    is no terminal."""
 
     def __init__(self, workers: int, expected_s: float, bar: Any = None) -> None:
         self._workers, self._expected_s, self._bar = workers, expected_s, bar
@@ -39,7 +40,8 @@ class BatchDisplay:
             yield cls(workers, expected_s, bar)
 
     def prepare(self, tasks: "Sequence[BatchTask]") -> None:
-        """Compiles the missing numerical loops once, so that not every worker compiles them for itself."""
+        """Compiles the numerical loops that the batch needs and that are not compiled on this machine yet, so that not
+        every worker compiles them for itself."""
         from pipeline.settings import settings_from_document
         from server.tasks.prepare import prepare_kernels
 

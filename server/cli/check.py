@@ -33,8 +33,8 @@ RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz
 
 
 class Checked(TypedDict):
-    """Describes what `eigenhead check --json` prints: ``faults`` make a reconstruction fail, ``warnings`` do not;
-    ``will`` lists in English what a reconstruction will do with photographs that have no cameras."""
+    """Describes what `eigenhead check --json` prints. ``faults`` make a reconstruction fail, ``warnings`` do not.
+    ``will`` lists in English what a reconstruction does with photographs that have no cameras."""
 
     capture: str
     cameras: list[str]
@@ -46,9 +46,10 @@ class Checked(TypedDict):
 
 
 def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> Checked:
-    """Returns every fault and warning of a capture folder or archive that can be found without a fit.
+    """Returns every fault and warning of a capture folder or archive that can be found without fitting a head.
 
-    Raises InputError for wrong settings, and WrongVariable and WorkFailed for faults of this machine."""
+    Raises InputError for wrong settings, and WrongVariable or WorkFailed if this machine, not the capture, is at fault.
+    """
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
@@ -153,7 +154,7 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
 
 
 def lines(found: Checked) -> list[str]:
-    """Returns the findings as lines of text for people."""
+    """Returns the findings of a check as lines for people."""
     findings = [f"fault    {fault}" for fault in found["faults"]]
     findings += [f"warning  {warning['code']}: {warning['message']}" for warning in found["warnings"]]
     findings += [f"will     {step}" for step in found["will"]]

@@ -1,4 +1,4 @@
-"""Provides a Python client of the service: it resumes uploads, waits with progress, and checks downloads.
+"""A Python client of the service, which resumes uploads, waits with progress, and checks downloads.
 
 with Client("http://127.0.0.1:8600") as client:
     capture = client.upload(Path("capture"))
@@ -71,8 +71,8 @@ class Event:
 
 
 class Client:
-    """Calls one service. Requests that a broken connection or a busy service stopped are repeated for ``patience_s``
-    seconds; refused requests are not."""
+    """Calls one service. A request that fails by a broken connection or a busy service is repeated for ``patience_s``
+    seconds. A refused request is not."""
 
     def __init__(self, url: str, key: str | None = None, *, patience_s: float = 30.0, timeout_s: float = 300.0) -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
@@ -87,29 +87,32 @@ class Client:
         self._http.close()
 
     def get(self, path: str, **query: Any) -> Any:
-        """Returns the JSON answer to a GET; query parameters that are None are left out."""
+        """Sends a GET and returns the JSON of the answer. Query parameters that are None are left out. Raises
+        ServiceError and Unreachable."""
         return self._request("GET", path, params={k: v for k, v in query.items() if v is not None}).json()
 
     def post(self, path: str, document: Any = None, headers: dict[str, str] | None = None) -> Any:
-        """Returns the JSON answer to a POST.
+        """Sends a POST of ``document`` and returns the JSON of the answer. Raises ServiceError and Unreachable.
 
-        A broken connection leaves open whether the service acted, so the request is repeated only if ``headers`` hold
-        an Idempotency-Key."""
+        After a broken connection it is unknown whether the service acted. So the request is repeated only if
+        ``headers`` has an Idempotency-Key.
+        """
         again = bool(headers and "Idempotency-Key" in headers)
         return self._request("POST", path, json=document, headers=headers, repeat=again).json()
 
     def put(self, path: str, document: Any) -> Any:
-        """Returns the JSON answer to a PUT of ``document``."""
+        """Sends a PUT of ``document`` and returns the JSON of the answer. Raises ServiceError and Unreachable."""
         return self._request("PUT", path, json=document).json()
 
     def delete(self, path: str) -> None:
-        """Sends a DELETE. Raises ServiceError if the service refuses it."""
+        """Sends a DELETE. Raises ServiceError if the service refuses it, and Unreachable."""
         self._request("DELETE", path)
 
     def upload(self, source: Path, *, report: Progress | None = None, **about: str) -> CaptureDocument:
-        """Uploads a capture folder or an archive of one, resuming after every break; returns the capture.
+        """Uploads a capture folder or an archive of one, resuming after every interruption, and returns the capture.
 
-        ``about`` may hold session, label and expression. Raises ServiceError naming every fault of the capture.
+        ``about`` may hold session, label and expression. Raises ServiceError naming every fault of the capture, and
+        Unreachable.
         """
         with tempfile.TemporaryDirectory() as scratch:
             archive = source
@@ -126,16 +129,19 @@ class Client:
         settings: Mapping[str, object] | None = None,
         key: str | None = None,
     ) -> JobDocument:
-        """Queues a job and returns its document. ``key`` is the idempotency key, which makes the request safe to
-        repeat; a new one is made by default."""
+        """Queues a job and returns its document. ``key`` is the idempotency key that makes the request safe to repeat;
+        by default a new one is made. Raises ServiceError and Unreachable."""
         request = {"capture_id": capture_id, "model": model, "settings": settings}
         headers = {"Idempotency-Key": key or hashlib.sha256(f"{capture_id}{time.time_ns()}".encode()).hexdigest()}
         return self.post("/v1/jobs", request, headers)
 
     def events(self, job_id: str) -> Iterator[tuple[str, "JsonObject"]]:
-        """Yields (kind, document) for each event of a job until the job ends, reconnecting where the connection breaks.
+        """Yields kind and document of each event of a job until the job ends. Reconnects after an interruption without
+        repeating events.
 
-        Raises Unreachable if no connection succeeds for ``patience_s`` seconds; a job may be silent for any time."""
+        Raises Unreachable if no connection succeeds for ``patience_s`` seconds. The time between two events is not
+        limited.
+        """
         last, deadline = "0", time.monotonic() + self._patience_s
         while True:
             try:
@@ -166,8 +172,8 @@ class Client:
         raise AssertionError("a stream of events ends with 'end'")
 
     def download(self, job_id: str, folder: Path) -> list[Path]:
-        """Writes the files of a job's result into ``folder``, replacing those of an earlier result; returns their
-        paths. Each file is checked against its sha256."""
+        """Writes the files of a job's result into ``folder``, replacing an earlier result, and returns their paths.
+        Raises ServiceError if a file does not have its SHA-256; the folder then stays as it was."""
         job = self.get(f"/v1/jobs/{job_id}")
         with fresh_folder(folder) as fresh:
             for name, described in job["files"].items():

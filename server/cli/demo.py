@@ -1,5 +1,5 @@
-"""Implements ``eigenhead demo``: runs the main job through a real service, from the trigger to the head, and on request
-solves it by the paper's simplex too."""
+"""Implements ``eigenhead demo``: runs a job on a real service, from the trigger to the head, and with ``--compare`` a
+second one by the paper's simplex."""
 
 import json
 import subprocess
@@ -31,7 +31,7 @@ STRIP = 60  # height of a heading, pixels
 
 
 class ServiceDied(EigenheadError):
-    """Reports that the demo's service process ended before its end was requested; ``log`` is its log file."""
+    """Reports that the demo's service process ended before the demo did. The message has the end of its log."""
 
     def __init__(self, log: Path) -> None:
         super().__init__(f"the service did not start:\n{log.read_text(errors='replace')[-2000:]}")
@@ -121,8 +121,8 @@ def _described(folder: Path, truth: Path) -> MethodDocument:
 
 
 def side_by_side(found: dict[str, MethodDocument], target: Path) -> None:
-    """Joins the contact sheets of all solvers to one, written to ``target``: input and start once, then each solver's
-    silhouettes and head."""
+    """Writes one picture that joins the contact sheets of all solvers: the input and the start once, then silhouettes
+    and head of each solver."""
     columns = []
     for method, described in found.items():
         sheet = cv2.imread(str(Path(described["ply"]).with_name("contact_sheet.png")))

@@ -38,11 +38,15 @@ MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
 class Connection(Protocol):
-    """Describes the methods that connections to SQLite and to PostgreSQL have in common (PEP 249)."""
+    """Declares the methods that connections to SQLite and to PostgreSQL have in common (PEP 249)."""
 
-    def cursor(self) -> Any: ...
+    def cursor(self) -> Any:
+        """Returns a new cursor."""
+        ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Closes the connection."""
+        ...
 
 
 class Finding(TypedDict):
@@ -53,7 +57,8 @@ class Finding(TypedDict):
 
 
 def examine(settings: ServiceSettings) -> dict[str, Finding]:
-    """Runs every check and returns the findings by name. Only reads: neither folders nor tables are made."""
+    """Runs every check of this machine and returns the findings by name. Only reads: it makes neither folders nor
+    tables."""
     checks: dict[str, Callable[[ServiceSettings], tuple[bool, str]]] = {
         "python": _python,
         "egl": _egl,

@@ -90,7 +90,7 @@ def _check_options(name: str, folders: list[Path] | None, only: list[str] | None
 
 
 def check_research() -> None:
-    """Raises EigenheadError if this is an installed wheel, which does not contain the research code."""
+    """Raises EigenheadError in an installed wheel, which does not contain the research code."""
     try:
         from pipeline import research  # noqa: F401
     except ImportError:

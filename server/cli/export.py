@@ -1,4 +1,4 @@
-"""The command that hands a capture to other programs: export."""
+"""Implements ``eigenhead export``, which writes a capture for other programs."""
 
 from pathlib import Path
 from typing import Annotated

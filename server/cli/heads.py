@@ -32,8 +32,7 @@ app = typer.Typer(rich_markup_mode=None)
 
 
 def of_setting(name: str) -> Callable[[], tuple[str, ...]]:
-    """Returns a function that lists the values which a setting of the pipeline may have, read from its type
-    annotation."""
+    """Returns a function that lists the allowed values of a setting of the pipeline, read from its type annotation."""
 
     def choices() -> tuple[str, ...]:
         from pipeline.settings import Settings
@@ -45,8 +44,7 @@ def of_setting(name: str) -> Callable[[], tuple[str, ...]]:
 
 
 def of_output(name: str) -> Callable[[], tuple[str, ...]]:
-    """Returns a function that lists the values which a setting of the outputs may have, read from its type
-    annotation."""
+    """Returns a function that lists the allowed values of a setting of the outputs, read from its type annotation."""
 
     def choices() -> tuple[str, ...]:
         from pipeline.settings import OutputSettings

@@ -1,4 +1,4 @@
-"""Implements the command ``eigenhead``. Everything heavy is imported inside the commands, so that --help answers at
+"""Implements the command ``eigenhead``. Everything heavy is imported inside the commands, so that ``--help`` answers at
 once."""
 
 import os

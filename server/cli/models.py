@@ -47,7 +47,10 @@ def model_import(
     data: Data = None,
     json_out: Json = False,
 ) -> None:
-    """Make a foreign head model one of ours."""
+    """Convert a head model of another program.
+
+    It is kept among the models under its name.
+    """
     from pipeline.head_model.data_folder import models_folder
     from pipeline.head_model.model_file import save_model
     from pipeline.model_building.sources.imports import import_model
@@ -92,9 +95,10 @@ def model_fetch(
     data: Data = None,
     json_out: Json = False,
 ) -> None:
-    """Fetch a published head model.
+    """Download a published head model.
 
-    Its licence is shown, and it becomes one of ours."""
+    Its licence is shown, and it is kept among the models.
+    """
     from pipeline.model_building.sources.fetch import fetch_model
 
     with progress_bar() as report:

@@ -1,5 +1,8 @@
-"""Implements ``eigenhead experiments real FOLDER...``: judges real captures by views that the fit did not use. Cameras
-are calibrated first where a folder has none."""
+"""Implements ``eigenhead experiments real FOLDER...``: judges heads from real captures by views that their fit did not
+use.
+
+Cameras are estimated first if a folder has none.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,8 +34,9 @@ def judge_folders(
 ) -> "Outcome":
     """Computes the experiment's figures for every folder.
 
-    ``outlines`` is a file of masks drawn by hand, allowed for a single folder only; by default a folder's own
-    outlines.json is read. In ``kept`` the estimated cameras and the table of figures are stored. Raises InputError."""
+    ``outlines`` is a file of outlines drawn by hand, allowed for a single folder only; by default a folder's own
+    outlines.json is read. The estimated cameras and the table of figures are written to ``kept``. Raises InputError.
+    """
     if outlines is not None and len(folders) > 1:
         raise InputError("--outlines", ["belongs to one folder; put outlines.json into each of several"])
     from pipeline.head_model.model import load_model
@@ -56,8 +60,8 @@ def judge_folders(
 def read_real_capture(
     folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Progress
 ) -> "RealCapture":
-    """Reads a folder for the experiment ``real``. Its masks and drawn outlines serve as reference; its feature points
-    are dropped."""
+    """Reads a folder for the experiment ``real``. Its masks and drawn outlines serve as the reference, its feature
+    points are not used. Estimated cameras are written to ``kept``."""
     from pipeline.research.faults.real import RealCapture
 
     prepared = read_or_calibrate(folder, kept, front=front, report=report)

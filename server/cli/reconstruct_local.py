@@ -33,9 +33,10 @@ def reconstruct_locally(
 ) -> "ReportDocument":
     """Reconstructs a capture folder or archive into ``out`` and returns the content of report.json.
 
-    Estimated cameras and masks are kept in ``out`` even if a later stage fails. Settings, model, template, capture,
-    ``out`` and ``trace`` are checked before heavy modules are loaded. The file ``trace`` receives what ran when on
-    which thread, also for a job that fails."""
+    Estimated cameras and masks are kept in ``out`` even if a later stage fails; an earlier result stays until the new
+    one is complete. Settings, model, template, capture, ``out`` and ``trace`` are checked before heavy modules are
+    loaded. The file ``trace`` receives which thread ran what when, also if the job fails.
+    """
     from pipeline.settings import settings_from_document
     from pipeline.templates.header import check_template
 
@@ -72,7 +73,7 @@ def _reconstruct_folder(
 
 
 def check_apart(out: Path, capture: Path, option: str = "--out") -> None:
-    """Raises SpoilsCapture if pictures of the result in ``out`` would be read as pictures of the capture."""
+    """Raises SpoilsCapture if a later run would read pictures of the result in ``out`` as pictures of the capture."""
     from server.tasks.photographs import photographs_alone
 
     if not capture.is_dir():

@@ -28,10 +28,12 @@ from server.tasks.reconstruct_folder import folder_of
 def refine_locally(
     captures: Sequence[Path], *, calibration: Path | None, focal: bool, model: str | None, report: Progress
 ) -> RefinementRun:
-    """Refines the calibration that the captures share, or ``calibration``; with a ``model`` its rims are used too.
+    """Refines the calibration that the captures share, or the file ``calibration``, by the captures' silhouettes; with
+    a head ``model`` also by the rims of fitted heads. ``focal``: refines focal lengths, too.
 
     A camera that the drift watch finds moved in a capture is left out of that capture: it must be calibrated anew with
-    the board. Raises InputError, TooFewCaptures, and the errors of the alignment of a head."""
+    the board. Raises InputError, TooFewCaptures for fewer than two, and the errors of aligning a head.
+    """
     if len(captures) < 2:
         raise TooFewCaptures(len(captures))
     rig = None if calibration is None else read_rig(calibration)
@@ -70,10 +72,6 @@ def refine_locally(
         compose("refinement-camera-moved", camera=name, captures=where) for name, where in sorted(moved.items())
     ]
     return RefinementRun(refined, rig, tuple(path.name for path in captures), tuple(moved_warnings))
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """Discards progress, since another bar is shown already."""
 
 
 def _differences(recorded: Rig, rig: Rig, *, same_poses: bool) -> list[str]:

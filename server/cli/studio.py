@@ -25,7 +25,7 @@ from server.tasks.subjects import subject_of
 
 @dataclass(frozen=True, slots=True)
 class OpenStudio:
-    """Holds the addresses and files by which an operator reaches the devices of a served studio."""
+    """Holds the addresses and files through which an operator uses the devices of a served studio."""
 
     url: str
     cameras: dict[str, str]
@@ -36,13 +36,13 @@ class OpenStudio:
 
     @classmethod
     def of(cls, devices: StudioDevices, truth: Path) -> "OpenStudio":
-        """Collects the addresses of devices that run. ``truth`` is the folder of the subject's truth."""
+        """Collects the addresses of running devices. ``truth`` is the folder with the subject's true head."""
         link = devices.port_link
         cameras = {name: devices.streams.url(name) for name in devices.names}
         return cls(devices.streams.address, cameras, link, str(link.readlink()), devices.folder / "rig.toml", truth)
 
     def document(self) -> dict[str, object]:
-        """Returns what ``simulate --serve --json`` prints."""
+        """Returns the JSON object that ``simulate --serve --json`` prints."""
         return {
             "url": self.url,
             "cameras": self.cameras,
@@ -88,11 +88,12 @@ def serve_studio(
     ready: Callable[[OpenStudio], None],
     report: Progress,
 ) -> None:
-    """Serves the same subject that ``eigenhead simulate`` draws for ``seed``, until SIGINT or SIGTERM.
+    """Serves the subject that ``eigenhead simulate`` draws for the same ``seed``, until SIGINT or SIGTERM.
 
-    Writes rig.toml, cameras.json and clean plates into ``folder``, and the truth into ``<folder>.truth``. ``ready`` is
-    called once all devices can be used. Afterwards no thread, port or pseudo-terminal is left. Raises InputError for a
-    folder that belongs to another rig, a wrong fault, or a port that is in use."""
+    Writes rig.toml, cameras.json and clean plates into ``folder``, and the true head into ``<folder>.truth``. ``ready``
+    is called once all devices can be used. Afterwards no thread, port or pseudo-terminal is left. Raises InputError for
+    a folder of another rig, a wrong fault, or a port in use.
+    """
     planted = [device_fault_from_text(text) for text in faults]
     _check_folder(folder)
     for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background jobs are started with SIGINT ignored

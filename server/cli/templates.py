@@ -1,4 +1,4 @@
-"""Implements the commands about templates, meshes in whose vertex order results are written: template add, list,
+"""Implements the commands about templates (meshes in whose vertex order results are written): template add, list,
 remove."""
 
 from collections.abc import Mapping

@@ -38,9 +38,12 @@ def verify_captures(
     limits: "Limits",
     report: Progress,
 ) -> "VerificationReport":
-    """Writes report.json and certificate.pdf into ``out``, and the results of captures into ``out/results``.
+    """Judges captures of a mannequin, or their results, by the scan ``reference``. Writes report.json and
+    certificate.pdf into ``out``, and results of captures into ``out/results``.
 
-    The reference is checked before anything is reconstructed. Raises InputError."""
+    The reference is checked before anything is reconstructed. Raises InputError, also if results were made with
+    different models, and the errors of the pipeline.
+    """
     from pipeline.head_model.model import load_model
     from pipeline.verification.judgement import judge
     from pipeline.verification.measured import identity_of, is_result, read_measured
@@ -76,7 +79,8 @@ def verify_captures(
 
 
 def read_limits(path: Path | None) -> "Limits":
-    """Returns the limits of a TOML or JSON file; those that it omits have their defaults. Raises InputError."""
+    """Reads limits from a TOML or JSON file. Those that it omits, or all without a file, have their defaults. Raises
+    InputError."""
     from pipeline.verification.limits import limits_from_document
     from server.tasks.settings_file import settings_document
 

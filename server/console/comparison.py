@@ -1,4 +1,5 @@
-"""Numbers by vertex that the 3D view colours a head with, in the order of head.ply's vertices (and head.glb's)."""
+"""Computes the numbers by vertex with which the 3D view colours a head, in the order of the vertices of head.ply and
+head.glb."""
 
 from pathlib import Path
 
@@ -19,8 +20,8 @@ TRIMMED = 0.8  # share of the nearest pairs that a round uses: necks end at diff
 
 
 def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
-    """Returns one number for each vertex from a binary little-endian PLY file, whose first element must be the
-    vertices. Raises NotFound where the file has no such property."""
+    """Reads one number for each vertex from a binary little-endian PLY file, whose first element must be the vertices.
+    Raises NotFound if the file has no such property."""
     data = path.read_bytes()
     end = data.index(b"end_header\n") + len(b"end_header\n")
     count, fields, element = 0, [], ""
@@ -39,8 +40,8 @@ def ply_property(path: Path, name: str) -> Float[np.ndarray, " v"]:
 def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.ndarray, " v"]:
     """Computes the distance (mm) of every vertex of a result's head to the surface of the mesh ``other``.
 
-    Heads of different captures stand in different places: with ``align`` the result's head is first moved rigidly onto
-    the other one.
+    With ``align`` the result's head is first moved rigidly onto the other one, since heads of different captures stand
+    in different places. Raises FileNotFoundError.
     """
     mine, theirs = read_mesh(result / "head.ply"), read_mesh(other)
     points = moved_onto(mine, theirs) if align else mine.vertices
@@ -48,8 +49,9 @@ def to_surface(result: Path, other: Path, *, align: bool = False) -> Float[np.nd
 
 
 def moved_onto(mine: Mesh, theirs: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices of ``mine`` after the rigid motion that brings them closest to ``theirs``: to the same
-    vertices if both heads have as many, else to the nearest ones, the farthest fifth left out."""
+    """Returns the vertices of ``mine`` after the rigid motion that brings them closest to ``theirs``. Heads with
+    equally many vertices are compared vertex by vertex. Others are compared by nearest points, without the farthest
+    fifth."""
     if len(mine.vertices) == len(theirs.vertices):
         return _rigid(mine.vertices, theirs.vertices, mine.vertices)
     points = mine.vertices - mine.vertices.mean(0) + theirs.vertices.mean(0)

@@ -1,4 +1,5 @@
-"""Where the board was seen, camera by camera: what a person who carries it needs to know for the next shot."""
+"""Measures where in each camera's picture the board was seen, and advises the person who carries it on the next
+shot."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,7 +24,11 @@ Corners = dict[str, list[list[float]]]  # of a shot, by camera: shares of the im
 
 
 class Coverage(TypedDict):
-    """Holds how one camera's picture was covered by the board so far."""
+    """Holds how much of one camera's picture the board has covered so far.
+
+    ``views``: pictures that show the board; ``covered``: share of the picture; ``corners`` and ``last``: corners of
+    earlier shots and of the last one, as shares of width and height.
+    """
 
     name: str
     views: int
@@ -35,7 +40,7 @@ class Coverage(TypedDict):
 
 def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: Mapping[str, object]) -> Corners:
     """Finds the corners of the board in each image of a capture, in a child process. Returns them by camera, as shares
-    of width and height; none where the board is not seen. Raises InputError for an impossible board."""
+    of width and height; the list is empty if the board is not seen. Raises InputError for an impossible board."""
     described = board_from_document(board)
     found = {}
     for number, path in enumerate(sorted((Path(files) / "images").iterdir())):
@@ -50,8 +55,8 @@ def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: 
 
 
 def covered(corners: Float[np.ndarray, "n 2"]) -> float:
-    """Returns the share of a picture's cells that hold a corner of the board. Corners are shares of
-    width and height."""
+    """Computes the share of a picture's ``CELLS`` that hold a corner of the board. Corners are shares of width and
+    height."""
     if len(corners) == 0:
         return 0.0
     cells = np.clip((corners * CELLS).astype(int), 0, np.array(CELLS) - 1)
@@ -59,8 +64,8 @@ def covered(corners: Float[np.ndarray, "n 2"]) -> float:
 
 
 def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
-    """Returns for each camera how many pictures show the board, which share of the picture is covered, the corners, and
-    whether that is enough."""
+    """Computes the coverage of each camera by the shots so far: pictures that show the board, covered share, corners,
+    and whether that is enough."""
     lines: list[Coverage] = []
     for name in cameras:
         seen = [shot[name] for shot in shots if shot.get(name)]
@@ -83,7 +88,7 @@ def summary(cameras: list[str], shots: list[Corners]) -> list[Coverage]:
 
 
 def advice(lines: list[Coverage]) -> Message:
-    """Returns a message of what the person with the board should do next."""
+    """Returns a message that says what the person with the board should do next."""
     if not lines or not any(line["views"] for line in lines):
         return compose("board-hold")
     blind = [line["name"] for line in lines if line["views"] == 0]

@@ -1,7 +1,8 @@
-"""The head as the page Result shows it first, drawn by the service: a picture of some 30 kB that stands there until the
-browser has the 3 MB of the head, has decoded them and has drawn them.
+"""Draws the head as the page Result shows it first: a picture of some 30 kB, shown until the browser has loaded and
+drawn the 3 MB of the head.
 
-Place, lens and light are those of ``pages/result.js`` and ``static/views.js``: three-quarter, "studio", texture.
+Position, lens and light are those of ``pages/result.js`` and ``static/views.js``: three-quarter view, light "studio",
+texture.
 """
 
 from pathlib import Path
@@ -27,14 +28,16 @@ GAMMA = 2.2  # near enough to sRGB's curve for a picture that is there for half 
 
 
 def first_view(result: Path) -> UInt8[np.ndarray, "s s 3"]:
-    """Draws the head of a result as the page Result shows it first (RGB). Raises InputError where there is no head."""
+    """Draws the head of a result as the page Result shows it first (RGB). Raises InputError if the result has no head
+    that can be read."""
     head, _ = read_head_ply(result / "head.ply")
     mesh = Mesh(placed(result).apply(head.vertices), head.faces, head.colours)
     return drawn(mesh)
 
 
 def drawn(mesh: Mesh) -> UInt8[np.ndarray, "s s 3"]:
-    """Draws a coloured head (head frame, mm) on the page's background, at twice the size and then reduced."""
+    """Draws a coloured head (head frame, mm) on the page's background (RGB), at twice the size, and reduces the
+    picture, which smooths edges."""
     vertices = mesh.vertices
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
@@ -48,8 +51,8 @@ def drawn(mesh: Mesh) -> UInt8[np.ndarray, "s s 3"]:
 
 
 def lit(mesh: Mesh) -> UInt8[np.ndarray, "v 3"]:
-    """Computes the vertices' colours in the lights of the page, as three.js does for a rough surface: linear colour
-    times light over pi."""
+    """Computes the vertices' colours in the page's lights, as three.js does for a rough surface: linear colour times
+    light over pi."""
     normals = vertex_normals(mesh.vertices, mesh.faces)
     light: Float[np.ndarray, " v"] = np.full(len(normals), AMBIENT)
     for *place, power in LIGHTS:

@@ -1,7 +1,5 @@
-"""Faces of a capture for the pages: found once, in a child process, and kept beside its silhouettes.
-
-Whoever asks waits in a thread, and no longer than ``PATIENCE_S``.
-"""
+"""Finds the faces of a capture in a child process and caches them beside its silhouettes. A caller waits no longer than
+``PATIENCE_S`` seconds."""
 
 import threading
 import time
@@ -23,10 +21,10 @@ _finding: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
 
 def found_faces(service: Service, identity: str) -> FacesDocument:
-    """Returns the faces in a capture's pictures, found at the first call and then kept. Blocks.
+    """Returns the faces in a capture's pictures. The first call finds them; later ones read the cache. Blocks.
 
-    Raises NotFound, Conflict for a shot of the board, InputError and WorkFailed as the work did, and Unavailable where
-    it takes too long.
+    Raises NotFound, Conflict for a shot of the board, InputError and WorkFailed if the pictures cannot be searched, and
+    Unavailable after ``PATIENCE_S`` seconds.
     """
     deadline = time.monotonic() + PATIENCE_S
     record = service.store.capture(identity)

@@ -1,6 +1,7 @@
-"""What helps to pick one point in several views: epipolar guides, the triangulated point, the model's landmark.
+"""Computes aids for picking one feature point in several views: epipolar guides, the triangulated point, the model's
+landmark.
 
-Pure functions of a rig and pixels; lens distortion is kept, so that a guide is a curve.
+Everything is a function of a rig and pixels. Lens distortion is kept, so that a guide is a curve.
 """
 
 from collections.abc import Collection, Mapping
@@ -32,8 +33,8 @@ OUTSIDE = 0.25  # of the image: guides go so far beyond its rim
 
 
 def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) -> Float[np.ndarray, "n 2"]:
-    """Returns the curve (px) at which the camera ``target`` sees the line of sight through a pixel of the camera
-    ``source``; empty where it sees none of it."""
+    """Computes the curve (px) at which the camera ``target`` sees the line of sight through a pixel of the camera
+    ``source``. It is empty if the target sees none of it."""
     camera = rig[source]
     ray = camera.rays_world(np.asarray(pixel, float)[None])[0]
     middle = float((rig.centre_world() - camera.centre_world) @ ray)
@@ -43,11 +44,11 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
 
 
 class Helps(TypedDict):
-    """Holds what helps to pick points, by point and then by camera, in pixels.
+    """Holds the aids for picking feature points, by point and then by camera, in pixels.
 
-    ``guides``: curves of the other views' lines of sight; ``reprojected``: where the triangulated point is seen;
-    ``off_px``: how far the picked pixel is from there; ``predicted``: where the model's landmarks would be.
-    ``contradictions``: by point, what a job would leave out.
+    ``guides``: the other views' lines of sight as curves; ``reprojected``: where the triangulated point is seen;
+    ``off_px``: distance of the picked pixel from there; ``predicted``: where the model's landmarks would be.
+    ``contradictions``: for a point whose pixels do not fit together, what a job would leave out.
     """
 
     guides: dict[str, dict[str, list[list[list[float]]]]]
@@ -59,8 +60,8 @@ class Helps(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """Holds what follows from the pixels picked for one point. ``position`` (world frame, mm) is None where the lines
-    of sight do not meet."""
+    """Holds what follows from the pixels picked for one point. ``position`` (world frame, mm) is None if it cannot be
+    triangulated."""
 
     position: Float[np.ndarray, " 3"] | None
     reprojected: dict[str, list[float]]
@@ -69,8 +70,8 @@ class Located:
 
 
 class Guides:
-    """Computes what helps to pick points in the pictures of one rig. Only what a change affects is computed again, so
-    that a click costs the same however many points there are."""
+    """Computes the aids for picking feature points in the pictures of one rig. It keeps results and computes again only
+    what a change affects, so that a click costs the same however many points there are."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -81,8 +82,11 @@ class Guides:
     def helps(
         self, points: Pixels, landmarks: Landmarks, shown: Collection[str], views: Collection[str] | None = None
     ) -> Helps:
-        """Returns what helps to pick ``points``. ``shown``: points whose curves are wanted; ``views``: cameras in which
-        (None: all)."""
+        """Computes the aids for picking feature points. ``points``: the pixels picked so far, by point and camera.
+
+        ``landmarks``: the model's (head frame, mm); ``shown``: points whose guides are needed; ``views``: cameras in
+        which guides are needed (None: all).
+        """
         targets = self._rig.names if views is None else [name for name in self._rig.names if name in views]
         located = {name: self._of(name, views) for name, views in points.items()}
         places = {name: found.position for name, found in located.items() if found.position is not None}
@@ -129,7 +133,8 @@ class Guides:
 
 
 def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) -> Located:
-    """Triangulates one point from the pixels picked in several views, and finds what a job would leave out of them."""
+    """Triangulates one point from the pixels picked in several views, and finds those that contradict the others, which
+    a job would leave out."""
     try:
         found = triangulate(views, rig, noise_px=CLICK_NOISE_PX)
     except NoPoint:
@@ -141,7 +146,7 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
 
 
 def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
-    """Returns what helps to pick all points, without an earlier computation to build on."""
+    """Computes the aids for picking feature points, for all points in all views, without results of an earlier call."""
     return Guides(rig).helps(points, landmarks, list(points))
 
 
@@ -152,8 +157,8 @@ def _picks(points: Pixels, shown: Collection[str]) -> set[tuple[str, tuple[float
 def predicted(
     rig: Rig, located: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Mapping[str, Float[np.ndarray, " 3"]]
 ) -> dict[str, dict[str, list[float]]]:
-    """Returns the pixels of the model's landmarks in every view, the mean head being placed by at least three located
-    points. Returns none where the points do not place it."""
+    """Predicts the pixels of the model's landmarks in every view. The mean head is placed by the points in ``located``
+    (world frame, mm). Returns nothing if fewer than three of them are landmarks, or they lie on a line."""
     names = [name for name in located if name in landmarks]
     if len(names) < POINTS_LEAST:
         return {}
@@ -166,14 +171,14 @@ def predicted(
 
 
 def nearest_views(rig: Rig, front: str, count: int) -> list[str]:
-    """Returns the names of ``count`` cameras: ``front`` and those that look most nearly in the same direction."""
+    """Returns the names of ``count`` cameras: ``front`` and those with the most similar viewing directions."""
     axes = {camera.name: camera.camera_from_world.rotation[2] for camera in rig}
     return sorted(axes, key=lambda name: (name != front, -float(axes[name] @ axes[front])))[:count]
 
 
 def mean_landmarks(context: WorkerContext, report: Progress, *, model: str, names: list[str]) -> dict[str, list[float]]:
-    """Returns the landmarks of a model's mean head (head frame, mm). Runs in a child process,
-    because a model is large."""
+    """Returns the landmarks of a model's mean head (head frame, mm). Runs in a child process, since a model is
+    large."""
     from pipeline.head_model.model import load_model
 
     loaded = load_model(model)

@@ -1,5 +1,5 @@
-"""Pictures of a job's head: drawn by the service at the first look, one at a time, and kept beside the result, so that
-they go with the job."""
+"""Draws pictures of a job's head when they are first requested, one at a time, and keeps them beside the result, so
+that they are removed with the job."""
 
 import threading
 from contextlib import suppress
@@ -28,7 +28,7 @@ _drawing = threading.Lock()
 
 
 def result_folder(service: Service, job_id: str) -> Path:
-    """Returns the folder of a job's result. Raises Conflict where the job has none."""
+    """Returns the folder of a job's result. Raises NotFound, and Conflict if the job has not succeeded."""
     state = service.jobs.state(job_id)
     if state != "succeeded":
         raise Conflict("no-result", compose("job-without-result", state=state))
@@ -36,8 +36,8 @@ def result_folder(service: Service, job_id: str) -> Path:
 
 
 def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
-    """Returns the file of a picture of a job's head, which is drawn at the first call. Raises Conflict where the job
-    has no result, and NotFound or InputError where the result has no head."""
+    """Returns the file of a picture of a job's head, which the first call draws. Raises NotFound if the job or its head
+    is gone, Conflict if the job has not succeeded, and InputError if the head cannot be read."""
     result = result_folder(service, job_id)
     kept = result.parent / name
     if not kept.is_file():
@@ -51,14 +51,16 @@ def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
 
 
 def draw_first_view(service: Service, job_id: str) -> None:
-    """Draws the first view of a head that is about to be opened, so that it is ready when the page asks for it."""
+    """Draws the first view of a head that is about to be opened, so that it is ready when the page requests it. Raises
+    nothing if the head is gone."""
     with suppress(EigenheadError, OSError):  # removed meanwhile, or a result without a head: the page tells
         head_picture(service, job_id, "first-view.jpg")
 
 
 @cache
 def warm_up() -> None:
-    """Loads what reads and draws heads, so that the first head does not have to wait a second for that."""
+    """Imports and runs the code that reads and draws heads, once a process, so that the first head does not wait a
+    second for it."""
     corners = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]])
     corner = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
     with suppress(OSError), TemporaryDirectory() as folder:  # on a full disk the first head waits

@@ -1,7 +1,7 @@
-"""Who sits at a page: on this machine and without keys anybody, else whoever proved an API key.
+"""Identifies who uses a page: anybody on this machine while there are no API keys, otherwise who has given a key.
 
-The key itself is not stored: the user storage of the browser's session (a file in the data folder, named by a signed
-cookie) holds the key's id, and every look asks the database whether that key still exists. So a removed key ends its
+The key itself is not stored. The user storage of the browser's session (a file in the data folder, named by a signed
+cookie) holds the key's id, and every refresh of a page looks the key up in the database. So a removed key ends its
 pages, and a sign-in outlives a restart of the service.
 """
 
@@ -25,18 +25,18 @@ KEY_ID = "key_id"
 
 
 def service_of_pages() -> Service:
-    """Returns the running service, which lives as long as the pages do."""
+    """Returns the running service. It lives as long as the pages do."""
     return pages.state.eigenhead.state.service
 
 
 def sign_in(service: Service, token: str) -> Caller | None:
-    """Returns the caller whose API key is ``token``, None for an unknown key. Blocks."""
+    """Returns the caller whose API key is ``token``; None for an unknown key. Blocks."""
     return service.keys.caller(token.strip())
 
 
 def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
-    """Returns the caller behind a browser, from its user storage. Returns None where an API key must be given first.
-    Blocks."""
+    """Identifies the caller by ``stored``, the user storage of the browser's session. Returns None if an API key must
+    be given first. Blocks."""
     keys = {key.id: key for key in service.keys.all()}
     if not keys and service.settings.is_private:
         return Caller(LOCAL, frozenset(SCOPES))
@@ -45,7 +45,8 @@ def caller_of(service: Service, stored: Mapping[str, object]) -> Caller | None:
 
 
 def permit(caller: Caller | None, scope: str) -> Caller:
-    """Returns ``caller`` if it has the scope. Raises Unauthenticated for None, and Forbidden."""
+    """Returns ``caller`` if it has the scope. Raises Unauthenticated for None, and Forbidden for a caller without the
+    scope."""
     if caller is None:
         raise Unauthenticated("key-missing", compose("sign-in-again"))
     if not caller.may(scope):
@@ -54,7 +55,8 @@ def permit(caller: Caller | None, scope: str) -> Caller:
 
 
 def cookie_secret(data: Path) -> str:
-    """Returns the secret that signs session cookies. It is made once, so that a restart signs nobody out."""
+    """Returns the secret that signs session cookies. It is made once and kept in the data folder, so that a restart
+    signs nobody out."""
     path = data / "console" / "secret"
     if not path.is_file() or not path.stat().st_size:  # an empty one is left where a full disk met the first start
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -63,7 +65,7 @@ def cookie_secret(data: Path) -> str:
 
 
 def is_foreign(scope: Scope, settings: ServiceSettings) -> bool:
-    """Tells whether a page of another site made a browser send this request: its Origin is neither the requested host
+    """Returns whether a page of another site made a browser send this request: its Origin is neither the requested host
     nor the public address."""
     headers = Headers(scope=scope)
     origin, host = headers.get("origin"), headers.get("host", "")
@@ -71,8 +73,8 @@ def is_foreign(scope: Scope, settings: ServiceSettings) -> bool:
 
 
 def is_rebound(scope: Scope, settings: ServiceSettings) -> bool:
-    """Tells whether a request to a service that listens only on loopback names another host than loopback or the public
-    one (DNS rebinding)."""
+    """Returns whether a request names a host that is neither loopback nor the public one, although the service listens
+    on loopback only. A browser sends such requests in an attack by DNS rebinding."""
     host = Headers(scope=scope).get("host", "")
     name = host.rpartition(":")
     return is_loopback(settings.host) and host != settings.public_host and not is_loopback(name[0] or name[2])

@@ -1,4 +1,4 @@
-"""The live view: one thread looks at the cameras while somebody watches, and every open page gets its pictures."""
+"""The live view: one thread takes pictures while somebody watches, and every open page gets them."""
 
 import asyncio
 import json
@@ -15,7 +15,8 @@ from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 from server.console.live_frame import LiveFrame
 from server.console.studio_view import frames
-from server.services.rigs import RigBackend, jpeg, reduced
+from server.services.rigs.backend import RigBackend
+from server.services.rigs.previews import jpeg, reduced
 from server.services.service import Service
 from server.tasks.child import Child
 from server.wire.problems import problem_from
@@ -30,41 +31,51 @@ log = structlog.get_logger()
 
 
 class Source(Protocol):
-    """Declares where the pictures of the live view come from. Methods block."""
+    """Declares where the live view gets its pictures: from real cameras or the simulated studio. Methods block."""
 
     def frames(self) -> list[LiveFrame]:
-        """Returns the present picture of each camera (``jpeg`` None where it shows nothing) with its measurements."""
+        """Returns the present picture of each camera, with its measurements. ``jpeg`` is None if the camera delivers
+        none."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Releases what the source holds."""
+        ...
 
 
 class StudioSource:
+    """Draws the cameras' pictures of the simulated studio, in a child process of its own."""
+
     def __init__(self) -> None:
         self._child, self._looks = Child(), 0
 
     def frames(self) -> list[LiveFrame]:
+        """Returns the present picture of each simulated camera, with its measurements."""
         self._looks += 1
         return self._child.remote(frames)(look=self._looks)
 
     def close(self) -> None:
+        """Ends the child process."""
         self._child.close()
 
 
 class RigSource:
-    """Takes pictures of real cameras, of all at once. Each time one camera's picture is judged for sharpness, which
-    needs its full size."""
+    """Takes pictures of real cameras, all at once. Each time the sharpness of one camera's picture is measured, in
+    turn, since that needs the full size."""
 
     def __init__(self, rig: RigBackend) -> None:
         self._rig, self._looks = rig, 0
 
     def frames(self) -> list[LiveFrame]:
+        """Returns the present picture of each camera, with its measurements. Raises Unavailable if the rig cannot be
+        opened."""
         pictures = self._rig.look()
         names = [camera.name for camera in self._rig.describe().cameras]
         self._looks += 1
         return [_frame(name, pictures.get(name), self._looks % len(names) == i) for i, name in enumerate(names)]
 
     def close(self) -> None:
+        """Does nothing: the rig stays open for shots."""
         pass
 
 
@@ -86,8 +97,8 @@ def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
 
 
 class LiveView:
-    """Holds the newest pictures of all cameras, numbered. A thread takes them from when somebody watches until
-    ``KEEP_S`` after the last one left."""
+    """Holds the newest pictures of all cameras, numbered. Its thread takes pictures while somebody watches, and ends
+    ``KEEP_S`` seconds after the last viewer has left."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
@@ -98,8 +109,8 @@ class LiveView:
         self.fault: Message | None = None
 
     async def stream(self) -> AsyncIterator[bytes]:
-        """Yields the pictures of all cameras as they are taken: 4 bytes of header length, 4 of body length, a JSON
-        header, and the JPEG files in the header's order."""
+        """Yields the pictures of all cameras as they are taken, each time as one message of ``look_bytes``. Starts the
+        thread if needed."""
         seen = 0
         while True:
             self._watch()
@@ -152,8 +163,9 @@ class LiveView:
 
 
 def look_bytes(frames: list[LiveFrame], fault: Message | None) -> bytes:
-    """Encodes the pictures of all cameras as ``LiveView.stream`` sends them. ``bytes`` in the header is the length of
-    each JPEG file."""
+    """Encodes the pictures of all cameras as one message: 4 bytes with the header's length, 4 with the length of the
+    rest (both big-endian), a JSON header, and the JPEG files in the header's order. ``bytes`` in the header is the
+    length of each file."""
     header = [{k: v for k, v in f.items() if k != "jpeg"} | {"bytes": len(f["jpeg"] or b"")} for f in frames]
     text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document()}).encode()
     body = b"".join(f["jpeg"] or b"" for f in frames)

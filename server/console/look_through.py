@@ -1,5 +1,5 @@
-"""Looking at a head through a camera of the rig: where the camera stands in the head's frame, and its photograph as a
-lens without distortion would have taken it, so that a browser's pinhole camera puts the mesh onto it."""
+"""Lets a browser show a head through a camera of the rig: the camera's pose in the head's frame, and its photograph
+without lens distortion, onto which a pinhole camera draws the mesh exactly."""
 
 from pathlib import Path
 from typing import TypedDict
@@ -22,7 +22,7 @@ MM = 1000.0
 
 
 class CameraView(TypedDict):
-    """Holds a pinhole camera (px). ``camera_from_head``: rows of a 4 x 4 matrix (metres), from the head frame of
+    """Holds a pinhole camera (px). ``camera_from_head``: rows of a 4 x 4 matrix (metres); the head frame is that of
     head.glb."""
 
     name: str
@@ -36,8 +36,8 @@ class CameraView(TypedDict):
 
 
 def camera_views(rig: Rig, report: Report) -> list[CameraView]:
-    """Returns every camera of a capture as seen from the head, whose pose ``report`` has: x_world = R x_head + s t, at
-    its true size."""
+    """Returns every camera of a capture as seen from the head. The head's pose is that of ``report``, its size the true
+    one: x_world = R x_head + s t."""
     place = report["world_from_head"]
     shift = np.array(place["translation"]) * place["scale"]
     world_from_head = RigidTransform(np.array(place["rotation"]), shift)
@@ -45,7 +45,7 @@ def camera_views(rig: Rig, report: Report) -> list[CameraView]:
 
 
 def rig_of(capture: Path) -> Rig:
-    """Reads the rig from the files of a capture. Raises InputError."""
+    """Reads the rig from the files of a capture. Raises InputError if there is none or it cannot be read."""
     found = find_rig_file(capture)
     if found is None:
         raise InputError("capture", [compose("no-cameras-json")])
@@ -53,7 +53,7 @@ def rig_of(capture: Path) -> Rig:
 
 
 def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
-    """Returns the photograph with the lens's distortion removed, at most ``WIDTH_MOST`` pixels wide."""
+    """Removes the lens's distortion from a photograph and reduces it to at most ``WIDTH_MOST`` pixels of width."""
     lens = camera.intrinsics
     if camera.recorded is not None:
         image = camera.recorded.undistort(image, lens.matrix(), smooth=True)
@@ -68,8 +68,8 @@ def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
 
 
 def straightened_face(face: FoundFace, camera: Camera) -> FoundFace:
-    """Returns a face with its pixels as in the straightened photograph at full size. Points outside the lens are left
-    out."""
+    """Converts a face to the pixels of the photograph without distortion, at full size. Points outside the lens are
+    left out."""
     lens, pixels = camera.intrinsics, np.array(face["points"])
     if camera.recorded is not None:
         straight = camera.recorded.undistorted(pixels, lens.matrix())

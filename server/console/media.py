@@ -1,5 +1,8 @@
-"""What the pages fetch by address: the live view, thumbnails, silhouettes, archives going in, files and mesh
-attributes of results. Each asks who the browser's session is, as the API asks for a key."""
+"""Declares the routes by which the pages fetch and send files: live view, thumbnails, silhouettes, uploads, files of
+results, numbers by vertex.
+
+Each route identifies the caller by the browser's session, as the API does by an API key.
+"""
 
 import asyncio
 import json
@@ -43,8 +46,8 @@ _drawing = threading.Lock()
 
 
 def session(scope: str) -> Any:
-    """Returns a dependency that gives the service and the caller of the browser's session. It raises what ``permit``
-    does."""
+    """Returns a FastAPI dependency that yields the service and the caller of the browser's session. It raises
+    Unauthenticated, and Forbidden for a caller without ``scope``."""
 
     async def authenticate() -> tuple[Service, Caller]:
         service, stored = service_of_pages(), dict(pages.storage.user)
@@ -64,17 +67,20 @@ async def _answer_problem(request: Request, error: Exception) -> Response:
 
 
 def live_view(service: Service) -> LiveView:
+    """Returns the live view of a service. All pages share it."""
     return _live.setdefault(id(service), LiveView(service))
 
 
 @pages.get("/console/live")
 async def live(who: Reader) -> StreamingResponse:
+    """Streams the live pictures of all cameras, in the form of ``LiveView.stream``."""
     return StreamingResponse(live_view(who[0]).stream(), media_type="application/octet-stream")
 
 
 @pages.get("/console/captures/{capture_id}/{camera}.jpg")
 def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
-    """Returns a small JPEG file of an image of a capture. Browsers may keep it, because captures never change."""
+    """Returns a small JPEG file of an image of a capture. The browser may keep it for ever, since pictures of a capture
+    never change."""
     service = who[0]
     name = _image_name(service.store.capture(capture_id), camera)
     path = service.store.cache_of(capture_id) / "small" / f"{Path(name).stem}.jpg"
@@ -85,7 +91,7 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/front")
 def front(who: Reader, capture_id: str) -> Response:
-    """Returns the picture of the front camera."""
+    """Returns a small JPEG file of the front camera's image."""
     return thumbnail(who, capture_id, who[0].store.capture(capture_id).front)
 
 
@@ -97,18 +103,20 @@ def checks(who: Reader, capture_id: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/holdings")
 def holdings(who: Reader, capture_id: str) -> Response:
-    """Returns what a removal of the capture would take and what would stay."""
+    """Returns what removing the capture would take away and what would stay."""
     return JSONResponse(asdict(who[0].captures.holdings(capture_id)), headers={"Cache-Control": "no-store"})
 
 
 @pages.get("/console/captures/{capture_id}/{camera}.image")
 def image(who: Reader, request: Request, capture_id: str, camera: str) -> Response:
+    """Returns a camera's photograph as it was received."""
     return send_file(request, who[0].captures.image(capture_id, "images", camera))
 
 
 @pages.get("/console/captures/{capture_id}/{camera}.silhouette.png")
 def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
-    """Returns the outline of the subject in a camera's picture. At the first request those of all cameras are drawn."""
+    """Returns the outline of the subject in a camera's picture. The first request of a capture draws those of all its
+    cameras."""
     service = who[0]
     name = Path(_image_name(service.store.capture(capture_id), camera)).stem
     folder = service.store.cache_of(capture_id) / "outlines"
@@ -122,12 +130,13 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
 
 @pages.get("/console/captures/{capture_id}/faces")
 def faces(who: Reader, capture_id: str) -> Response:
-    """Returns the faces in a capture's pictures with their points (px). They are found at the first request."""
+    """Returns the faces in a capture's pictures with their points (px). The first request finds them."""
     return JSONResponse(found_faces(who[0], capture_id)["faces"], headers=FOREVER)
 
 
 @pages.post("/console/captures")
 async def upload(who: Taker, request: Request) -> Response:
+    """Receives an archive and makes a capture of it. Answers 201 with its id, or a problem document."""
     try:
         record, _ = await receive_capture(who[0], request)
     except Exception as error:
@@ -137,6 +146,8 @@ async def upload(who: Taker, request: Request) -> Response:
 
 @pages.post("/console/calibrations")
 async def upload_calibration_pictures(who: Taker, request: Request) -> Response:
+    """Receives an archive of board pictures or photographs and queues a calibration. Answers 202 with its id, or a
+    problem document."""
     try:
         made = await receive_calibration_pictures(who[0], request)
     except Exception as error:
@@ -146,6 +157,7 @@ async def upload_calibration_pictures(who: Taker, request: Request) -> Response:
 
 @pages.get("/console/jobs/{job_id}/overlays/{name}")
 def overlay_file(who: Reader, request: Request, job_id: str, name: str) -> Response:
+    """Returns an overlay of a job's result: a photograph with the input contour and the fitted one."""
     return send_file(request, who[0].jobs.result_file(job_id, f"overlays/{name}"))
 
 
@@ -161,13 +173,14 @@ def numbers(who: Reader, job_id: str, surface: Literal["head", "bust"], name: Li
 
 @pages.get("/console/jobs/{job_id}/portrait.jpg")
 def portrait(who: Reader, job_id: str) -> Response:
-    """Returns a small picture of the head."""
+    """Returns a small picture of a job's bust or head."""
     return FileResponse(head_picture(who[0], job_id, "portrait.jpg"), headers=FOREVER)
 
 
 @pages.get("/console/jobs/{job_id}/first-view.jpg")
 def first_view(who: Reader, job_id: str) -> Response:
-    """Returns the head as the page Result shows it first. Returns nothing for a head.ply of another program."""
+    """Returns a picture of the head as the page Result shows it first. Answers 204 without content if the head.ply was
+    not written by this program."""
     try:
         return FileResponse(head_picture(who[0], job_id, "first-view.jpg"), headers=FOREVER)
     except InputError:
@@ -176,8 +189,8 @@ def first_view(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/cameras")
 def cameras(who: Reader, job_id: str) -> Response:
-    """Returns the cameras of a job's capture in the head's frame. Returns none where the capture was removed or the
-    report does not place the head."""
+    """Returns the cameras of a job's capture as seen from the head. The list is empty if the capture was removed or the
+    report has no pose of the head."""
     service, found = who[0], []
     report = result_folder(who[0], job_id) / "report.json"
     with suppress(NotFound, FileNotFoundError, KeyError):
@@ -188,7 +201,7 @@ def cameras(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/photographs/{camera}.jpg")
 def photograph(who: Reader, job_id: str, camera: str) -> Response:
-    """Returns a photograph of the capture as a lens without distortion would have taken it."""
+    """Returns a photograph of the job's capture without lens distortion. It is made at the first request and cached."""
     service = who[0]
     capture, record = _capture_files(service, job_id)
     name = _image_name(record, camera)
@@ -201,7 +214,7 @@ def photograph(who: Reader, job_id: str, camera: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/faces")
 def faces_of_job(who: Reader, job_id: str) -> Response:
-    """Returns the faces in the job's pictures, in pixels of its straightened photographs at full size."""
+    """Returns the faces in the job's pictures, in pixels of the photographs without distortion, at full size."""
     capture, record = _capture_files(who[0], job_id)
     rig, found = rig_of(capture), found_faces(who[0], record.id)["faces"]
     straight = {name: [straightened_face(face, rig[name]) for face in seen] for name, seen in found.items()}
@@ -210,8 +223,8 @@ def faces_of_job(who: Reader, job_id: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/distance.f32")
 def distance(who: Reader, job_id: str, other: str) -> Response:
-    """Returns the distance (mm, float32) of every vertex to the surface of another job's head, or of the true head if
-    ``other`` is ``truth``."""
+    """Returns the distance (mm, float32) of every vertex of a job's head to the surface of another job's head, or to
+    the true head if ``other`` is ``truth``. Heads of different captures are aligned first."""
     service = who[0]
     job = service.jobs.get(job_id)
     mine = result_folder(service, job_id)
@@ -227,27 +240,31 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
 
 @pages.get("/console/jobs/{job_id}/all.zip")
 def all_files(who: Reader, request: Request, job_id: str) -> Response:
-    """Returns all files of a result in one archive."""
+    """Returns all files of a result in one .zip."""
     return send_archive(request, result_folder(who[0], job_id), who[0].jobs.files(job_id), name=None)
 
 
 @pages.get("/console/jobs/{job_id}/{name}")
 def result_file(who: Reader, request: Request, job_id: str, name: str) -> Response:
+    """Returns a file of a job's result."""
     return send_file(request, who[0].jobs.result_file(job_id, name))
 
 
 @pages.get("/console/batches/{batch_id}/heads.{form}")
 def batch_table(who: Reader, batch_id: str, form: TableFormat) -> Response:
+    """Returns the table of a batch, as CSV or Parquet."""
     return send_table(who[0], batch_id, form)
 
 
 @pages.get("/console/batches/{batch_id}/sheet.html")
 def batch_sheet(who: Reader, batch_id: str) -> Response:
+    """Returns the contact sheet of a batch."""
     return send_sheet(who[0], batch_id)
 
 
 @pages.get("/console/calibrations/{calibration_id}/report.html")
 def calibration_report(who: Reader, request: Request, calibration_id: str) -> Response:
+    """Returns the report of a calibration, an HTML page in which no script may run."""
     answer = send_file(request, who[0].calibrations.file(calibration_id, "report.html"))
     answer.headers["Content-Security-Policy"] = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     return answer
@@ -255,10 +272,13 @@ def calibration_report(who: Reader, request: Request, calibration_id: str) -> Re
 
 @pages.get("/console/calibrations/{calibration_id}/cameras.json")
 def cameras_file(who: Reader, calibration_id: str) -> Response:
+    """Returns the cameras.json of a calibration."""
     return FileResponse(who[0].calibrations.cameras_json(calibration_id), media_type="application/json")
 
 
 def make_thumbnail(source: Path, target: Path) -> None:
+    """Writes a JPEG file of at most ``THUMBNAIL_WIDTH`` pixels of width. The file appears under its name only when it
+    is complete."""
     target.parent.mkdir(parents=True, exist_ok=True)
     unfinished = target.with_suffix(f".{threading.get_ident()}")
     with open_picture(source) as picture:

@@ -1,4 +1,4 @@
-"""Puts the pages onto the service's app."""
+"""Adds the operator's pages to the service's app."""
 
 from pathlib import Path
 
@@ -28,9 +28,9 @@ FOLDERS = ("/_nicegui", "/console/", "/features/", "/result/")
 
 
 def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
-    """Adds the pages to the service's app, at ``/``. Addresses that are no pages are left to the API.
+    """Adds the pages to the service's app, at ``/``. Addresses that are no pages stay with the API.
 
-    NiceGUI has one app a process, so that of several services in a process the last one has the pages.
+    NiceGUI has one app in a process. Of several services in one process, the last one has the pages.
     """
     from server.console import media  # noqa: F401 - they add their routes to NiceGUI's app
     from server.console.pages import (  # noqa: F401
@@ -76,21 +76,21 @@ def mount_console(app: FastAPI, settings: ServiceSettings) -> None:
 
 
 def path_below(scope: Scope) -> str:
-    """Returns the path of a request, relative to where the service is mounted (``root_path``)."""
+    """Returns the path of a request relative to where a proxy mounts the service (``root_path`` of ASGI)."""
     path, root = scope["path"], scope.get("root_path", "")
     below = path.removeprefix(root)
     return below if below == "" or below.startswith("/") else path
 
 
 class PagesMount(Mount):
-    """Mounts the pages. Answers only for their paths, and refuses requests that another web page
-    made a browser send."""
+    """Serves the pages at their paths only, and refuses requests that another web page made a browser send."""
 
     def __init__(self, mounted: Mount, settings: ServiceSettings) -> None:
         super().__init__(mounted.path, app=mounted.app)
         self._settings = settings
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        """Tells Starlette whether a request is for the pages: its path is in ``PAGES`` or below ``FOLDERS``."""
         if scope["type"] in ("http", "websocket"):
             path = path_below(scope)
             if path not in PAGES and not path.startswith(FOLDERS):
@@ -98,6 +98,8 @@ class PagesMount(Mount):
         return super().matches(scope)
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serves a request, or refuses it with status 403 (a websocket with code 1008) if it comes from a foreign web
+        page."""
         if is_foreign(scope, self._settings) or is_rebound(scope, self._settings):
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})

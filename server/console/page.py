@@ -1,4 +1,5 @@
-"""What all pages share: a component that shows a state document, actions that run in threads, and their messages."""
+"""Holds what all pages share: a component that shows a state document, actions that run in threads, and cached
+values."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -49,10 +50,10 @@ _threads = anyio.CapacityLimiter(16)  # actions and looks of all pages; a captur
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """Describes what an event of a page does: ``function(page, event)``, in a thread, for callers with ``scope``.
-    ``page`` is the page that the event comes from, ``event`` what its component sends.
+    """Describes what an event of a page does. ``function(page, event)`` runs in a thread, for callers with ``scope``.
+    ``page`` is the page on which the event happened, ``event`` what its component sent.
 
-    A message that the function returns is shown in the corner.
+    A message that the function returns is shown in the corner; an error is shown there with its faults.
     """
 
     scope: str
@@ -61,8 +62,11 @@ class Action:
 
 @dataclass
 class Cache:
-    """Keeps values that all open pages share, so that they agree and ten pages cost what one does. A value that takes
-    long to make is kept longer, up to ``KEEP_MOST_S``, so that making it takes a tenth of the time at most."""
+    """Keeps values that all open pages share, so that they agree and ten pages cost as much as one.
+
+    A value is kept at least ``KEEP_TIMES`` times as long as it took to make, but for that no longer than
+    ``KEEP_MOST_S`` seconds. So making it takes a tenth of the time at most.
+    """
 
     _values: dict[Any, tuple[float, float, Any]] = field(default_factory=dict)
     _locks: dict[Any, Lock] = field(default_factory=dict)
@@ -70,8 +74,8 @@ class Cache:
     _forgets: int = 0
 
     def get(self, key: Any, age_s: float, make: MAKE) -> Any:
-        """Returns the value of ``key``, made anew by ``make`` if it is older than ``age_s`` seconds. Blocks. Raises
-        what ``make`` raises."""
+        """Returns the value of ``key``. It is made anew by ``make`` if it is older than ``age_s`` seconds, and by one
+        thread at a time. Blocks. Raises what ``make`` raises."""
         with self._lock:
             key_lock = self._locks.setdefault(key, Lock())
         with key_lock:
@@ -86,7 +90,8 @@ class Cache:
             return value
 
     def forget(self, *kinds: str) -> None:
-        """Drops the values whose key is, or begins with, one of ``kinds``."""
+        """Drops the values whose key is one of ``kinds``, or is a tuple that begins with one. Values that are being
+        made meanwhile are not kept."""
         self._forgets += 1
         for key in list(self._values):
             if (key[0] if isinstance(key, tuple) else key) in kinds:
@@ -101,6 +106,7 @@ class Cache:
                 self._locks.pop(key, None)
 
     def clear(self) -> None:
+        """Drops all values, so that the next look of every page reads them anew."""
         with self._lock:
             self._forgets += 1
             self._values.clear()
@@ -111,8 +117,8 @@ shared = Cache()
 
 
 class Page(Element):
-    """Shows one page: a Vue component with the property ``state``, whose event ``act`` carries
-    {name, ...} to an action."""
+    """Shows one page: a Vue component with the property ``state``. Its event ``act`` carries {name, ...} and runs the
+    action of that name."""
 
     actions: Mapping[str, Action] = {}
 
@@ -131,22 +137,27 @@ class Page(Element):
         frame.on("follow", self._follow)
 
     def begin(self) -> None:
-        """Starts to refresh the page's state regularly. NiceGUI sends a page when its first timer asks for the
-        browser's connection: timers start after the first refresh, so that the state is sent with the page."""
+        """Starts to refresh the page's state, the status and the followed jobs regularly.
+
+        NiceGUI sends a page when its first timer waits for the browser's connection. Timers start after the first
+        refresh, so that the state is sent with the page.
+        """
         ui.timer(REFRESH_S, self.refresh, immediate="loading" in self.props["state"])
         ui.timer(STATUS_S, self._refresh_status, immediate=True)
         self._following = ui.timer(FOLLOW_S, self._refresh_followed, active=False, immediate=True)
 
     def look(self) -> Mapping[str, object]:
-        """Returns the state of the page as a document. Runs in a thread."""
+        """Returns the document that the page shows. It consists of JSON values. Runs in a thread and may block."""
         raise NotImplementedError
 
     def preloads(self) -> Iterable[tuple[str, str]]:
-        """Returns what the browser should fetch while it still reads the page: pairs of kind (``image``, ``fetch``) and
-        address."""
+        """Returns what the browser should fetch while it still reads the page, as pairs of kind (``image``, ``fetch``)
+        and address."""
         return ()
 
     async def refresh(self) -> None:
+        """Reads the state of the page and sends it to the browser if it has changed. An error is shown once, and the
+        page keeps its last state."""
         try:
             state = await anyio.to_thread.run_sync(self.look, limiter=_threads, abandon_on_cancel=True)
             detail = None
@@ -172,8 +183,8 @@ class Page(Element):
             self.frame.show(status=status)
 
     def started(self, *jobs: str, opens: bool = False) -> None:
-        """Notes jobs that an action began, so that the browser's tab follows them. ``opens``: the head is shown when it
-        is ready."""
+        """Notes jobs that an action has queued, so that this tab of the browser follows them. ``opens``: the head is
+        shown when it is ready."""
         self._started = ([*jobs], opens)
 
     async def _follow(self, event: GenericEventArguments) -> None:
@@ -231,7 +242,8 @@ class Chosen(TypedDict):
 
 
 def undo(page: Page, event: Chosen) -> Message:
-    """Takes back a removal that is still waiting, whichever page began it."""
+    """Takes back a removal that is still waiting, whichever page began it. Raises Gone if it is too late, and Forbidden
+    for a caller who could not have removed the thing."""
     removal = removals.waiting().get(event["id"])
     if removal is not None:
         permit(page.caller, removal.scope)
@@ -245,14 +257,15 @@ UNDO = Action("read", undo)
 
 
 def remove_later(identity: str, remove: Callable[[], None], title: Message, scope: str) -> None:
-    """Hides a thing from all pages at once, and calls ``remove`` after a while unless somebody takes that back."""
+    """Hides a thing from all pages at once, and calls ``remove`` after ``UNDO_S`` seconds unless somebody takes the
+    removal back."""
     removals.add(identity, remove, title, scope)
     shared.clear()
 
 
 def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: Message, scope: str) -> None:
-    """Hides several things from all pages at once, and removes them after a while unless somebody takes that back, for
-    all together."""
+    """Hides several things from all pages at once, and removes each after ``UNDO_S`` seconds unless somebody takes the
+    whole removal back. Things that then cannot be removed are logged."""
 
     def remove_each() -> None:
         done = each(ids, remove)
@@ -264,6 +277,8 @@ def remove_all_later(ids: Sequence[str], remove: Callable[[str], None], title: M
 
 
 def as_problem(error: Exception) -> Problem:
+    """Converts an error to the problem that a page shows. An InputError with a single fault is shown as that fault
+    alone."""
     if isinstance(error, WorkFailed) and error.kind != "bug":
         return Problem(500, type_of_failure(error.kind), error.message, error.faults)
     problem = problem_from(error)
@@ -275,13 +290,13 @@ def as_problem(error: Exception) -> Problem:
 
 
 async def signed_in() -> Caller | None:
-    """Returns the caller who opens the page. Returns None where an API key must be given first."""
+    """Returns the caller who opens the page; None if an API key must be given first."""
     stored = dict(pages.storage.user)
     return await anyio.to_thread.run_sync(caller_of, service_of_pages(), stored, limiter=_threads)
 
 
 async def show(name: str, page: type[Page], **initial: str | None) -> RedirectResponse | None:
-    """Shows ``page`` to a caller who is signed in; others are sent to the page that asks for an API key."""
+    """Shows ``page`` to a caller who is signed in. Others are redirected to the page that asks for an API key."""
     caller = await signed_in()
     if caller is None:
         return RedirectResponse("/sign-in")
@@ -296,8 +311,8 @@ async def show(name: str, page: type[Page], **initial: str | None) -> RedirectRe
 
 
 class Followed(TypedDict):
-    """Holds the progress of a job that was started in this tab of the browser. The state of a job that was removed is
-    ``gone``."""
+    """Holds the progress (0 to 1) of a job that was started in this tab of the browser. The state of a job that was
+    removed is ``gone``."""
 
     id: str
     state: str
@@ -305,6 +320,8 @@ class Followed(TypedDict):
 
 
 def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
+    """Returns the progress of the jobs with these ids, in their order. The answer is shared by all pages."""
+
     def make() -> list[Followed]:
         known = {job.id: job for job in service.jobs.of(ids)}
         return [
@@ -318,8 +335,9 @@ def followed_jobs(service: Service, ids: Sequence[str]) -> list[Followed]:
 
 
 class Status(TypedDict):
-    """Holds what all pages show of the service. ``faults``: what to do, by the part that is not well; ``starting``:
-    parts that are not there yet; ``empty``: there is no capture."""
+    """Holds what every page shows of the service. ``faults``: what to do, by the part that is not well; ``starting``:
+    parts that will be well soon; ``jobs``: how many are queued or run; ``empty``: there is no capture; ``local``: the
+    caller has no API key and needs none."""
 
     starting: list[str]
     faults: dict[str, MessageDocument]
@@ -330,7 +348,7 @@ class Status(TypedDict):
 
 
 def status_of(service: Service, caller: Caller) -> Status | None:
-    """Returns what all pages show of the service. Returns None where the caller's API key was removed."""
+    """Returns what every page shows of the service. Returns None if the caller's API key was removed."""
     if caller_of(service, {"key_id": caller.key}) is None:
         return None
 

@@ -1,4 +1,5 @@
-"""A small picture of a result, so that people and heads are told apart at a glance: the bust where there is one."""
+"""Draws a small picture of a result, by which people and heads are told apart at a glance: of the bust if there is
+one."""
 
 import json
 from pathlib import Path
@@ -20,8 +21,8 @@ MARGIN = 1.12  # of the head's box, for hair
 
 
 def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Draws a small picture (RGB) of a result's bust or head from half left, in the colours of the photographs. Raises
-    FileNotFoundError where there is no head."""
+    """Draws a small picture (RGB) of a result's bust, or else its head, turned by ``AZIMUTH_DEG``, in the colours of
+    the photographs. Raises FileNotFoundError if there is no head."""
     name = "bust.ply" if (result / "bust.ply").is_file() else "head.ply"
     head_from_world = placed(result)
     head = head_from_world.apply(read_mesh(result / "head.ply").vertices)
@@ -35,7 +36,7 @@ def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def placed(result: Path) -> RigidTransform:
-    """Returns head_from_world as the report of a result has it, the identity where it has none."""
+    """Returns the rigid transform head_from_world of a result's report; the identity if the report has none."""
     try:
         place = json.loads((result / "report.json").read_text())["world_from_head"]
     except (FileNotFoundError, KeyError):

@@ -1,6 +1,8 @@
-"""Removing with undo: a thing is out of sight at once and really removed a little later, unless it is taken back.
+"""Removal with undo: a thing disappears from the pages at once and is removed a little later, unless somebody takes
+that back.
 
-The wait is kept in the process: if the service dies meanwhile, the thing is there again, which is the safe side.
+What waits is kept in the process only. If the service ends meanwhile, nothing is removed and the thing appears again,
+which is the safe side.
 """
 
 import threading
@@ -18,8 +20,8 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Removal:
-    """Holds a removal that can still be taken back. ``scope``: what a caller needs to do that; ``ids``: all that is
-    removed."""
+    """Holds a removal that can still be taken back. ``scope``: what a caller needs for that; ``ids``: everything that
+    is removed."""
 
     title: Message
     scope: str
@@ -29,7 +31,8 @@ class Removal:
 
 @dataclass
 class Removals:
-    """Holds the removals that can still be taken back, by id."""
+    """Holds the removals that can still be taken back, by id. ``identity in removals`` tells whether a thing is being
+    removed. Thread-safe."""
 
     wait_s: float = UNDO_S
     _waiting: dict[str, Removal] = field(default_factory=dict)
@@ -41,8 +44,8 @@ class Removals:
     def add(
         self, identity: str, remove: Callable[[], None], title: Message, scope: str, also: Iterable[str] = ()
     ) -> None:
-        """Adds a removal; ``remove`` is called when the time to take it back has passed. ``also``: ids of further
-        things that are removed with it."""
+        """Adds a removal; ``remove`` is called after ``wait_s`` seconds unless it is taken back. ``also``: ids of
+        further things that it removes. Does nothing if the thing is being removed already."""
         timer = threading.Timer(self.wait_s, self._remove, (identity, remove))
         timer.daemon = True
         with self._lock:
@@ -51,7 +54,7 @@ class Removals:
                 timer.start()
 
     def undo(self, identity: str) -> bool:
-        """Takes a removal back. Tells whether it was still waiting."""
+        """Takes a removal back. Returns whether it was still waiting."""
         with self._lock:
             removal = self._waiting.pop(identity, None)
         if removal is not None:
@@ -59,6 +62,7 @@ class Removals:
         return removal is not None
 
     def waiting(self) -> dict[str, Removal]:
+        """Returns the removals that can still be taken back, by the id with which they were added."""
         with self._lock:
             return dict(self._waiting)
 

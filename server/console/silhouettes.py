@@ -1,4 +1,4 @@
-"""Silhouettes of a capture as pictures to lay over its images; runs in a child process. Kept in the cache folder."""
+"""Draws the outlines of a capture's subject, to be laid over its images; runs in a child process."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ LINE_PX = 3
 
 
 def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, target: str) -> None:
-    """Draws the subject's outline in each picture of a capture as ``target``/<camera>.png, transparent outside. Raises
-    InputError."""
+    """Draws the subject's outline in each picture of a capture as ``target``/<camera>.png, transparent outside.
+    Silhouettes come from the folder ``cache`` or are stored there. Raises InputError."""
     from pipeline.settings import SegmentationSettings
     from server.storage.silhouette_cache import segment_once
     from server.tasks.photographs import read_scaled_capture
@@ -31,7 +31,7 @@ def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, 
 
 
 def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
-    """Returns an RGBA picture of a mask, at most ``WIDTH`` wide: the outline solid, the inside lightly tinted."""
+    """Draws a mask as an RGBA picture, at most ``WIDTH`` pixels wide: the outline solid, the inside lightly tinted."""
     factor = min(1.0, WIDTH / mask.shape[1])
     size = (round(mask.shape[1] * factor), round(mask.shape[0] * factor))
     small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)

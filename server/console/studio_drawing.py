@@ -1,7 +1,7 @@
-"""The live view of the simulated studio; runs in a child process of its own, so that a shot does not stop it.
+"""Draws the live view of the simulated studio, in a child process of its own, so that a shot does not stop it.
 
-The studio is drawn once. What a look costs is the sensor's noise, so that the cameras are binned as real ones are for a
-live view; one camera now and then is exposed at full size, for its sharpness.
+The studio is drawn once; each picture adds fresh sensor noise only. Cameras are binned for that, as real ones are for a
+live view. From time to time one camera is exposed at full size to measure its sharpness.
 """
 
 from dataclasses import replace
@@ -28,8 +28,8 @@ SUBJECT_SEED = 1  # the same person as in the rig's own previews
 
 
 def frames(context: WorkerContext, look: int) -> list[LiveFrame]:
-    """Returns the present picture of each camera of the simulated studio. Now and then one camera's blur is measured,
-    too."""
+    """Returns the present picture of each camera of the simulated studio. ``look`` counts the calls: every
+    ``SHARP_EVERY``-th measures one camera's blur, too."""
     views = context.keep("live", _draw)
     rng = context.keep("noise", np.random.default_rng)
     names = list(views)

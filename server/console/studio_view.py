@@ -1,4 +1,5 @@
-"""The live view of the simulated studio, asked of a child process, so that this one need not load what draws it."""
+"""Requests the live view of the simulated studio from a child process, so that the service need not import what draws
+it."""
 
 from rig.progress import Progress
 from server.console.live_frame import LiveFrame
@@ -6,8 +7,8 @@ from server.tasks.child import WorkerContext
 
 
 def frames(context: WorkerContext, report: Progress, *, look: int) -> list[LiveFrame]:
-    """Returns the present picture of each camera of the simulated studio. Now and then one camera's blur is measured,
-    too."""
+    """Returns the present picture of each camera of the simulated studio, drawn in a child process. ``look`` counts the
+    calls."""
     from server.console import studio_drawing
 
     return studio_drawing.frames(context, look)

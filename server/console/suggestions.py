@@ -1,4 +1,4 @@
-"""Places that are suggested for feature points: what is left of them, what of them becomes points. Pure functions."""
+"""Handles suggested pixels of feature points: which are still open, which become points. Pure functions."""
 
 from collections.abc import Iterator
 
@@ -6,7 +6,8 @@ from server.storage.face_cache import PixelsOfPoints
 
 
 def open_suggestions(suggested: PixelsOfPoints, points: PixelsOfPoints) -> PixelsOfPoints:
-    """Returns the suggestions (px, by point and camera) without those for views in which the point is set already."""
+    """Returns the suggestions (pixels, by point and camera) without those for views in which the point is set
+    already."""
     left = {
         name: {camera: at for camera, at in views.items() if camera not in points.get(name, {})}
         for name, views in suggested.items()
@@ -17,8 +18,8 @@ def open_suggestions(suggested: PixelsOfPoints, points: PixelsOfPoints) -> Pixel
 def take_suggestions(
     points: PixelsOfPoints, suggested: PixelsOfPoints, point: str | None = None, camera: str | None = None
 ) -> PixelsOfPoints:
-    """Returns the points with suggestions added: those of one point in one view, of one point in all views, or all.
-    Points that are set stay."""
+    """Returns the points with suggestions added: those of ``point`` in the view ``camera``, of ``point`` in all views
+    if ``camera`` is None, or all if both are None. Points that are set already stay."""
     taken = {name: dict(views) for name, views in points.items()}
     for name, view, at in _of(open_suggestions(suggested, points), point, camera):
         taken.setdefault(name, {})[view] = at
@@ -26,7 +27,8 @@ def take_suggestions(
 
 
 def drop_suggestions(suggested: PixelsOfPoints, point: str | None = None, camera: str | None = None) -> PixelsOfPoints:
-    """Returns the suggestions without some: those of one point in one view, of one point in all views, or all."""
+    """Returns the suggestions without those of ``point`` in the view ``camera``, of ``point`` in all views if
+    ``camera`` is None, or without any if both are None."""
     left = {name: dict(views) for name, views in suggested.items()}
     for name, view, _ in _of(suggested, point, camera):
         left[name].pop(view)

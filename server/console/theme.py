@@ -1,4 +1,5 @@
-"""The one look of all pages: colours and sizes are in ``static/theme.css``, and every page starts in ``page_frame``."""
+"""The appearance of all pages: colours and sizes are in ``static/theme.css``, and every page starts with
+``page_frame``."""
 
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -29,8 +30,8 @@ Answer = Callable[[Any], Awaitable[Any]]
 
 
 class Frame(Element, component="static/frame.js"):
-    """Shows what surrounds every page: navigation, state of the service, messages, and the keys
-    that work everywhere."""
+    """Shows what surrounds every page: navigation, status of the service, messages, and the keys that work
+    everywhere."""
 
     def __init__(self, current: str) -> None:
         super().__init__()
@@ -38,8 +39,8 @@ class Frame(Element, component="static/frame.js"):
         self.props.update(links=links, current=current, status={}, removed=[], followed=[])
 
     def show(self, **changed: Any) -> None:
-        """Shows the ``status`` of the service, things that were ``removed`` and can be taken back, or the progress of
-        ``followed`` jobs."""
+        """Updates what the frame shows: the ``status`` of the service, things that are being ``removed`` and can be
+        taken back, or the progress of ``followed`` jobs."""
         if any(self.props[name] != value for name, value in changed.items()):
             self.props.update(changed)
             self.update()
@@ -50,6 +51,7 @@ class Frame(Element, component="static/frame.js"):
 
 
 def install() -> None:
+    """Adds style sheet and colour scheme to the head of every page."""
     ui.add_head_html('<link rel="stylesheet" href="/console/static/theme.css">', shared=True)
     ui.add_head_html('<meta name="color-scheme" content="dark light">', shared=True)
     ui.add_head_html(f"<script>{LOOK}</script>", shared=True)
@@ -57,6 +59,8 @@ def install() -> None:
 
 @contextmanager
 def page_frame(current: str) -> Iterator[Frame]:
+    """Yields the frame of the page ``current`` and sets the page's title and colours. What the block makes appears
+    inside the frame."""
     title = next((title for name, _, title in PAGES if name == current), "Sign in")
     ui.page_title(f"{title} - eigenhead")
     ui.colors(primary=ACCENT, dark="#14171c", dark_page="#0d0f12")

@@ -1,4 +1,4 @@
-"""What a page asks before a job is sent: model, preset and template."""
+"""Converts what a form asks before a job is queued (model, preset, template) to a request, and lists the choices."""
 
 from typing import NotRequired, TypedDict, cast
 
@@ -10,20 +10,22 @@ from server.services.work import ReconstructionRequest
 
 
 class PresetLine(TypedDict):
+    """Holds a preset (a named choice of settings) as an entry of a form's list."""
+
     id: str
     title: MessageDocument
     explanation: MessageDocument
 
 
 class TemplateLine(TypedDict):
-    """Holds a template as forms list it. ``models``: names of the model that carries it."""
+    """Holds a template as an entry of a form's list. ``models``: names of the model that has it."""
 
     name: str
     models: list[str]
 
 
 class WorkForm(Chosen):
-    """Holds what a form asks before a job is sent. ``method``: id of a preset."""
+    """Holds what a form asks before a job is queued. ``method``: id of a preset."""
 
     model: NotRequired[str | None]
     method: NotRequired[str | None]
@@ -31,10 +33,12 @@ class WorkForm(Chosen):
 
 
 def preset_lines() -> list[PresetLine]:
+    """Converts all presets to entries of a form's list."""
     return [{"id": p.id, "title": p.title.document(), "explanation": p.explanation.document()} for p in PRESETS]
 
 
 def template_lines() -> list[TemplateLine]:
+    """Converts the templates whose model is at hand to entries of a form's list."""
     return [{"name": found.name, "models": list(found.models)} for found in templates_at_hand() if found.models]
 
 

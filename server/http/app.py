@@ -35,9 +35,8 @@ log = structlog.get_logger()
 
 
 def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None) -> FastAPI:
-    """Builds the service's ASGI app. ``mount_pages`` adds the operator's pages to it.
-
-    Data folder and database are opened when the app starts, not when this function is called."""
+    """Builds the service's ASGI app. ``mount_pages`` adds the operator's pages to it. Data folder and database are
+    opened when the app starts, not when this function is called."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -93,6 +92,7 @@ class Watch:
         self._app, self._metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one ASGI connection. Only HTTP requests get an id and are counted."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

@@ -1,8 +1,8 @@
-"""Identifies the caller of a request.
+"""Identifies the caller of a request by the API key in its Authorization header.
 
-That is an API key in the Authorization header. On a loopback address, as long as no key exists, everybody on this
-machine is a caller with all scopes; requests that a foreign web page makes a browser send are refused then, by their
-Host and Origin headers."""
+On a loopback address, as long as no key exists, everybody on this machine is a caller with all scopes. Requests that a
+foreign web page makes a browser send are then refused by their Host and Origin headers.
+"""
 
 from collections.abc import Callable
 from typing import Annotated
@@ -21,7 +21,7 @@ bearer = HTTPBearer(auto_error=False, description="API key, eh_...; not needed o
 
 
 def service_of(request: Request) -> Service:
-    """Returns the service that the app of a request belongs to."""
+    """Returns the service to whose app a request was sent."""
     return request.app.state.service
 
 
@@ -29,10 +29,12 @@ ServiceOf = Annotated[Service, Depends(service_of)]
 
 
 def require(scope: str) -> Callable[..., Caller]:
-    """Returns a dependency of FastAPI that yields the caller and raises a 401 or 403 problem unless it has ``scope``.
+    """Returns a FastAPI dependency that yields the caller, or raises a 401 problem for an unknown caller and a 403
+    problem for one without ``scope``.
 
-    It runs before an upload is read. FastAPI reads JSON bodies before dependencies, so those are guarded by
-    ``check_caller`` (server.http.json_bodies)."""
+    It runs before an upload is read. FastAPI reads JSON bodies before dependencies, so routes with such a body are
+    guarded by ``check_caller`` (server.http.json_bodies).
+    """
 
     def authenticate(
         request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]

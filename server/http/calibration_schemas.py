@@ -44,6 +44,8 @@ class NewCalibration(Received):
 
 
 class UseCalibration(Received):
+    """Selects the calibration that the rig uses from now on."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"calibration_id": EXAMPLE_ID}]})
 
     calibration_id: Id
@@ -51,6 +53,9 @@ class UseCalibration(Received):
 
 
 class CalibrationOut(Answer):
+    """Describes a calibration: the state of its job and, once it has succeeded, figures, checks and the verdict.
+    ``progress`` runs from 0 to 1; ``eta_s`` is the estimated remaining time in seconds."""
+
     id: str
     created: Moment
     source: Literal["upload", "rig"]
@@ -74,4 +79,6 @@ class CalibrationOut(Answer):
 
 
 class CalibrationList(Answer):
+    """Holds all calibrations, newest first."""
+
     calibrations: list[CalibrationOut]

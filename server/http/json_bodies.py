@@ -19,14 +19,16 @@ JSON_BYTES = 4 << 20  # the largest legitimate body, feature points of all camer
 
 
 class JsonBodies:
-    """Reads the JSON body of a request from a known caller, at most ``most`` bytes, and passes it on. Refuses other
-    requests with a problem document."""
+    """Guards the routes that take a JSON body: identifies the caller, reads the body, at most ``most`` bytes, and
+    passes the request on. It answers others with a problem document: 401 or 403 for the caller, 413 for the size, 415
+    for a form."""
 
     def __init__(self, app: ASGIApp, routes: Sequence[APIRoute], most: int = JSON_BYTES) -> None:
-        """Stores the app and ``routes``, all of the app's routes in their order."""
+        """Wraps ``app``. ``routes`` are all of its routes in their order."""
         self._app, self._routes, self._most = app, routes, most
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one ASGI connection. What is no request with a JSON body is passed on unread."""
         route = self._route(scope) if scope["type"] == "http" else None
         if route is None or route.body_field is None:
             await self._app(scope, receive, send)

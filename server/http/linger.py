@@ -16,15 +16,17 @@ LINGER_S = 10.0  # a proxy closes within milliseconds of a complete answer; a cl
 
 
 class DrainRequestBody:
-    """Drains the unread body of a request whose connection will be closed.
+    """Reads and drops the rest of a request's body when the connection will be closed after the answer.
 
-    The answer begins once the body ends or after ``patience_s`` seconds, and it ends once the body ends or after
-    another ``linger_s`` seconds."""
+    The answer begins once the body has ended or after ``patience_s`` seconds. It ends once the body has ended or after
+    another ``linger_s`` seconds.
+    """
 
     def __init__(self, app: ASGIApp, *, patience_s: float = PATIENCE_S, linger_s: float = LINGER_S) -> None:
         self._app, self._patience_s, self._linger_s = app, patience_s, linger_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one ASGI connection. What is no HTTP request, or will be kept alive, is passed on as it is."""
         if scope["type"] != "http" or not _closes(scope):
             await self._app(scope, receive, send)
             return

@@ -37,15 +37,20 @@ class Listed(Answer):
 
 
 class CaptureList(Listed):
+    """Holds one page of captures."""
+
     captures: list[CaptureOut]
 
 
 class SessionList(Listed):
+    """Holds one page of sessions."""
+
     sessions: list[SessionOut]
 
 
 class PersonOut(Answer):
-    """Describes a subject of the library. (``SubjectOut`` is where the subject is in a picture.)"""
+    """Describes a person whose sessions have the same name. ``captures`` counts captures, ``heads`` jobs that made a
+    head."""
 
     id: str = Field(description="of the newest session")
     label: str
@@ -61,18 +66,26 @@ class PersonOut(Answer):
 
 
 class SubjectList(Listed):
+    """Holds one page of people."""
+
     subjects: list[PersonOut]
 
 
 class JobList(Listed):
+    """Holds one page of jobs."""
+
     jobs: list[JobOut]
 
 
 class JobBatch(Answer):
+    """Holds the jobs that one request has queued, one for each capture."""
+
     jobs: list[JobOut]
 
 
 class RefusedOne(Answer):
+    """Describes why an action was refused for one of the ids in a request."""
+
     id: str
     type: str = Field(description="as of a problem document")
     detail: TextOf
@@ -80,7 +93,7 @@ class RefusedOne(Answer):
 
 
 class BulkOut(Answer):
-    """Holds the result of an action on many things: each of them is in one of the two lists."""
+    """Holds the result of an action on many things. Each id is in one of the two lists."""
 
     done: list[str]
     refused: list[RefusedOne]
@@ -90,6 +103,8 @@ Ids = Annotated[list[Id], Field(min_length=1, max_length=1000)]
 
 
 class CaptureBulk(Received):
+    """Requests one action on many captures. Each of them succeeds or is refused by itself."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"action": "remove", "ids": [EXAMPLE_ID]}]})
 
     action: Literal["remove", "erase", "reconstruct", "move", "tag", "untag"] = Field(
@@ -104,6 +119,8 @@ class CaptureBulk(Received):
 
 
 class JobBulk(Received):
+    """Requests one action on many jobs. Each of them succeeds or is refused by itself."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"action": "cancel", "ids": [EXAMPLE_ID]}]})
 
     action: Literal["cancel", "restart", "remove"]

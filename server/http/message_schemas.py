@@ -12,7 +12,7 @@ Texts = list[TextOf]
 
 
 class MessageOut(BaseModel):
-    """Holds a message of the service as data, so that it can be shown in another language by ``code`` and
+    """Holds a message of the service as data. A program can show it in another language by its ``code`` and
     ``parameters``."""
 
     code: str = Field(description="stable; decides what parameters there are")
@@ -26,6 +26,6 @@ class MessageOut(BaseModel):
 
 
 class WarningOut(MessageOut):
-    """Holds a warning as in report.json."""
+    """Holds a warning with its code and parameters, as report.json has it."""
 
     code: str = Field(description="as in docs/operator.md, among them scale-assumed, view-left-out, views-many")

@@ -1,7 +1,8 @@
 """Completes the OpenAPI document of the service.
 
-Operations get the names that client generators use, the pipeline's settings get schemas of their own, files are marked
-as bytes, and problem documents replace the framework's error schemas."""
+Operations get names that client generators use, the pipeline's settings get schemas of their own, files are marked as
+bytes, and the schema of problem documents replaces the framework's error schemas.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -21,12 +22,12 @@ TEXTUAL = ("application/json", problems.MEDIA_TYPE, "text/")
 
 
 def operation_name(route: APIRoute) -> str:
-    """Returns the id of an operation: its function's name, which generated clients use for their method."""
+    """Returns the id of an operation: the name of its function, after which generated clients name their method."""
     return route.name
 
 
 def describe(app: FastAPI) -> None:
-    """Replaces ``app.openapi`` by a function that returns the completed document."""
+    """Replaces ``app.openapi`` by a function that returns the completed document, which is made once."""
     original = app.openapi
 
     def openapi() -> JsonObject:

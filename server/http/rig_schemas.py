@@ -1,6 +1,6 @@
-"""Defines the JSON documents about the rig's pictures: their checks, what a capture holds, and clean plates."""
+"""Defines the JSON documents about the rig, its cameras and clean plates, and about what a capture's pictures show."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
@@ -8,7 +8,61 @@ from server.http.message_schemas import MessageOut, Texts
 from server.http.schemas import Answer, Moment, Received
 
 
+class CameraOut(Answer):
+    """Describes a camera of the rig. ``closed``: not used since the start; ``ready``: simulated."""
+
+    name: str
+    driver: str
+    state: Literal["ready", "open", "closed", "missing"]
+
+
+class RigOut(Answer):
+    """Describes the rig. ``calibration``: ``own`` if it has a calibration, ``studio`` for the simulated studio without
+    one, null for a real rig without one."""
+
+    id: str
+    kind: Literal["simulated", "real"]
+    ready: bool
+    cameras: list[CameraOut]
+    faults: Texts
+    fault_messages: list[MessageOut] = Field(validation_alias="faults")
+    calibration: str | None
+
+
+class CameraSettingsEdit(Received):
+    """Changes a camera's settings. A key that is left out keeps its value. With null the service no longer sets the
+    value, and the camera keeps the one that it has."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"exposure_ms": 8.0, "gain_db": 0.0}]})
+
+    exposure_ms: float | None = Field(None, ge=0.001, le=60_000)
+    gain_db: float | None = Field(None, ge=-60, le=60)
+    white_balance_k: int | None = Field(None, ge=1000, le=20_000)
+
+
+class CameraSettingsOut(Answer):
+    """Holds the settings requested of a camera (null: the camera decides), and which of them it did not accept."""
+
+    exposure_ms: float | None
+    gain_db: float | None
+    white_balance_k: int | None
+    unmet: Texts = Field(description="what the camera did not take, and why")
+    unmet_messages: list[MessageOut] = Field(validation_alias="unmet")
+
+
+class Lights(Received):
+    """Holds which lamps are on during a shot."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"outputs": [0, 1]}]})
+
+    outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
+        max_length=4, description="light outputs of the trigger box that are on during a shot"
+    )
+
+
 class SubjectOut(Answer):
+    """Describes where the subject is in a picture. (A person of the library is ``PersonOut``.)"""
+
     share: float = Field(description="of the picture's area")
     cut_off: list[str] = Field(description="edges of the picture that cut the head: top, left, right")
     outline: list[list[float]] = Field(description="corners, in pixels of the picture")
@@ -26,6 +80,8 @@ class ViewChecksOut(Answer):
 
 
 class CaptureChecks(Answer):
+    """Holds what was measured on each camera's picture, by camera. It is empty for captures of earlier versions."""
+
     cameras: dict[str, ViewChecksOut]
 
 
@@ -41,7 +97,7 @@ class HoldingsOut(Answer):
 
 
 class PlatesOut(Answer):
-    """Describes a set of stored clean plates."""
+    """Describes a version of the clean plates that is stored."""
 
     id: str
     taken: Moment
@@ -52,16 +108,22 @@ class PlatesOut(Answer):
 
 
 class PlatesList(Answer):
+    """Holds all stored versions of the clean plates, newest first."""
+
     versions: list[PlatesOut]
 
 
 class UsePlates(Received):
+    """Selects a version of the clean plates."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"version": "20261122T215052123456Z"}]})
 
     version: str = Field(max_length=64, description="an id of GET /v1/rig/background")
 
 
 class BackgroundOut(Answer):
+    """Describes the clean plates that were just taken: the cameras, and how many pictures of each."""
+
     cameras: list[str]
     plates: int
     note: Annotated[str, BeforeValidator(lambda note: "" if note is None else str(note))]

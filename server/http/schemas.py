@@ -1,4 +1,4 @@
-"""Defines the JSON documents of requests and answers."""
+"""Defines what the JSON documents of HTTP have in common, and those of captures, sessions, jobs and results."""
 
 import base64
 import binascii
@@ -26,18 +26,20 @@ EXAMPLE_ID = "0198c0de" + 20 * "0"
 
 
 class Received(BaseModel):
-    """Is the base of request bodies. Unknown keys are refused."""
+    """Refuses unknown keys; the base of all request bodies."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 class Answer(BaseModel):
-    """Is the base of response bodies, built from a record of the service with the same fields."""
+    """Reads its fields from a record of the service that has the same fields; the base of all response bodies."""
 
     model_config = ConfigDict(from_attributes=True)
 
 
 class NewSession(Received):
+    """Begins a session of one subject."""
+
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"label": "Anna", "consent": "signed 2026-03-01, for research"}]}
     )
@@ -47,6 +49,8 @@ class NewSession(Received):
 
 
 class NewCapture(Received):
+    """Requests a shot with the rig."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna", "expression": "neutral"}]})
 
     session: Id | None = None
@@ -58,6 +62,8 @@ class NewCapture(Received):
 
 
 class NewImport(Received):
+    """Requests a capture from an archive on another server."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://store.example/anna.tar.gz"}]})
 
     url: str = Field(max_length=2000, description="of an archive of a capture, at a server that the operator allowed")
@@ -68,7 +74,7 @@ class NewImport(Received):
 
 
 class SessionEdit(Received):
-    """Changes a session. Keys that are left out keep their values."""
+    """Changes the label or the consent note of a session. Keys that are left out keep their values."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"label": "Anna B."}]})
 
@@ -89,6 +95,8 @@ class CaptureEdit(Received):
 
 
 class NewFeatures(Received):
+    """Holds feature points: for each point the pixel in each camera that shows it."""
+
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"points": {"pronasale": {"cam00": [511.2, 402.7], "cam03": [433.0, 398.1]}}}]}
     )
@@ -110,11 +118,15 @@ Secret = Annotated[str, Field(pattern="^whsec_[A-Za-z0-9+/]{32,}={0,2}$"), After
 
 
 class JobWebhook(Received):
+    """Names an address to which the end of one job is announced."""
+
     url: str = Field(pattern="^https?://", max_length=2000, description="at a server that the operator allowed")
     secret: Secret | None = Field(None, description="signs the messages (standardwebhooks.com)")
 
 
 class NewJob(Received):
+    """Requests a reconstruction of a capture."""
+
     model_config = ConfigDict(
         json_schema_extra={
             "examples": [
@@ -137,6 +149,8 @@ class NewJob(Received):
 
 
 class NewSessionJobs(Received):
+    """Requests a reconstruction of every capture of a session that shows a head."""
+
     model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"detail": "fine"}}]})
 
     model: str | None = Field(None, max_length=200)
@@ -145,7 +159,7 @@ class NewSessionJobs(Received):
 
 
 class Restart(Received):
-    """Repeats a job. Keys that are left out are taken from the old job."""
+    """Repeats a job. Keys that are left out have the values of the old job."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"settings": {"method": "simplex"}}]})
 
@@ -153,22 +167,9 @@ class Restart(Received):
     settings: JobSettings | None = None
 
 
-class NewWebhook(Received):
-    model_config = ConfigDict(json_schema_extra={"examples": [{"url": "https://lab.example/hooks/heads"}]})
-
-    url: str = Field(pattern="^https?://[^\\x00-\\x1f\\x7f]*$", max_length=2000)
-
-
-class NewKey(Received):
-    model_config = ConfigDict(
-        json_schema_extra={"examples": [{"name": "console", "scopes": ["read", "capture", "submit"]}]}
-    )
-
-    name: str = Field(min_length=1, max_length=200, pattern=PLAIN)
-    scopes: list[Literal["read", "capture", "submit", "admin"]] = Field(min_length=1, max_length=4)
-
-
 class Size(Answer):
+    """Describes a camera by its name and the size of its pictures in pixels."""
+
     name: str
     width: int
     height: int
@@ -185,6 +186,8 @@ class FaultOut(Answer):
 
 
 class CaptureOut(Answer):
+    """Describes a capture: its pictures, what people wrote about it, and the verdict on it."""
+
     id: str
     created: Moment
     source: Literal["upload", "rig"]
@@ -209,6 +212,8 @@ class CaptureOut(Answer):
 
 
 class SessionOut(Answer):
+    """Describes a session with the ids of its captures, newest first."""
+
     id: str
     created: Moment
     label: str
@@ -217,6 +222,8 @@ class SessionOut(Answer):
 
 
 class JobError(Answer):
+    """Describes why a job failed. ``type`` and ``detail`` are as in a problem document."""
+
     type: str
     detail: TextOf
     errors: Texts
@@ -225,22 +232,31 @@ class JobError(Answer):
 
 
 class FileOut(Answer):
+    """Describes a file by its size in bytes and its SHA-256."""
+
     bytes: int
     sha256: str
 
 
 class ResultFile(FileOut):
+    """Describes a file of a result and where to fetch it."""
+
     name: str = Field(description="below the result folder, such as overlays/cam00.png")
     url: str
     media_type: str
 
 
 class ResultList(Answer):
+    """Holds the files of a job's result."""
+
     job_id: str
     files: list[ResultFile]
 
 
 class JobOut(Answer):
+    """Describes a job: its request, state and progress and, once it has succeeded, the files of its result. ``eta_s``
+    is the estimated remaining time in seconds."""
+
     id: str
     name: str
     state: State
@@ -264,118 +280,3 @@ class JobOut(Answer):
     started: Moment | None
     finished: Moment | None
     files: dict[str, FileOut]
-
-
-class ModelOut(Answer):
-    id: str
-    name: str
-    bytes: int
-    default: bool
-
-
-class ModelList(Answer):
-    models: list[ModelOut]
-
-
-class WebhookOut(Answer):
-    id: str
-    url: str
-
-
-class NewWebhookOut(WebhookOut):
-    secret: str = Field(description="shown this once; signs the messages (standardwebhooks.com)")
-
-
-class WebhookList(Answer):
-    webhooks: list[WebhookOut]
-
-
-class KeyOut(Answer):
-    id: str
-    name: str
-    scopes: list[str]
-
-
-class KeyList(Answer):
-    keys: list[KeyOut]
-
-
-class NewKeyOut(Answer):
-    id: str
-    key: str = Field(description="shown this once")
-
-
-class Health(Answer):
-    status: Literal["ok"]
-    version: str
-
-
-class InfoOut(Answer):
-    version: str
-    cores: int = Field(description="that this service may use; its workers may run elsewhere")
-    queued: int = Field(description="jobs")
-    running: int = Field(description="jobs")
-    cameras_least: int = Field(description="of a capture")
-    cameras_most: int = Field(description="of a capture")
-    body_bytes_most: int = Field(description="of an upload")
-    image_pixels_most: int = Field(description="of one image")
-    jobs_per_key_most: int = Field(description="queued and running")
-    settings: JobSettings = Field(description="what a job has where it gives none; its schema says what it may give")
-
-
-class CheckOut(Answer):
-    """Holds one check of the service: whether it passed, and what to do if not. ``starting``: it will pass soon without
-    any action."""
-
-    ok: bool
-    detail: TextOf
-    starting: bool
-    detail_message: MessageOut = Field(validation_alias="detail")
-
-
-class Ready(Answer):
-    ready: bool
-    checks: dict[str, CheckOut]
-
-
-class CameraOut(Answer):
-    name: str
-    driver: str
-    state: Literal["ready", "open", "closed", "missing"]
-
-
-class RigOut(Answer):
-    id: str
-    kind: Literal["simulated", "real"]
-    ready: bool
-    cameras: list[CameraOut]
-    faults: Texts
-    fault_messages: list[MessageOut] = Field(validation_alias="faults")
-    calibration: str | None
-
-
-class CameraSettingsEdit(Received):
-    """Changes a camera's settings. Keys that are left out keep their values; null stops setting the value, so that the
-    camera keeps the one that it has."""
-
-    model_config = ConfigDict(json_schema_extra={"examples": [{"exposure_ms": 8.0, "gain_db": 0.0}]})
-
-    exposure_ms: float | None = Field(None, ge=0.001, le=60_000)
-    gain_db: float | None = Field(None, ge=-60, le=60)
-    white_balance_k: int | None = Field(None, ge=1000, le=20_000)
-
-
-class CameraSettingsOut(Answer):
-    exposure_ms: float | None
-    gain_db: float | None
-    white_balance_k: int | None
-    unmet: Texts = Field(description="what the camera did not take, and why")
-    unmet_messages: list[MessageOut] = Field(validation_alias="unmet")
-
-
-class Lights(Received):
-    model_config = ConfigDict(json_schema_extra={"examples": [{"outputs": [0, 1]}]})
-
-    outputs: list[Annotated[int, Field(ge=0, le=3)]] = Field(
-        max_length=4, description="light outputs of the trigger box that are on during a shot"
-    )

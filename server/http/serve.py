@@ -30,8 +30,9 @@ log = structlog.get_logger()
 class WorkerProcess:
     """Keeps a worker process running as long as this process lives.
 
-    A worker that dies is started again. It ends when its standard input closes, so it also ends if this process is
-    killed."""
+    A worker that dies is started again, after a pause that grows with each early death. It ends when its standard input
+    closes, so also if this process is killed.
+    """
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._environment = python_environment() | settings.environment()
@@ -41,12 +42,12 @@ class WorkerProcess:
         self._thread.start()
 
     def expect_end(self) -> None:
-        """Declares that the worker may end from now on without being restarted: a signal to a process group or a
-        container ends it too."""
+        """Stops restarting the worker. To be called when this process is asked to end: the signal may have gone to the
+        whole process group or container, and ends the worker, too."""
         self._stop.set()
 
     def close(self) -> None:
-        """Ends the worker: closes its standard input, and kills it if it has not ended after 10 s."""
+        """Ends the worker by closing its standard input, and kills it if it has not ended after 10 s."""
         self.expect_end()
         process = self._process
         if process.stdin is not None:
@@ -85,10 +86,12 @@ class WorkerProcess:
 
 
 def run_service(settings: ServiceSettings, *, worker: bool = True, ready: Callable[[str], None] | None = None) -> None:
-    """Serves until a signal ends the process. ``ready`` is called with the address once requests are answered.
+    """Serves requests until a signal ends the process. ``ready`` is called with the service's address once it answers.
 
-    Faults of the rig's file, the address and the database are found before anything heavy is loaded. Raises InputError,
-    AddressTaken, DatabaseUnavailable, KeylessAddress."""
+    Faults of the rig's file, the address and the database are found before anything heavy is loaded. Raises InputError
+    for the rig's file, AddressTaken, DatabaseUnavailable, and KeylessAddress if others could reach a service without
+    keys.
+    """
     if settings.rig is not None:
         read_rig_config(settings.rig)
     sock = listen(settings.host, settings.port)

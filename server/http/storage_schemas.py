@@ -8,12 +8,16 @@ from server.http.schemas import Answer, Moment
 
 
 class KindOut(Answer):
+    """Describes how much disk space one kind of data takes."""
+
     kind: str
     bytes: int
     things: int = Field(description="captures, jobs, ...: what lies directly in the kind's folders")
 
 
 class StorageOut(Answer):
+    """Describes how the disk of the data folder is used."""
+
     free: int = Field(description="bytes of the disk")
     total: int = Field(description="bytes of the disk")
     spare: int = Field(description="bytes that uploads and jobs leave free")
@@ -23,6 +27,8 @@ class StorageOut(Answer):
 
 
 class UpcomingOut(Answer):
+    """Describes a capture or finished job that retention will remove."""
+
     kind: Literal["job", "capture"]
     id: str
     label: str
@@ -31,6 +37,8 @@ class UpcomingOut(Answer):
 
 
 class RetentionOut(Answer):
+    """Describes how long captures, results and caches are kept, and what is removed next."""
+
     keep_captures_days: float | None = Field(description="null: for ever")
     keep_results_days: float | None = Field(description="null: for ever")
     keep_jobs: int | None = Field(description="finished jobs; null: all")

@@ -1,4 +1,4 @@
-"""Defines the JSON documents about templates, meshes in whose vertex order heads are written."""
+"""Defines the JSON documents about templates: meshes in whose vertex order heads are written."""
 
 from pydantic import ConfigDict, Field
 
@@ -6,7 +6,8 @@ from server.http.schemas import Answer
 
 
 class RegistrationOut(Answer):
-    """Describes how well a template fits its model."""
+    """Describes how well a template was fitted to its model. Distances are in mm: the median, and the value that 95 %
+    of vertices stay below (``p95``)."""
 
     skin_share: float = Field(ge=0, le=1, description="of its vertices, on the model's skin; the others follow it")
     face_covered_share: float = Field(ge=0, le=1, description="of the model's face, that it shows")
@@ -17,7 +18,8 @@ class RegistrationOut(Answer):
 
 
 class TemplateOut(Answer):
-    """Describes a mesh in whose vertex order a job writes its head: ``settings.outputs.template``."""
+    """Describes a template: a mesh in whose vertex order a job writes its head if ``settings.outputs.template`` names
+    it."""
 
     model_config = ConfigDict(
         from_attributes=True,
@@ -57,4 +59,6 @@ class TemplateOut(Answer):
 
 
 class TemplateList(Answer):
+    """Holds the templates at hand, sorted by name."""
+
     templates: list[TemplateOut]

@@ -25,10 +25,12 @@ async def append(
     threads: Threads,
     silent_s: float = IDLE_TIMEOUT_S,
 ) -> int:
-    """Appends the body of a PATCH to an upload and returns the new offset (bytes).
+    """Appends the body of a PATCH to an upload and returns the new offset (bytes). Bytes that arrived stay if the
+    connection breaks or the process is killed.
 
-    Raises problems: 460 for a wrong checksum, and the bytes are removed again; 408 for a client that is silent for
-    ``silent_s`` seconds, and the bytes received so far are kept; 413 for more bytes than were announced."""
+    Raises problems: 460 for a wrong checksum, after removing this body's bytes again; 408 for a client that is silent
+    for ``silent_s`` seconds; 413 for more bytes than were announced; 400 for an unknown kind of checksum.
+    """
     path, before = uploads.data(record), uploads.offset(record)
     digest = _digest(checksum)
     target = await threads.disk(path.open, "ab")

@@ -1,6 +1,7 @@
-"""The table and the contact sheet of a batch of the service, by the same code as those of ``eigenhead batch``.
+"""Makes the table and the contact sheet of a batch of the service, with the code that ``eigenhead batch`` uses.
 
-A module of its own, since what draws and measures heads takes a second to import: no start of the service waits for it.
+This is a module of its own because it imports the code that draws and measures heads, which takes a second. The start
+of the service must not wait for it.
 """
 
 import json
@@ -23,7 +24,8 @@ from server.storage.store import Store
 
 
 def batch_columns(batch: Batch) -> tuple[Column, ...]:
-    """Returns the columns of a batch's table."""
+    """Returns the columns of a batch's table: those of every head, and one for each expression of the batch's model.
+    Columns of expressions are left out if the model was removed since."""
     expressions: list[str] = []
     with suppress(UnknownModel):  # it was removed since
         expressions = expressions_of([batch.model])
@@ -31,12 +33,14 @@ def batch_columns(batch: Batch) -> tuple[Column, ...]:
 
 
 def batch_rows(batches: Batches, store: Store, batch: Batch, columns: Sequence[Column]) -> Iterator[Row]:
-    """Yields the rows of a batch's table, in the order of its captures."""
+    """Yields the rows of a batch's table, in the order of its captures. A capture that was erased, or whose head is not
+    made yet, has a row, too."""
     return (table_row(outcome, columns) for outcome in _outcomes(batches, store, batch))
 
 
 def batch_sheet(batches: Batches, store: Store, batch: Batch) -> Iterator[str]:
-    """Returns the lines of a batch's contact sheet."""
+    """Yields the lines of a batch's contact sheet, a self-contained HTML page with one card for each capture. A card
+    links to the console's page of the result."""
     columns = batch_columns(batch)
     cards = [sheet_card(outcome, table_row(outcome, columns)) for outcome in _outcomes(batches, store, batch)]
     return sheet_lines(batch.label or batch.id, cards)

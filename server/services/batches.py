@@ -1,9 +1,9 @@
-"""Batches: many captures, a job each, in one queue with everybody else's jobs and behind them.
+"""Batches: many captures, one job each, in the same queues as other jobs and behind them.
 
-A batch says what shall become of its captures; ``serve``, which the service calls again and again, makes it so. It
-keeps at most ``FED_MOST`` jobs of batches in each queue, so that a batch of ten thousand costs the queue no more than a
-small one, takes those of a paused batch back, and cancels those of a cancelled one. Whatever stops it, the next call
-goes on.
+A batch states what is to become of its captures. ``Batches.serve``, which the service calls every ``poll_s`` seconds,
+makes it so. It keeps at most ``FED_MOST`` jobs of batches in each queue, so that a batch of ten thousand captures does
+not fill the queue. It takes the queued jobs of a paused batch back and cancels the jobs of a cancelled one. Whatever
+interrupts a call, the next call continues from the rows in the database.
 """
 
 import json
@@ -21,7 +21,8 @@ from rig.digest import document_sha256
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, compose
 from server.errors import Conflict, DiskFull, NotFound, TooMany
-from server.services.jobs import STATES, STATUSES, Jobs
+from server.services.job_rows import STATES, STATUSES
+from server.services.jobs import Jobs
 from server.services.records import Batch, Found, Job, moment_of
 from server.services.texts import check_texts
 from server.services.webhooks import Webhooks
@@ -44,8 +45,8 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Describes the captures of a batch, in one of three ways: by id, by session, or by what their labels begin
-    with."""
+    """Describes which captures a batch is made of. Exactly one field is set: the captures' ids, the id of a session, or
+    the text that their labels begin with."""
 
     captures: Sequence[str] | None = None
     session: str | None = None
@@ -54,7 +55,8 @@ class Selection:
 
 @dataclass(frozen=True, slots=True)
 class BatchRequest:
-    """Holds what a batch is to do, and where. ``queue`` None: the service's own."""
+    """Holds a request for a batch: which captures, what is done with each, and in which queue (None: the service's
+    own). Of two jobs the one with the lower ``priority`` runs first."""
 
     selection: Selection
     work: ReconstructionRequest
@@ -63,6 +65,8 @@ class BatchRequest:
     priority: int = PRIORITY
 
     def digest(self) -> str:
+        """Returns the SHA-256 of everything that was requested. A repeated request with the same idempotency key must
+        have the same digest."""
         chosen = self.selection
         captures = None if chosen.captures is None else list(chosen.captures)
         wanted = [captures, chosen.session, chosen.prefix, self.work.model, self.work.settings]
@@ -70,7 +74,7 @@ class BatchRequest:
 
 
 class Batches:
-    """Manages the batches of a service. Methods block."""
+    """Manages the batches of a service. Methods block on the database, so call them from a thread."""
 
     def __init__(
         self,
@@ -85,10 +89,12 @@ class Batches:
         self._library, self._webhooks, self._index = library, webhooks, jobs.batches
 
     def submit(self, wanted: BatchRequest, *, key: str = "local", idempotency_key: str | None = None) -> Batch:
-        """Begins a batch and returns it. With a known idempotency key it returns the batch of the first request.
+        """Begins a batch and returns it. A repeated request with the same idempotency key returns the batch that the
+        first request made.
 
-        Raises InputError for work that cannot be done and captures that cannot be used, NotFound for a session,
-        DiskFull, TooMany, and Conflict where the idempotency key was used for another request.
+        Raises InputError for unknown models or settings and for captures that cannot be used, NotFound for an unknown
+        session, DiskFull, TooMany if the API key has too many unfinished batches, and Conflict if its idempotency key
+        was used for a different request.
         """
         wanted.work.check()
         check_texts({"label": wanted.label}, "request")
@@ -135,22 +141,23 @@ class Batches:
         return self._batches(self._index.of(ids))
 
     def pause(self, identity: str) -> Batch:
-        """Lets no further job of a batch begin; those that run go on. Raises NotFound, and Conflict for a batch that
-        ended."""
+        """Starts no further job of a batch; jobs that run already continue. Queued jobs are taken back at the next call
+        of ``serve``. Raises NotFound, and Conflict for a batch that has ended."""
         return self._change(identity, "paused")
 
     def resume(self, identity: str) -> Batch:
-        """Goes on with a paused batch. Raises NotFound, and Conflict for a batch that ended."""
+        """Continues a paused batch. Raises NotFound, and Conflict for a batch that has ended."""
         return self._change(identity, "running")
 
     def cancel(self, identity: str) -> Batch:
-        """Cancels all jobs of a batch that have not ended. A batch that ended stays as it is. Raises NotFound."""
+        """Cancels all jobs of a batch that have not ended, at the next call of ``serve``. A batch that has ended stays
+        as it is. Raises NotFound."""
         self._known(identity)
         self._index.change(identity, "cancelled")
         return self.get(identity)
 
     def retry(self, identity: str) -> Batch:
-        """Makes new jobs for all captures whose job failed. Raises NotFound, and Conflict where none failed or the
+        """Makes a new job for every capture whose job failed. Raises NotFound, and Conflict if no job failed or the
         batch was cancelled."""
         if self._known(identity).wish == "cancelled":
             raise Conflict("batch-ended", compose("batch-cancelled"))
@@ -159,14 +166,20 @@ class Batches:
         return self.get(identity)
 
     def remove(self, identity: str) -> None:
-        """Removes a batch that ended; its jobs and their results stay. Raises NotFound, and Conflict for a batch that
-        has not ended."""
+        """Removes a batch that has ended; its jobs and their results stay. Raises NotFound, and Conflict for a batch
+        that has not ended."""
         if self._known(identity).finished is None:
             raise Conflict("batch-active", compose("batch-active"))
         self._index.remove(identity)
 
     def serve(self) -> None:
-        """Brings the jobs of all batches to what their owners want. May run in several processes at once."""
+        """Starts, takes back and cancels jobs until they agree with what the owners of all batches want, and notes
+        which batches have finished.
+
+        The service calls it every ``poll_s`` seconds. It may run in several processes at once: the jobs of a batch are
+        given in one transaction that locks the batch's row. A process killed between two steps loses nothing; the next
+        call repeats them.
+        """
         for identity, jobs in self._index.recalled().items():  # also those that an ended process left
             self._take_back(identity, jobs)
         rows, waiting = self._index.unfinished(), self._index.with_waiting()
@@ -190,7 +203,8 @@ class Batches:
                 self._index.finish(row, _now_ms())
 
     def captures(self, identity: str) -> Iterator[tuple[str | None, Job | None]]:
-        """Yields the captures of a batch in their order, None where one was erased, each with its latest job."""
+        """Yields the captures of a batch in their order: the id (None if the capture was erased) and its latest job
+        (None if it has none)."""
         for items in self._index.items(identity):
             ids = [item.job_id for item in items if item.job_id is not None and is_id(item.job_id)]
             jobs = {job.id: job for job in self._jobs.of(ids)}

@@ -1,4 +1,4 @@
-"""One action on many things: each is done or refused by itself."""
+"""Does one action on many things, each of which succeeds or is refused by itself."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from server.problem_types import URN
 
 @dataclass(frozen=True, slots=True)
 class RefusedOne:
-    """Holds why an action was refused for one thing. ``type`` and ``detail`` are those of the problem that the action
-    alone would have given."""
+    """Holds why an action was refused for one thing. ``type`` and ``detail`` are those of the problem document (RFC
+    9457) that a request for this thing alone would have been answered with."""
 
     id: str
     type: str
@@ -21,12 +21,15 @@ class RefusedOne:
 
 @dataclass(frozen=True, slots=True)
 class Bulk:
+    """Holds the outcome of one action on many things: the ids for which it was done, and the refusals."""
+
     done: tuple[str, ...]
     refused: tuple[RefusedOne, ...]
 
 
 def each(ids: Iterable[str], action: Callable[[str], object]) -> Bulk:
-    """Does ``action`` once for every id. Where it is refused for one id, the others are still done."""
+    """Calls ``action`` once for every different id and collects the outcomes. A refusal for one id does not stop the
+    others. Exceptions that are no EigenheadError pass through."""
     done, refused = [], []
     for identity in dict.fromkeys(ids):
         try:

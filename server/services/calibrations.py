@@ -1,9 +1,10 @@
-"""Calibrations: an archive of pictures of a board, or of a scene, goes in, a durable job makes a rig of them, and one
-is put to use.
+"""Calibrations: pictures of a board or of a scene are stored, a durable job estimates the rig from them, and one of the
+results is put to use.
 
 <data>/calibrations/<id>/record.json  board.toml  images/<camera>/<shot>.<ext>  result/cameras.json  calibration.json
 
-A scene has no board.toml, and perhaps scale.json. It may show a subject: its images/ are removed once the work ended.
+A scene has no board.toml, and may have scale.json. Its pictures may show a person, so its images/ are removed once the
+job has ended.
 """
 
 import hashlib
@@ -22,7 +23,7 @@ from rig.errors import InputError
 from rig.messages.message import Message, compose, read_message
 from server.errors import Conflict, NotFound
 from server.services.failures import failure
-from server.services.jobs import APPLICATION_VERSION, FINISHED, STATES
+from server.services.job_rows import APPLICATION_VERSION, FINISHED, STATES
 from server.services.records import Calibration
 from server.services.texts import check_texts
 from server.storage.events import EventLog
@@ -35,14 +36,15 @@ WORKFLOW = "calibrate"
 
 
 class Calibrations:
-    """Manages the calibrations of a service. Methods block."""
+    """Manages the calibrations of a service. Methods block, so call them from a thread."""
 
     def __init__(self, store: Store, client: DBOSClient, queue: str, events: EventLog) -> None:
         self._store, self._client, self._queue, self._events = store, client, queue, events
 
     def add(self, folder: Path, source: str, label: str) -> Calibration:
-        """Takes over ``folder`` (images/, and board.toml if they show a board) and queues its calibration. Raises
-        InputError for an invalid label."""
+        """Moves ``folder`` to its final place in the data folder and queues its calibration. The folder holds images/,
+        and board.toml if they show a board; ``source`` says where they come from ("upload", "rig"). If the process is
+        killed before the job is queued, ``get`` queues it. Raises InputError for an invalid label."""
         check_texts({"label": label})
         identity = new_id()
         cameras = {path.name: len(list(path.iterdir())) for path in sorted((folder / "images").iterdir())}
@@ -55,7 +57,8 @@ class Calibrations:
         return self.get(identity)
 
     def add_shots(self, board: Mapping[str, object], captures: list[str], label: str) -> Calibration:
-        """Queues a calibration from captures that show the board. Raises NotFound and InputError."""
+        """Queues a calibration from captures that show the board. ``board``: the content of a ``board.toml``. Raises
+        NotFound for an unknown capture, and InputError for a wrong board or captures without images."""
         from calibration.board.board import board_from_document, write_board
 
         described = board_from_document(board)
@@ -68,7 +71,7 @@ class Calibrations:
 
     def add_scene(self, captures: list[str], scale: Mapping[str, object] | None, label: str) -> Calibration:
         """Queues a calibration from captures of any scene. ``scale``: the content of a ``scale.json``. Raises NotFound
-        and InputError."""
+        for an unknown capture, and InputError for a wrong scale or captures without images."""
         with self._store.incoming() as folder:
             target = folder / "calibration"
             target.mkdir()
@@ -79,7 +82,8 @@ class Calibrations:
             return self.add(target, "rig", label)
 
     def get(self, identity: str) -> Calibration:
-        """Returns a calibration with its progress or outcome. Raises NotFound."""
+        """Returns a calibration with its progress or its outcome. Queues the job anew if the service was killed before
+        it was queued. Raises NotFound."""
         record = self._store.calibration(identity)
         row = self._row(identity)
         state = STATES[row.status] if row else "queued"
@@ -120,22 +124,27 @@ class Calibrations:
         return found
 
     def cameras_json(self, identity: str) -> Path:
-        """Returns the path of the cameras.json of a calibration that succeeded. Raises NotFound and Conflict."""
+        """Returns the path of a calibration's cameras.json. Raises NotFound, and Conflict if the calibration has not
+        succeeded."""
         return self.result(identity, "cameras.json")
 
     def result(self, identity: str, name: str) -> Path:
-        """Returns the path of a file of a calibration that succeeded. Raises NotFound and Conflict."""
+        """Returns the path of a file in the result folder of a calibration. Raises NotFound, and Conflict if the
+        calibration has not succeeded."""
         state = self.get(identity).state
         if state != "succeeded":
             raise Conflict("no-result", compose("calibration-without-result", state=state))
         return self._store.folder("calibrations", identity) / "result" / name
 
     def file(self, identity: str, name: str) -> StoredFile:
-        """Returns a file of a calibration that succeeded, with its SHA-256. Raises NotFound and Conflict."""
+        """Returns a file in the result folder of a calibration, with its SHA-256. Raises NotFound, and Conflict if the
+        calibration has not succeeded."""
         path = self.result(identity, name)
         return StoredFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
     def remove(self, identity: str) -> None:
+        """Removes a calibration, its pictures and its result. A rig that uses it keeps its own copy of cameras.json.
+        Raises NotFound, and Conflict while its job is queued or runs."""
         if self.get(identity).state not in FINISHED:
             raise Conflict("calibration-active", compose("calibration-active"))
         self._store.remove(self._store.folder("calibrations", identity))
@@ -143,18 +152,21 @@ class Calibrations:
         self._client.delete_workflow(identity)
 
     def check_usable(self, identity: str) -> None:
-        """Raises Conflict for a calibration whose verdict is poor, naming what it lacks."""
+        """Raises Conflict for a calibration whose verdict is poor, naming what it lacks; NotFound for an unknown
+        one."""
         found = self.get(identity)
         if found.verdict == "poor":
             detail = compose("calibration-poor")
             raise Conflict("calibration-poor", detail, found.missing)
 
     def in_use(self) -> str | None:
-        """Returns the SHA-256 of the cameras.json of the calibration in use, if any."""
+        """Returns the SHA-256 of the cameras.json of the calibration in use; None if none was put to use."""
         path = self._store.data / "rig" / "in_use"
         return path.read_text() if path.is_file() else None
 
     def mark_in_use(self, identity: str) -> None:
+        """Notes, in one atomic write, that the rig uses this calibration. Raises NotFound, and Conflict if the
+        calibration has not succeeded."""
         digest = hashlib.sha256(self.cameras_json(identity).read_bytes()).hexdigest()
         write_atomically(self._store.data / "rig" / "in_use", digest.encode())
 
@@ -173,8 +185,8 @@ class Calibrations:
 
 
 def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
-    """Links the pictures of the named captures into ``folder``, each capture as one shot. Raises NotFound and
-    InputError."""
+    """Links the images of the captures to ``folder/images/<camera>/`` (hard links), each capture as one shot. Raises
+    NotFound for an unknown capture, and InputError if none of them has images."""
     for number, identity in enumerate(captures):
         record = store.capture(identity)
         files = store.folder("captures", identity) / "files"

@@ -1,4 +1,5 @@
-"""Captures: taken with the rig or made of an archive, found, given feature points, changed, removed."""
+"""Manages captures: shoots them with the rig or makes them from archives, searches, changes and removes them, and
+stores their feature points."""
 
 import hashlib
 import json
@@ -22,7 +23,8 @@ from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings
 from server.services.jobs import Jobs
 from server.services.records import Found
-from server.services.rigs import SHOT_BYTES, RigBackend, SimulatedRig
+from server.services.rigs.backend import SHOT_BYTES, RigBackend
+from server.services.rigs.simulated import SimulatedRig
 from server.services.tags import checked_tags, typed_tags
 from server.services.texts import check_texts
 from server.services.work import refuse_board
@@ -39,8 +41,8 @@ POINTS = TypeAdapter(Points)
 
 @dataclass(frozen=True, slots=True)
 class CaptureMetadata:
-    """Holds what people say of a capture: label, tags and the like. Raises InputError for texts
-    that cannot be stored."""
+    """Holds what people write about a capture: its session, label, the subject's expression, and tags. Raises
+    InputError for texts that are too long or hold control characters."""
 
     session: str | None = None
     label: str = ""
@@ -52,13 +54,14 @@ class CaptureMetadata:
 
     @classmethod
     def of(cls, fields: Mapping[str, str | None]) -> "CaptureMetadata":
-        """Reads the metadata from the fields of a form, in which tags are separated by commas. Raises InputError."""
+        """Reads the metadata from the fields of a form, in which tags are separated by commas. Raises InputError for
+        invalid texts and tags."""
         tags = typed_tags(fields.get("tags") or "")
         return cls(fields.get("session") or None, fields.get("label") or "", fields.get("expression") or "", tags)
 
 
 class Captures:
-    """Manages the captures of a service. Methods block."""
+    """Manages the captures of a service. Methods block, so call them from a thread."""
 
     def __init__(
         self,
@@ -73,8 +76,12 @@ class Captures:
         self._settings, self._library = settings, library
 
     def take(self, about: CaptureMetadata, *, seed: int | None = None, board: bool = False) -> CaptureRecord:
-        """Takes a shot with the rig and stores it as a capture. ``board``: it shows the calibration board. Raises
-        Unavailable and DiskFull."""
+        """Takes a shot with the rig, checks its pictures in a child process and stores it as a capture.
+
+        ``board``: the shot shows the calibration board; it needs no consent and gets no verdict. ``seed`` chooses the
+        subject of the simulated studio. Raises DiskFull, Unavailable naming what the shot lacks, InputError for a seed
+        of a real rig, NotFound for an unknown session, and Conflict if consent is missing.
+        """
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         if not board:
             self._check_consent(about.session)
@@ -88,7 +95,7 @@ class Captures:
             return self._add(capture, "rig", content, about, shot)
 
     def sample(self) -> CaptureRecord:
-        """Takes a shot of the simulated studio, even if the rig is a real one. It shows no real person, so that no
+        """Takes a shot of the simulated studio, even if the service has a real rig. It shows no real person, so no
         consent is needed. Raises Unavailable and DiskFull."""
         self._store.reserve(SHOT_BYTES, self._settings.free_bytes)
         studio = SimulatedRig(self._store.data / "rig" / "none")
@@ -112,8 +119,11 @@ class Captures:
             studio.close()
 
     def accept(self, archive: Path, folder: Path, about: CaptureMetadata) -> CaptureRecord:
-        """Makes a capture from a received archive. ``folder`` is the incoming folder. Raises InputError naming every
-        fault, and Conflict where consent is missing."""
+        """Makes a capture from a received archive, which is unpacked and checked in a child process.
+
+        ``folder`` is a folder of ``Store.incoming``; it must be on the file system of the data folder. Raises
+        InputError naming every fault, DiskFull, NotFound for an unknown session, and Conflict if consent is missing.
+        """
         self._check_consent(about.session)
         limits = self.archive_limits(archive)
         (folder / "capture").mkdir()
@@ -127,13 +137,15 @@ class Captures:
         return self._add(folder / "capture", "upload", content, about)
 
     def archive_limits(self, archive: Path) -> ArchiveLimits:
-        """Returns how large the content of an archive may be. Raises DiskFull where there is no room for it."""
+        """Returns how many files an archive may hold and how large they may be when unpacked. Raises DiskFull if the
+        disk has no room for the archive."""
         self._store.reserve(archive.stat().st_size, self._settings.free_bytes)
         s = self._settings
         return ArchiveLimits(members=s.archive_members, total_bytes=s.archive_bytes, ratio=s.archive_ratio)
 
     def page(self, query: CaptureQuery, limit: int = 100, cursor: str | None = None) -> Found[CaptureRecord]:
-        """Returns one page of the captures that match a query. Raises InputError for a cursor of another list."""
+        """Returns one page of the captures that match a query, ``limit`` at most. ``cursor`` is that of the page
+        before. Raises InputError for a cursor of another list."""
         page = self._library.captures(query, limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
@@ -146,13 +158,15 @@ class Captures:
         return found
 
     def newest(self) -> CaptureRecord | None:
+        """Returns the newest capture; None if there is none."""
         return next(iter(self.page(CaptureQuery(), limit=1).items), None)
 
     def edit(
         self, identity: str, changes: Mapping[str, str | None], *, tags: Sequence[str] | None = None
     ) -> CaptureRecord:
-        """Changes label, expression, session or ``tags`` of a capture; fields that are left out stay. Raises NotFound,
-        and InputError for invalid texts and tags."""
+        """Changes the label, expression, session or tags of a capture. Fields that ``changes`` does not name stay, and
+        so do the tags if ``tags`` is None. Raises NotFound for an unknown capture or session, and InputError for
+        invalid texts and tags."""
         check_texts({name: changes.get(name) for name in ("label", "expression")})
         checked = None if tags is None else checked_tags(tags)
         if changes.get("session") is not None:
@@ -170,11 +184,13 @@ class Captures:
         return self._store.change_capture(identity, change)
 
     def tag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
-        """Adds ``tags`` to a capture. Raises NotFound, and InputError where the capture would have too many."""
+        """Adds tags to a capture. Raises NotFound, and InputError for invalid tags and if the capture would have too
+        many."""
         return self._store.change_capture(identity, lambda r: replace(r, tags=checked_tags([*r.tags, *tags])))
 
     def untag(self, identity: str, tags: Sequence[str]) -> CaptureRecord:
-        """Removes ``tags`` from a capture, whatever their case. Raises NotFound and InputError."""
+        """Removes tags from a capture; upper and lower case count as the same. Raises NotFound, and InputError for
+        invalid tags."""
         gone = {tag.casefold() for tag in checked_tags(tags)}
 
         def change(record: CaptureRecord) -> CaptureRecord:
@@ -183,12 +199,12 @@ class Captures:
         return self._store.change_capture(identity, change)
 
     def tags(self, limit: int = 200) -> list[str]:
-        """Returns the tags of all captures, the most frequent first."""
+        """Returns the tags of all captures, the most frequent first, ``limit`` at most."""
         return self._library.tags(limit)
 
     def image(self, identity: str, kind: str, camera: str) -> StoredFile:
-        """Returns a camera's file of a kind ("images", "background") with its path from the capture's record, never
-        from the text of a request. Raises NotFound."""
+        """Returns a camera's picture of one kind ("images", "background"). The path comes from the capture's record,
+        never from the request. Raises NotFound."""
         record = self._store.capture(identity)
         for name, digest in record.inputs.items():
             path = Path(name)
@@ -198,8 +214,8 @@ class Captures:
         raise NotFound(compose("thing-camera-file"), camera, compose("hint-capture-inputs"))
 
     def features(self, identity: str) -> Points:
-        """Returns the stored feature points (px), by point and camera. Raises NotFound, also where their file is
-        missing or damaged."""
+        """Returns the stored feature points of a capture, in pixels, by point and camera. It is empty if none were
+        stored. Raises NotFound for an unknown capture and if the points' file is missing or damaged."""
         if not self._store.capture(identity).features:
             return {}
         path = self._store.folder("captures", identity) / "files" / "features.json"
@@ -209,8 +225,9 @@ class Captures:
             raise NotFound(compose("thing-feature-points"), identity, compose("hint-put-again")) from error
 
     def put_features(self, identity: str, points: Points) -> CaptureRecord:
-        """Stores feature points (px by point and camera). Raises NotFound, and InputError naming every point that does
-        not fit the capture."""
+        """Checks feature points (pixels, by point and camera) against the capture's cameras and stores them in place of
+        earlier ones. Raises NotFound, Conflict for a capture of the calibration board, and InputError naming every
+        point that does not fit."""
         refuse_board(self._store.capture(identity))
         folder = self._store.folder("captures", identity) / "files"
         try:
@@ -228,7 +245,8 @@ class Captures:
         return self._store.change_capture(identity, change)
 
     def check_unused(self, identity: str) -> CaptureRecord:
-        """Returns the record of a capture if no job needs the capture. Raises Conflict otherwise."""
+        """Returns the record of a capture that no queued or running job needs. Raises NotFound, and Conflict naming the
+        jobs that need it."""
         record = self._store.capture(identity)
         if active := self._jobs.active(capture=identity):
             detail = compose("capture-in-use")
@@ -236,17 +254,21 @@ class Captures:
         return record
 
     def remove(self, identity: str) -> None:
-        """Removes a capture with its images. Its jobs and their results stay. Raises Conflict while a job needs it."""
+        """Removes a capture with its pictures and caches. Its jobs and their results stay. Raises NotFound, and
+        Conflict while a queued or running job needs it."""
         self.check_unused(identity)
         self._store.remove_capture(identity)
 
     def holdings(self, identity: str) -> Holdings:
-        """Returns what would be removed with a capture and what would stay. Raises NotFound."""
+        """Returns what removing a capture would take away and what would stay. Raises NotFound."""
         return holdings(self._store, self._jobs, identity)
 
     def erase(self, identity: str) -> None:
-        """Cancels the jobs of a capture, then removes all traces of it: images, heads, caches and rows of the job
-        database. Raises NotFound, and Unavailable while a worker still writes."""
+        """Cancels the jobs of a capture, then removes every trace of it: pictures, heads, caches and rows of the job
+        database.
+
+        An interrupted call can be repeated. Raises NotFound, and Unavailable while a worker still writes.
+        """
         self._store.capture(identity)
         erase_captures(self._store, self._jobs, [identity])
         self._library.scrub()
@@ -302,15 +324,15 @@ class Captures:
 
 
 def shot_faults(shot: Mapping[str, object] | None) -> tuple[Fault, ...]:
-    """Returns the faults in the certificate of a real rig's shot. Pictures of the simulated studio are judged as
-    uploads are."""
+    """Returns the faults in the certificate of a real rig's shot. It returns none for the simulated studio, whose
+    pictures are judged like those of an upload."""
     if shot is None or "checks" not in shot:
         return ()
     return tuple(read_fault(document) for document in cast(ShotDocument, shot)["faults"])
 
 
 def all_checks(shot: Mapping[str, object] | None, content: CaptureContent) -> dict[str, ViewDocument]:
-    """Returns the measurements of each camera's picture, those of the shot and those of the check
-    of its files together."""
+    """Merges what was measured of each camera's picture at the shot (``shot``) and when the files were checked
+    (``content``). The latter counts where both measured the same."""
     taken = cast(Mapping[str, ViewDocument], {} if shot is None else shot.get("checks", {}))
     return {name: {**taken.get(name, {}), **view} for name, view in content.checks.items()}

@@ -1,4 +1,5 @@
-"""Documents of the service as its clients get them: the command line's, and the pages' components."""
+"""Declares the JSON documents in which the command line and the components of the pages receive captures, jobs and
+failures."""
 
 from typing import TypedDict
 
@@ -8,12 +9,17 @@ from server.services.records import Failure
 
 
 class SizeDocument(TypedDict):
+    """Holds the name of a camera and the size of its pictures in pixels."""
+
     name: str
     width: int
     height: int
 
 
 class CaptureDocument(TypedDict):
+    """Holds a capture as the HTTP interface answers it; the fields are those of ``CaptureRecord``. ``inputs`` has the
+    SHA-256 of every file by name."""
+
     id: str
     created: str
     source: str
@@ -32,6 +38,9 @@ class CaptureDocument(TypedDict):
 
 
 class ErrorDocument(TypedDict):
+    """Holds why a job failed: the problem's ``type`` (a URN), English texts, and the same texts as messages (code and
+    parameters) for translation."""
+
     type: str
     detail: str
     errors: list[str]
@@ -40,12 +49,15 @@ class ErrorDocument(TypedDict):
 
 
 class FileDocument(TypedDict):
+    """Holds size and SHA-256 of a file of a result."""
+
     bytes: int
     sha256: str
 
 
 class JobLine(TypedDict):
-    """Holds a job without its files, as a list shows it."""
+    """Holds a job as a list shows it, without the files of its result. ``progress`` runs from 0 to 1, ``eta_s`` is the
+    estimated remaining time in seconds; ``notice`` says why a queued job cannot begin, or that its result is gone."""
 
     id: str
     state: str
@@ -69,13 +81,13 @@ class JobLine(TypedDict):
 
 
 class JobDocument(JobLine):
-    """A job with the files of its result, by name."""
+    """Holds a job with the files of its result, by name."""
 
     files: dict[str, FileDocument]
 
 
 def failure_document(failure: Failure) -> ErrorDocument:
-    """Returns a failure as clients get it."""
+    """Returns the JSON document of a job's failure."""
     return {
         "type": failure.type,
         "detail": failure.detail.text,

@@ -1,4 +1,5 @@
-"""Erasing for good: pictures, heads, caches, and what the job database holds of them; and what a removal would take."""
+"""Erases captures for good: pictures, heads, caches and rows of the job database; and tells beforehand what a removal
+would take."""
 
 import time
 from collections.abc import Collection
@@ -6,7 +7,8 @@ from dataclasses import dataclass
 
 from rig.messages.message import compose
 from server.errors import Unavailable
-from server.services.jobs import FINISHED, Jobs
+from server.services.job_rows import FINISHED
+from server.services.jobs import Jobs
 from server.storage.store import Store, folder_bytes
 
 CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
@@ -16,8 +18,9 @@ CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 class Holdings:
     """Holds what is stored of a capture.
 
-    A removal takes the pictures (``bytes``: size of their files and caches). ``heads``, the results whose overlays show
-    photographs, and the other ``jobs`` stay until the capture is erased.
+    ``pictures``: number of its cameras; ``bytes``: size of its pictures and caches, which a removal deletes. ``heads``
+    are the ids of jobs that made a head, with the size of their files; they show the face and stay until the capture is
+    erased. ``jobs`` are its other jobs, ``active`` the queued and running ones among them.
     """
 
     pictures: int
@@ -29,7 +32,7 @@ class Holdings:
 
 
 def holdings(store: Store, jobs: Jobs, capture: str) -> Holdings:
-    """Returns what is stored of a capture. Raises NotFound."""
+    """Counts what is stored of a capture. Raises NotFound."""
     record = store.capture(capture)
     of_capture = jobs.find(capture=capture, limit=100_000)
     heads = tuple(job.id for job in of_capture if job.state == "succeeded")
@@ -44,8 +47,12 @@ def holdings(store: Store, jobs: Jobs, capture: str) -> Holdings:
 
 
 def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: Collection[str] = ()) -> None:
-    """Cancels the jobs of the captures and ``others``, then removes results, images, caches and rows of the job
-    database. If it was interrupted, a second call completes it. Raises Unavailable while a worker still writes."""
+    """Cancels the jobs of the captures, and the jobs ``others``, then removes their results, pictures, caches and rows
+    of the job database.
+
+    A call that was interrupted is completed by a second one. Raises Unavailable if a worker still writes ``CANCEL_S``
+    seconds after its job was cancelled.
+    """
     of_captures = {job.id for capture in captures for job in jobs.find(capture=capture, limit=100_000)} | {*others}
     active = [job for job in of_captures if jobs.state(job) not in FINISHED]
     for job in of_captures:

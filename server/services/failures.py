@@ -1,4 +1,4 @@
-"""How a job failed: what the job engine keeps of it, and what clients get."""
+"""Describes how a job failed: the exception that the job engine stores, and the failure that clients get."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -17,7 +17,8 @@ log = structlog.get_logger()
 
 
 class JobFailed(EigenheadError):
-    """Reports a job that cannot succeed. The job engine stores it as the error of the workflow."""
+    """Reports a job that cannot succeed, however often it is repeated. The job engine pickles it as the workflow's
+    error; the pickle holds plain values only, so that later versions can read it."""
 
     def __init__(self, kind: str, detail: Message | Kept, errors: Iterable[Message | Kept] = ()) -> None:
         super().__init__(_read(detail))
@@ -40,7 +41,8 @@ def _read(kept: Message | Kept) -> Message:
 
 
 def failure(row: WorkflowStatus) -> Failure:
-    """Returns why the job of a workflow's row failed."""
+    """Returns why the job of a workflow's row failed. An error that is no JobFailed is logged and becomes
+    "internal-error"; a job that took too many workers down becomes "worker-died"."""
     error = row.error
     if isinstance(error, JobFailed):
         return Failure(URN + error.kind, error.detail, error.errors)

@@ -1,4 +1,4 @@
-"""Whether the service, or this machine, can do its work, and what to do where it cannot."""
+"""Checks whether the service can do its work, and says what to do where it cannot."""
 
 import os
 import time
@@ -22,7 +22,8 @@ from server.tasks.egl import try_egl
 
 
 def readiness(service: Service) -> dict[str, Check]:
-    """Checks EGL, disk, database, workers and rig, and returns one finding for each."""
+    """Checks database, disk, workers, queues, OpenGL (EGL), rig, records and results. Returns one finding for each, by
+    name. Tolerates a database that does not answer."""
     return {
         "database": _database(service),
         "disk": _disk(service),
@@ -78,7 +79,8 @@ def _queues(service: Service) -> Check:
 
 
 def check_egl(service: Service) -> None:
-    """Tries to make an OpenGL context, once a process, since that takes a second or more; blocks meanwhile."""
+    """Makes an OpenGL context in a child process and keeps the finding for ``readiness``. This takes a second or more,
+    during which the call blocks; a process does it once."""
     try:
         with service.children.one() as child:
             service.known["egl"] = Check(ok=True, detail=verbatim(child.remote(try_egl)()))
@@ -104,7 +106,7 @@ def _records(service: Service) -> Check:
 
 
 def exposition(service: Service) -> bytes:
-    """Returns the current metrics in the text format of Prometheus."""
+    """Returns the current metrics in Prometheus' text format."""
     captures, damaged = len(service.store.ids("captures")), len(service.store.list_quarantined())
     queued, slots = service.jobs.index.queued(), slots_by_queue(service.engine, service.settings.silent_s)
     queues = {
@@ -125,8 +127,8 @@ def exposition(service: Service) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Info:
-    """Holds what a client may want to know before it sends anything: limits, the length of the
-    queue, default settings."""
+    """Holds what a client may want to know before it sends anything: the version, processor cores, queued and running
+    jobs, limits, and the default settings of the pipeline. Names that end in ``_most`` are upper limits."""
 
     version: str
     cores: int
@@ -141,6 +143,7 @@ class Info:
 
 
 def about(service: Service) -> Info:
+    """Returns the service's version, its load, its limits and the default settings of a job."""
     jobs, limits = service.jobs.counts(), service.settings
     return Info(
         version("eigenhead"),

@@ -1,19 +1,18 @@
-"""Jobs as everybody but the worker sees them: submit, look, cancel, restart, delete.
+"""Jobs as everybody but the worker uses them: submit, query, cancel, restart, delete.
 
-The job engine's workflow row is the one truth about a job: its id is the workflow's id, its request the workflow's
-input, its state the workflow's status. Progress comes from the event log, files from the store.
+The job engine's row of a workflow is the only record of a job: the workflow's id is the job's, its input the request,
+its status the state. Progress comes from the event log, files from the data folder.
 """
 
 import json
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import sqlalchemy as sa
 import structlog
-from dbos import DBOS, DBOSClient, EnqueueOptions, WorkflowStatus
+from dbos import DBOS, DBOSClient, WorkflowStatus
 
 from rig.errors import InputError
 from rig.messages.message import Message, compose
@@ -22,7 +21,18 @@ from server.log import log_file
 from server.origins import target
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.failures import failure
-from server.services.records import Found, Job, moment_of
+from server.services.job_rows import (
+    APPLICATION,
+    FINISHED,
+    STATES,
+    STATUSES,
+    WORKFLOW,
+    by_state,
+    enqueue_options,
+    moment,
+    request_of,
+)
+from server.services.records import Found, Job
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
@@ -33,33 +43,18 @@ from server.storage.library import Library
 from server.storage.records import CaptureRecord, EventDocument, FileEntry, JobRequest, JobWebhook
 from server.storage.store import Store, StoredFile, is_id, new_id, repeatable_id
 
-APPLICATION = "eigenhead"
-APPLICATION_VERSION = "eigenhead-jobs-1"  # pinned: a job outlives an upgrade; changes only with the steps themselves
-WORKFLOW = "reconstruct"
-DELIVERY = "deliver"
-STATES = {
-    "DELAYED": "queued",
-    "ENQUEUED": "queued",
-    "PENDING": "running",
-    "SUCCESS": "succeeded",
-    "ERROR": "failed",
-    "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "failed",
-    "CANCELLED": "cancelled",
-}
-STATUSES = {state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())}
 WORKER_START_S = 60.0  # a worker loads for 5 s on idle cores, for 40 s where all cores are busy
-FINISHED = ("succeeded", "failed", "cancelled")
 
 log = structlog.get_logger()
 
 
 def migrate(settings: ServiceSettings) -> None:
-    """Creates the tables of the job engine, which the engine's client does not."""
+    """Creates the job engine's own tables in the service's database, which the engine's client does not do."""
     DBOS.migrate(system_database_url=settings.url)
 
 
 class Jobs:
-    """Manages the jobs of one service. Every method blocks on the database: call it from a thread."""
+    """Manages the jobs of one service. Every method blocks on the database, so call them from a thread."""
 
     def __init__(self, settings: ServiceSettings, store: Store, engine: sa.Engine, library: Library) -> None:
         self._settings, self._store, self._engine, self._library = settings, store, engine, library
@@ -71,6 +66,7 @@ class Jobs:
         self._began = time.monotonic()
 
     def close(self) -> None:
+        """Closes the job engine's connections to the database."""
         self.client.destroy()
 
     def submit(
@@ -83,11 +79,12 @@ class Jobs:
         queue: str | None = None,
         priority: int = 100,
     ) -> Job:
-        """Queues a reconstruction of a capture and returns the job. With a known idempotency key it returns the job of
-        the first request.
+        """Queues a reconstruction of a capture and returns the job. A repeated request with the same idempotency key
+        returns the job of the first one.
 
-        Raises InputError for work that cannot be done, InvalidInput for a webhook that may not be called, NotFound,
-        DiskFull, TooMany, and Conflict where the key was used for another request.
+        Raises NotFound for an unknown capture; InputError for an unknown model, wrong settings or queue; InvalidInput
+        for a webhook that may not be called; Conflict for a capture of the calibration board and for an idempotency key
+        that was used for another request; DiskFull; TooMany if the API key has too many jobs.
         """
         wanted.check()
         capture = self._store.capture(capture_id)
@@ -107,12 +104,13 @@ class Jobs:
         return self._enqueue(request, capture.session, key, queue, priority, idempotency_key)
 
     def check_queue(self, queue: str | None) -> None:
-        """Raises InputError for a queue that jobs may not name; None stands for the service's own."""
+        """Raises InputError for a queue that jobs may not name. None stands for the service's own queue."""
         if queue is not None and queue not in self._settings.queues:
             raise InputError("queue", [compose("queue-unknown", queue=f"{queue!r:.40}", queues=self._settings.queues)])
 
     def submit_session(self, session: str, wanted: ReconstructionRequest, *, key: str, priority: int) -> list[Job]:
-        """Queues a reconstruction of every capture of a session. Raises what ``submit`` raises."""
+        """Queues a reconstruction of every capture of a session that shows a head, and returns the jobs. Raises what
+        ``submit`` raises; jobs queued before the error stay queued."""
         wanted.check()  # a session without captures asks no job to
         self._store.session(session)
         return [self.submit(capture, wanted, key=key, priority=priority) for capture in self._library.heads_of(session)]
@@ -132,10 +130,10 @@ class Jobs:
             self._check_count(key)
             self.index.add(job_id, request, session)
             attributes = {"capture": request["capture_id"], "session": session, "key": key}
-            self.client.enqueue(_options(job_id, queue or self._settings.queue, priority, attributes), request)
+            self.client.enqueue(enqueue_options(job_id, queue or self._settings.queue, priority, attributes), request)
             first = self._status(job_id)
             assert first is not None
-        if not self._asks_the_same(_request(first), request):
+        if not self._asks_the_same(request_of(first), request):
             detail = compose("idempotency-key-reused")
             raise Conflict("idempotency-conflict", detail)
         return self._jobs([first])[0]
@@ -143,12 +141,12 @@ class Jobs:
     def enqueue_within(
         self, connection: sa.Connection, request: JobRequest, session: str | None, batch: BatchRow
     ) -> str:
-        """Queues a job of a batch in the caller's transaction and returns its id. It does not count among the jobs of
-        the batch's API key."""
+        """Queues a job of a batch in the caller's transaction and returns its id. If the transaction fails, there is no
+        job. It does not count towards the limit of jobs of an API key."""
         job_id = new_id()
         self.index.add_within(connection, job_id, request, session)
         attributes = {"capture": request["capture_id"], "session": session, "batch": batch.id}
-        options = _options(job_id, batch.queue, batch.priority, attributes)
+        options = enqueue_options(job_id, batch.queue, batch.priority, attributes)
         self.client.enqueue_in_transaction(connection, options, request)
         return job_id
 
@@ -166,9 +164,10 @@ class Jobs:
 
     def webhook(self, job_id: str) -> JobWebhook | None:
         """Returns the webhook that a job was submitted with, if any. Raises NotFound."""
-        return (_request(self._known(job_id)) or {}).get("webhook")
+        return (request_of(self._known(job_id)) or {}).get("webhook")
 
     def state(self, job_id: str) -> str:
+        """Returns the state of a job: "queued", "running", "succeeded", "failed" or "cancelled". Raises NotFound."""
         return STATES[self._known(job_id, load=False).status]
 
     def find(
@@ -180,7 +179,8 @@ class Jobs:
         limit: int = 100,
         offset: int = 0,
     ) -> list[Job]:
-        """Returns jobs, newest first, of one state, capture or session where these are given."""
+        """Returns jobs, newest first, ``limit`` at most after skipping ``offset``. They can be restricted to one state,
+        capture or session."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
             return []
@@ -191,9 +191,9 @@ class Jobs:
         return self._jobs(rows)
 
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:
-        """Returns one page of the jobs that match a query; a word that names a state selects jobs in that state. Raises
-        InputError for a cursor of another list."""
-        page = self.index.page(_by_state(query), limit, cursor)
+        """Returns one page of the jobs that match a query, ``limit`` at most. A word of the search that names a state
+        ("failed") selects jobs in that state. Raises InputError for a cursor of another list."""
+        page = self.index.page(by_state(query), limit, cursor)
         return Found(tuple(self.of(page.ids)), page.next, page.total)
 
     def of(self, ids: Sequence[str]) -> list[Job]:
@@ -216,7 +216,7 @@ class Jobs:
         return {capture: [(job.id, STATES[job.status]) for job in jobs] for capture, jobs in found.items()}
 
     def active(self, *, capture: str | None = None, session: str | None = None, key: str | None = None) -> list[str]:
-        """Lists the ids of queued and running jobs, of one capture, session or API key where these are given."""
+        """Lists the ids of queued and running jobs. They can be restricted to one capture, session or API key."""
         wanted = {k: v for k, v in {"capture": capture, "session": session, "key": key}.items() if v is not None}
         rows = self.client.list_workflows(
             name=WORKFLOW, status=STATUSES["queued"] + STATUSES["running"], load_input=False, load_output=False
@@ -225,7 +225,7 @@ class Jobs:
 
     def cancel(self, job_id: str) -> tuple[Job, bool]:
         """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether this call
-        cancelled it. Raises NotFound."""
+        cancelled it. A worker notices within about a second. Raises NotFound."""
         before = self.state(job_id)
         if before not in FINISHED:
             self.client.cancel_workflow(job_id)
@@ -234,8 +234,8 @@ class Jobs:
         return job, before not in FINISHED and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
-        """Returns size and SHA-256 of the files of a job's result, by name. Raises NotFound, and Conflict for a job
-        without result."""
+        """Returns size and SHA-256 of the files of a job's result, by name. Raises NotFound, and Conflict if the job
+        has not succeeded or its files are gone."""
         job = self.get(job_id)
         if job.state != "succeeded":
             raise Conflict("no-result", compose("job-without-result", state=job.state))
@@ -244,7 +244,8 @@ class Jobs:
         return job.files
 
     def log(self, job_id: str) -> str:
-        """Returns the log that the workers wrote for a job. Raises NotFound."""
+        """Returns the log that workers wrote of a job. Raises NotFound for an unknown job and for one that has not
+        begun."""
         self.state(job_id)
         try:
             return log_file(self._store.data / "jobs", job_id).read_text(encoding="utf-8", errors="replace")
@@ -261,18 +262,20 @@ class Jobs:
         return self._store.folder("jobs", job_id) / "result"
 
     def result_file(self, job_id: str, name: str) -> StoredFile:
-        """Returns a file of a job's result, looked up in the job's record. Raises NotFound and Conflict."""
+        """Returns a file of a job's result. The name is looked up in the job's record. Raises NotFound for an unknown
+        job or file, and Conflict if the job has no result."""
         file = self.files(job_id).get(name)
         if file is None:
             raise NotFound(compose("thing-file"), name, compose("hint-result-files", job=job_id))
         return StoredFile(self._result(job_id) / name, file["sha256"])
 
     def restart(self, job_id: str, wanted: ReconstructionRequest, *, key: str = "local") -> Job:
-        """Submits a new job for the capture of an earlier job, which it names. Where ``wanted`` has None, the earlier
-        job's value is used. Raises InputError, NotFound and TooMany."""
+        """Queues a new job for the capture of an earlier job, and notes the earlier job's id in it. Model and settings
+        that are None in ``wanted`` are the earlier job's. Raises InputError for wrong ones, NotFound if the job or its
+        capture is gone, and TooMany."""
         wanted.check()
         row = self._known(job_id)
-        request = _request(row)
+        request = request_of(row)
         if request is None:
             raise NotFound(compose("thing-job-request"), job_id)
         request = cast(JobRequest, {**request, "restart_of": job_id})
@@ -284,7 +287,8 @@ class Jobs:
         return self._enqueue(request, (row.attributes or {}).get("session"), key, row.queue_name, row.priority or 0)
 
     def delete(self, job_id: str) -> None:
-        """Removes a finished job and its files. The files go first, which needs no room in the database."""
+        """Removes a finished job and its files. The files go first: that needs no room in the database, and the call
+        can be repeated. Raises NotFound, and Conflict for a queued or running job."""
         if self.state(job_id) not in FINISHED:
             raise Conflict("job-active", compose("job-active"))
         self._store.remove(self._store.folder("jobs", job_id))
@@ -294,7 +298,7 @@ class Jobs:
 
     def _requests(self, jobs: list[str]) -> dict[str, JobRequest]:
         rows = self.client.list_workflows(workflow_ids=jobs, name=WORKFLOW, load_output=False)
-        return {row.workflow_id: request for row in rows if (request := _request(row)) is not None}
+        return {row.workflow_id: request for row in rows if (request := request_of(row)) is not None}
 
     def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
         latest = self.events.latest([row.workflow_id for row in rows])
@@ -314,7 +318,8 @@ class Jobs:
         return self.queue_notice(queue) if state == "queued" else None
 
     def queue_notice(self, queue: str | None) -> Message | None:
-        """Returns what keeps the jobs of a queue from beginning: that no worker serves it. Else None."""
+        """Returns a message if no live worker serves a queue, so that its jobs cannot begin. Returns None if one
+        does."""
         with self._engine.connect() as connection:
             alive = alive_workers(connection, self._settings.silent_s)
             if connection.scalar(sa.select(sa.func.count()).where(alive, workers.c.queue == queue)):
@@ -324,7 +329,8 @@ class Jobs:
         return compose("no-worker", queue=f"{queue!r}", queue_name=str(queue))
 
     def worker_may_start(self) -> bool:
-        """Tells whether the service started so recently that its worker may still be loading."""
+        """Returns whether the service started less than ``WORKER_START_S`` seconds ago, so that its worker may still be
+        loading."""
         return time.monotonic() - self._began < WORKER_START_S
 
     def _status(self, job_id: str, load: bool = True) -> WorkflowStatus | None:
@@ -340,7 +346,7 @@ class Jobs:
     def _job(self, row: WorkflowStatus, event: JobEvent | None, places: Mapping[str, int]) -> Job:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
-        request = _request(row)
+        request = request_of(row)
         attributes = row.attributes or {}
         return Job(
             id=row.workflow_id,
@@ -359,39 +365,8 @@ class Jobs:
             queue=row.queue_name,
             priority=row.priority or 0,
             queue_position=places.get(row.workflow_id) if state == "queued" else None,
-            created=_moment(row.created_at),
-            started=_moment(row.dequeued_at),
-            finished=_moment(row.completed_at) if state in FINISHED else None,
+            created=moment(row.created_at),
+            started=moment(row.dequeued_at),
+            finished=moment(row.completed_at) if state in FINISHED else None,
             files=dict(row.output or {}) if state == "succeeded" else {},
         )
-
-
-def _options(job_id: str, queue: str, priority: int, attributes: dict[str, str | None]) -> EnqueueOptions:
-    return {
-        "workflow_name": WORKFLOW,
-        "queue_name": queue,
-        "workflow_id": job_id,
-        "app_version": APPLICATION_VERSION,
-        "priority": priority,
-        "attributes": attributes,
-    }
-
-
-def _by_state(query: JobQuery) -> JobQuery:
-    words = query.sought.split()
-    states = [word.casefold() for word in words if word.casefold() in STATUSES]
-    if not states:
-        return query
-    statuses = [status for state in states for status in STATUSES[state]]
-    both = statuses if query.statuses is None else [status for status in statuses if status in query.statuses]
-    rest = " ".join(word for word in words if word.casefold() not in STATUSES)
-    return replace(query, sought=rest, statuses=both)
-
-
-def _request(row: WorkflowStatus) -> JobRequest | None:
-    """A copy of what the job was asked for; None where its input cannot be read."""
-    return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
-
-
-def _moment(milliseconds: int | None) -> str | None:
-    return None if milliseconds is None else moment_of(milliseconds)

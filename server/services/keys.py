@@ -1,7 +1,8 @@
-"""API keys with scopes: who may do what.
+"""API keys and their scopes, which say what a caller may do.
 
-A key is ``eh_<id>_<secret>``; the database holds the SHA-256 of the secret, which is 256 random bits, so that a slow
-hash would add nothing. Without keys the service answers only to its own machine and refuses to listen elsewhere.
+A key is ``eh_<id>_<secret>``. The database holds the SHA-256 of the secret alone. The secret has 256 random bits, so a
+slow hash would not make it harder to guess. Without any key the service answers its own machine only and refuses to
+listen to others.
 """
 
 import hashlib
@@ -36,18 +37,19 @@ class KeylessAddress(EigenheadError):
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Holds who sends a request. ``key`` is the id of the API key, or "local"."""
+    """Holds who sends a request: the id of the API key ("local" where the service has no keys), and its scopes."""
 
     key: str
     scopes: frozenset[str]
 
     def may(self, scope: str) -> bool:
+        """Returns whether the caller has a scope. The scope "admin" includes all others."""
         return scope in self.scopes or "admin" in self.scopes
 
 
 @dataclass(frozen=True, slots=True)
 class ApiKey:
-    """Holds an API key without its secret. ``created``: seconds since 1970."""
+    """Holds an API key without its secret. ``created`` is in seconds since 1970."""
 
     id: str
     name: str
@@ -56,13 +58,13 @@ class ApiKey:
 
 
 class Keys:
-    """Manages the API keys in the database."""
+    """Makes, lists, checks and removes the API keys in the database. Methods block."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
     def add(self, name: str, scopes: tuple[str, ...]) -> str:
-        """Makes an API key and returns it. The key cannot be shown again."""
+        """Makes an API key and returns its text, which cannot be shown again: only its hash is stored."""
         identity, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
         row = {"id": identity, "name": name, "digest": _digest(secret), "scopes": " ".join(scopes)}
         with self._engine.begin() as connection:
@@ -76,17 +78,19 @@ class Keys:
             return [ApiKey(r.id, r.name, tuple(r.scopes.split()), r.created) for r in rows]
 
     def remove(self, identity: str) -> None:
-        """Removes an API key. Raises NotFound."""
+        """Removes an API key, which is refused from then on. Raises NotFound."""
         with self._engine.begin() as connection:
             if not connection.execute(sa.delete(api_keys).where(api_keys.c.id == identity)).rowcount:
                 raise NotFound(compose("thing-key"), identity)
 
     def any(self) -> bool:
+        """Returns whether there is any API key."""
         with self._engine.connect() as connection:
             return connection.scalar(sa.select(sa.exists(sa.select(api_keys.c.id)))) or False
 
     def caller(self, token: str) -> Caller | None:
-        """Returns the caller whose API key is ``token``. Returns None for an unknown key."""
+        """Returns the caller whose API key is ``token``; None for an unknown or malformed key. Secrets are compared in
+        constant time."""
         parts = token.split("_", 2)
         if len(parts) != 3 or parts[0] != "eh":
             return None
@@ -98,7 +102,7 @@ class Keys:
 
 
 def check_address(settings: ServiceSettings, keys: Keys) -> None:
-    """Raises KeylessAddress if the service is to listen beyond its machine and has no API key."""
+    """Raises KeylessAddress if the settings have the service listen to other machines and there is no API key."""
     if not settings.is_private and not keys.any():
         raise KeylessAddress(settings.public_url or settings.host, settings.data)
 

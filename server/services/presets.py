@@ -1,4 +1,4 @@
-"""Settings of a job by names that people choose from; whoever needs more writes a document of settings."""
+"""Presets: named choices of a job's settings. Whoever needs other settings writes a settings document."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,8 @@ from rig.messages.message import Message, compose
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Holds a named choice of settings. ``settings``: the settings' document that it stands for."""
+    """Holds a preset: its title and explanation for people, and the settings document that it stands for. Raises
+    InputError for wrong settings."""
 
     id: str
     title: Message

@@ -1,4 +1,4 @@
-"""What the services give to routes, pages and the command line."""
+"""Declares the values that the services return to routes, pages and the command line."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,7 +23,8 @@ class Found(Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """States why a job failed: a stable ``type``, what to do, and every fault."""
+    """Holds why a job failed: the problem's ``type`` (a URN that stays the same across versions), what went wrong and
+    what to do, and every fault found."""
 
     type: str
     detail: Message
@@ -32,10 +33,11 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Holds a job at one moment.
+    """Holds the state of a job at one moment.
 
-    ``notice``: why a queued job cannot begin, or that its result is gone; ``queue_position``: how many jobs go before a
-    queued one; ``files``: size and SHA-256 of the result's files, by name.
+    ``progress`` runs from 0 to 1; ``eta_s`` is the estimated remaining time (s). ``notice`` says why a queued job
+    cannot begin, or that the files of its result are gone. ``queue_position`` counts the jobs that go before a queued
+    one. ``files`` has size and SHA-256 of the result's files, by name.
     """
 
     id: str
@@ -62,10 +64,10 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Holds a batch at one moment.
+    """Holds the state of a batch at one moment.
 
-    ``counts``: captures by state, those of ``ITEM_STATES``; ``total``: their sum; ``eta_s``: estimated remaining
-    seconds, None where nothing says them; ``notice``: why its jobs cannot begin.
+    ``counts``: number of captures in each state of ``ITEM_STATES``; ``total``: their sum; ``eta_s``: estimated
+    remaining time (s), None if it cannot be estimated; ``notice``: why its jobs cannot begin.
     """
 
     id: str
@@ -85,7 +87,7 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Holds one session of a subject, with the ids of its captures."""
+    """Holds a session: the ids of captures of one subject, and the note of the subject's consent."""
 
     id: str
     created: str
@@ -96,10 +98,11 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Holds one person: the sessions of one name, newest first, with their captures.
+    """Holds a person: the sessions with the same name, newest first.
 
-    ``id``: that of the newest session; ``head``: the newest job with a result; ``heads``: number of such jobs;
-    ``tags``: those of the captures.
+    ``id``, ``label`` and ``created`` are those of the newest session; ``captures``, ``heads`` and ``running`` count
+    captures, succeeded jobs, and queued or running jobs. ``head`` is the newest succeeded job, ``capture`` a capture to
+    show, ``consent`` whether every session has a note of it.
     """
 
     id: str
@@ -117,10 +120,10 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Holds a calibration and, once it succeeded, its outcome.
+    """Holds a calibration and, once it has succeeded, its outcome.
 
-    ``pictures``: number by camera; ``kind``: what they show, board or scene; ``stage``, ``progress`` (0 to 1) and
-    remaining seconds while it runs; ``missing``: what would make its verdict better.
+    ``pictures``: number of pictures by camera; ``kind``: what they show ("board", "scene"); ``stage``, ``progress`` (0
+    to 1) and ``eta_s`` (s): how far a running one is; ``missing``: what would improve its verdict.
     """
 
     id: str
@@ -145,6 +148,9 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class RigCamera:
+    """Holds a camera of the rig and its state: "closed" before it is first used, "open", "missing", or "ready" in the
+    simulated studio."""
+
     name: str
     driver: str
     state: str
@@ -152,8 +158,8 @@ class RigCamera:
 
 @dataclass(frozen=True, slots=True)
 class RigState:
-    """Holds the state of the rig at one moment. ``calibration``: "own" where the rig has a cameras.json, "studio" for
-    the simulated studio without one, else None."""
+    """Holds the state of the rig at one moment. ``faults`` say what it lacks. ``calibration``: "own" if the rig has a
+    cameras.json, "studio" for the simulated studio without one, None for a real rig without one."""
 
     id: str
     kind: str
@@ -165,8 +171,8 @@ class RigState:
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Holds the settings of a camera (None: the camera's own choice). ``unmet``: one message for each setting that the
-    camera did not take."""
+    """Holds the settings that were requested of a camera (None: the camera decides). ``unmet`` has a message for each
+    setting that the camera did not take."""
 
     exposure_ms: float | None
     gain_db: float | None
@@ -176,7 +182,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class CleanPlates:
-    """Holds of which cameras clean plates were taken, and how many of each."""
+    """Holds of which cameras clean plates were taken, and how many of each. ``note`` is for the operator."""
 
     cameras: tuple[str, ...]
     plates: int
@@ -185,17 +191,19 @@ class CleanPlates:
 
 @dataclass(frozen=True, slots=True)
 class Webhook:
+    """Holds a webhook: the address to which the service announces the end of jobs and batches."""
+
     id: str
     url: str
 
 
 @dataclass(frozen=True, slots=True)
 class NewWebhook(Webhook):
-    """Holds a webhook that was just added. ``secret`` signs the messages."""
+    """Holds a webhook that was just added, with the secret that signs its messages. The secret is not shown again."""
 
     secret: str
 
 
 def moment_of(milliseconds: int) -> str:
-    """Returns a time in ms since 1970 as text."""
+    """Formats a time in milliseconds since 1970 as ISO 8601 in UTC, such as 2026-01-31T12:00:00.000Z."""
     return datetime.fromtimestamp(milliseconds / 1000, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,5 +1,7 @@
-"""What is let go, and when: by age, by count, by space. What a queued or running job needs is never touched, nor is
-anything that the service did not make itself."""
+"""Retention: removes old jobs, captures and caches by age, by count and by free space.
+
+It never touches what a queued or running job needs, nor files that the service did not make itself.
+"""
 
 import time
 from contextlib import suppress
@@ -12,7 +14,7 @@ import structlog
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 from server.errors import NotFound
-from server.services.jobs import DELIVERY, FINISHED, STATUSES
+from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
 from server.storage.job_index import JobQuery
 from server.storage.library import CaptureQuery
@@ -26,8 +28,8 @@ log = structlog.get_logger()
 
 
 def clear_caches(service: Service) -> int:
-    """Removes the caches of all captures that no job needs; they are made anew on demand. Returns how many captures had
-    one."""
+    """Removes the caches of all captures that no queued or running job needs. Caches are made anew on demand. Returns
+    how many captures had one."""
     store, removed = service.store, 0
     for identity in store.ids("cache/captures"):
         if not service.jobs.active(capture=identity):
@@ -37,7 +39,8 @@ def clear_caches(service: Service) -> int:
 
 
 def sweep(service: Service) -> dict[str, int]:
-    """Removes everything whose time has come. Returns how many things of each kind were removed."""
+    """Removes everything that the settings no longer keep, and what crashes left behind. Returns how many things of
+    each kind were removed. Results that are missing are noted for ``readiness``."""
     gone = {"leftovers": service.store.sweep(LEFTOVER_S), "uploads": service.uploads.sweep()}
     gone["jobs"] = _jobs(service)
     gone["captures"] = _captures(service)
@@ -52,8 +55,8 @@ def sweep(service: Service) -> dict[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class Upcoming:
-    """Holds a finished job or a capture that retention removes next. ``goes``: when, None where that depends on free
-    space or on new jobs; ``why``: the setting."""
+    """Holds a finished job or a capture that retention will remove. ``goes``: when, as ISO 8601, None if that depends
+    on free space or on new jobs; ``why``: the setting that removes it."""
 
     kind: str
     id: str
@@ -63,8 +66,8 @@ class Upcoming:
 
 
 def upcoming(service: Service, limit: int = 10) -> list[Upcoming]:
-    """Returns what retention would remove next if nothing new came, jobs first. Captures that a job
-    needs are left out."""
+    """Returns what retention will remove next if nothing is added: at most ``limit`` jobs, then at most ``limit``
+    captures. Captures that a job needs are left out."""
     return [*_jobs_next(service, limit), *_captures_next(service, limit)]
 
 

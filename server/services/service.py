@@ -1,4 +1,4 @@
-"""The parts of one service process, made once and passed to whoever serves: HTTP's routes, the operator's pages."""
+"""Composes the parts of one service process, which HTTP's routes and the operator's pages share."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,8 @@ from server.services.captures import Captures
 from server.services.jobs import Jobs, migrate
 from server.services.keys import Keys
 from server.services.records import Calibration, Job, RigState
-from server.services.rigs import RigBackend, open_rig
+from server.services.rigs.backend import RigBackend
+from server.services.rigs.opening import open_rig
 from server.services.sessions import Sessions
 from server.services.storage_use import StorageCount
 from server.services.threads import Threads
@@ -29,8 +30,8 @@ from server.tasks.child import ChildProcessPool
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Holds one finding about the service: whether it is well, and what to do where it is not. ``starting``: it is not
-    well yet, but nothing needs to be done."""
+    """Holds one finding about the service. ``detail`` says what to do where it is not well. ``starting``: it will
+    become well by itself."""
 
     ok: bool
     detail: Message
@@ -39,7 +40,7 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """Holds the parts of one service process."""
+    """Holds the parts of one service process. ``known`` keeps findings that take long to make, by name."""
 
     settings: ServiceSettings
     store: Store
@@ -60,13 +61,15 @@ class Service:
     known: dict[str, Check]  # findings that are made once
 
     def close(self) -> None:
+        """Closes the rig, ends the child processes and closes all connections to the database."""
         self.rig.close()
         self.children.close()
         self.jobs.close()
         self.engine.dispose()
 
     def accept_board_pictures(self, archive: Path, folder: Path, label: str) -> Calibration:
-        """Queues a calibration from an archive of IMAGES/ and board.toml. Raises InputError naming every fault."""
+        """Unpacks an archive of IMAGES/ and board.toml and queues a calibration. ``folder`` is a folder of
+        ``Store.incoming``. Raises InputError naming every fault, and DiskFull."""
         limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
         target.mkdir(parents=True)
         with self.children.one() as child:
@@ -74,7 +77,8 @@ class Service:
         return self.calibrations.add(target, "upload", label)
 
     def accept_photographs(self, archive: Path, folder: Path, label: str) -> Calibration:
-        """Queues a calibration from an archive of photographs of a scene. Raises InputError naming every fault."""
+        """Unpacks an archive of photographs of a scene and queues a calibration. ``folder`` is a folder of
+        ``Store.incoming``. Raises InputError naming every fault, and DiskFull."""
         limits, target = self.captures.archive_limits(archive), folder / "calibration" / "pictures"
         target.mkdir(parents=True)
         with self.children.one() as child:
@@ -84,8 +88,8 @@ class Service:
         return self.calibrations.add(target, "upload", label)
 
     def use_calibration(self, identity: str, *, poor: bool = False) -> RigState:
-        """Uses a calibration for every capture from now on and returns the rig's state. Raises NotFound, and Conflict;
-        also for a poor one, unless ``poor`` allows it."""
+        """Uses a calibration for every later capture and returns the rig's state. Raises NotFound, and Conflict if the
+        calibration has not succeeded, is of other cameras, or has the verdict poor and ``poor`` does not allow that."""
         if not poor:
             self.calibrations.check_usable(identity)
         self.rig.use(self.calibrations.cameras_json(identity))
@@ -93,7 +97,8 @@ class Service:
         return self.rig.describe()
 
     def cancel(self, job_id: str) -> Job:
-        """Cancels a job and announces that to the webhooks. A finished job stays as it is."""
+        """Cancels a job and queues messages to the webhooks about that. A finished job stays as it is. Raises
+        NotFound."""
         job, did = self.jobs.cancel(job_id)
         if did:
             self.webhooks.announce(job_id, "cancelled", self.jobs.client.enqueue, job_webhook=self.jobs.webhook(job_id))
@@ -101,7 +106,8 @@ class Service:
 
 
 def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
-    """Opens the data folder, the database and the rig's description. Raises InputError, DatabaseUnavailable."""
+    """Opens the data folder, the database and the rig's description, brings the database's index up to date and returns
+    the parts. Raises InputError for a wrong rig.toml, and DatabaseUnavailable."""
     engine = open_database(settings)
     library = Library(engine)
     store = Store(settings.data, library)

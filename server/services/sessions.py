@@ -1,4 +1,4 @@
-"""Sessions: one subject's captures, and their erasure."""
+"""Sessions: captures of one subject with the note of their consent, and their erasure."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -16,13 +16,14 @@ from server.storage.store import Store, new_id
 
 
 class Sessions:
-    """Manages the sessions of a service. Methods block."""
+    """Manages the sessions of a service. Methods block, so call them from a thread."""
 
     def __init__(self, store: Store, jobs: Jobs, library: Library) -> None:
         self._store, self._jobs, self._library = store, jobs, library
 
     def add(self, label: str, consent: str) -> Session:
-        """Begins a session and returns it. Raises InputError for invalid texts."""
+        """Makes a session and returns it. ``consent`` is the note of the subject's consent, empty if there is none.
+        Raises InputError for invalid texts."""
         check_texts({"label": label, "consent": consent})
         created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         record = SessionRecord(new_id(), created, label, consent)
@@ -30,8 +31,8 @@ class Sessions:
         return _with_captures(record, [])
 
     def page(self, sought: str = "", limit: int = 100, cursor: str | None = None) -> Found[Session]:
-        """Returns one page of the sessions in which all words of ``sought`` occur, newest first. Raises InputError for
-        a cursor of another list."""
+        """Returns one page of the sessions in whose label or consent note all words of ``sought`` occur, newest first.
+        Raises InputError for a cursor of another list."""
         page = self._library.sessions(sought, limit, cursor)
         captures = self._library.captures_of(page.ids)
         records = [record for identity in page.ids if (record := self._record(identity)) is not None]
@@ -46,8 +47,8 @@ class Sessions:
         *,
         tag: str | None = None,
     ) -> Found[Subject]:
-        """Returns one page of subjects, each made of the sessions of one name. ``tag``: only subjects with a capture
-        that has this tag. Raises InputError for a cursor of another list."""
+        """Returns one page of subjects. Sessions with the same label are one subject. ``tag``: only subjects with a
+        capture that has this tag. Raises InputError for a cursor of another list."""
         page = self._library.subjects(sought, order, limit, cursor, tag)
         captures = self._library.captures_of([session for sessions in page.subjects for session in sessions])
         all_captures = [capture for some in captures.values() for capture in some]
@@ -62,7 +63,8 @@ class Sessions:
         return Found(tuple(found), page.next, page.total)
 
     def captures_of_subject(self, session: str | None) -> list[str]:
-        """Lists the ids of all captures of the subject of this session. Returns none for None."""
+        """Lists the ids of all captures of the person whom a session shows, other sessions included. The list is empty
+        for None and for an unknown session."""
         if session is None or (record := self._record(session)) is None:
             return []
         sessions = self._library.sessions_of(subject_of(record))
@@ -75,24 +77,24 @@ class Sessions:
         return None
 
     def get(self, identity: str) -> Session:
-        """Returns the session with this id. Raises NotFound where there is none."""
+        """Returns a session with the ids of its captures. Raises NotFound."""
         record = self._store.session(identity)
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def edit(self, identity: str, *, label: str | None = None, consent: str | None = None) -> Session:
-        """Changes the label or the consent note of a session; None leaves it as it is. Raises
-        NotFound and InputError."""
+        """Changes the label or the consent note of a session; None leaves it as it is. Raises NotFound, and InputError
+        for invalid texts."""
         check_texts({"label": label, "consent": consent})
         changes = {name: text for name, text in (("label", label), ("consent", consent)) if text is not None}
         record = self._store.change_session(identity, lambda old: replace(old, **changes))
         return _with_captures(record, self._library.captures_of([identity])[identity])
 
     def erase(self, identity: str) -> None:
-        """Cancels the jobs of a session, then removes all traces of it: images, results, caches and rows of the job
+        """Cancels the jobs of a session, then removes every trace of it: pictures, results, caches and rows of the job
         database.
 
-        The session's record goes last, so that an interrupted erasure can be repeated. Raises NotFound, and Unavailable
-        while a worker still writes.
+        The session's record goes last, so an interrupted erasure can be repeated. Captures that arrive meanwhile are
+        removed, too. Raises NotFound, and Unavailable while a worker still writes.
         """
         self._store.session(identity)
         self._erase_captures(identity)

@@ -1,4 +1,4 @@
-"""What lies in the data folder, by kind, and what of it could go."""
+"""Counts the bytes that captures, results, caches and so on take in the data folder."""
 
 import os
 import shutil
@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from server.services.jobs import STATUSES, Jobs
+from server.services.job_rows import STATUSES
+from server.services.jobs import Jobs
 from server.settings import ServiceSettings
 from server.storage.job_index import JobQuery
 from server.storage.store import Store
@@ -29,7 +30,7 @@ KINDS = {  # folders of the data folder, by what they hold
 
 @dataclass(frozen=True, slots=True)
 class KindOfUse:
-    """Holds how many bytes a kind of data takes. ``things``: number of captures, jobs and so on."""
+    """Holds how much disk space one kind of data takes. ``things``: how many captures, jobs and so on there are."""
 
     kind: str
     bytes: int
@@ -38,10 +39,11 @@ class KindOfUse:
 
 @dataclass(frozen=True, slots=True)
 class StorageUse:
-    """Holds how the disk of the data folder is used.
+    """Holds how the disk of the data folder is used; sizes are in bytes.
 
-    ``kinds``: None until the data folder was counted for the first time; ``at``: when that was (s since 1970);
-    ``spare``: bytes that uploads and jobs leave free; ``failed``: number of jobs without a result.
+    ``free`` and ``total`` are the disk's, ``spare`` is what uploads and jobs must leave free. ``kinds`` is None until
+    the data folder was counted, ``at`` is when that was (s since 1970). ``failed``: number of failed and cancelled
+    jobs.
     """
 
     data: str
@@ -54,7 +56,8 @@ class StorageUse:
 
 
 class StorageCount:
-    """Counts the bytes in the data folder, in a thread of its own, when ``use`` is called and the last count is old."""
+    """Counts the bytes in the data folder in a thread of its own, since a large folder takes long. The count is kept
+    for ``COUNT_AGAIN_S`` seconds."""
 
     def __init__(self, store: Store, jobs: Jobs, settings: ServiceSettings) -> None:
         self._store, self._jobs, self._settings = store, jobs, settings
@@ -63,7 +66,8 @@ class StorageCount:
         self._at: float | None = None
 
     def use(self) -> StorageUse:
-        """Returns the last count, and starts a new one where that is old. Does not wait for it."""
+        """Returns the last count and the disk's present free space. Starts a new count if the last is old, and does not
+        wait for it."""
         old = self._at is None or time.time() - self._at > COUNT_AGAIN_S
         if old and self._looking.acquire(blocking=False):
             threading.Thread(target=self._look, args=(self._store.data,), daemon=True).start()
@@ -79,7 +83,7 @@ class StorageCount:
         )
 
     def forget(self) -> None:
-        """Makes the next call of ``use`` start a new count. Until that is done, ``use`` returns the old one."""
+        """Marks the last count as old, so that the next call of ``use`` starts a new one."""
         self._at = None if self._found is None else 0.0
 
     def _look(self, data: Path) -> None:
@@ -90,8 +94,8 @@ class StorageCount:
 
 
 def count(data: Path) -> tuple[KindOfUse, ...]:
-    """Counts bytes and things in the data folder, by kind. "other" is everything else in the folder, the database and
-    models included."""
+    """Counts bytes and things in the data folder, by kind. The kind "other" is everything else in the folder, the
+    database and models included."""
     known = {folder for folders in KINDS.values() for folder in folders}
     found = []
     for kind, folders in KINDS.items():

@@ -1,4 +1,4 @@
-"""Tags: short words that people give captures, to find them by."""
+"""Tags: short words that people give captures in order to find them."""
 
 import unicodedata
 from collections.abc import Iterable
@@ -13,8 +13,8 @@ UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")  # Unicode's classes of cont
 
 
 def checked_tags(tags: Iterable[str]) -> tuple[str, ...]:
-    """Returns the tags in one spelling (NFC, single blanks), in their order, each once whatever its case. Raises
-    InputError naming every fault."""
+    """Returns the tags in one spelling (Unicode NFC, single blanks), in their order. Of tags that differ in case only,
+    the first is kept. Raises InputError naming every fault."""
     found: dict[str, str] = {}
     faults = []
     for number, tag in enumerate(tags, start=1):
@@ -37,5 +37,5 @@ def checked_tags(tags: Iterable[str]) -> tuple[str, ...]:
 
 
 def typed_tags(text: str) -> tuple[str, ...]:
-    """Splits tags that were typed with commas between them. Raises InputError."""
+    """Splits a text at its commas and returns the tags. Raises InputError naming every fault."""
     return checked_tags(tag for tag in text.split(SEPARATOR) if tag.strip())

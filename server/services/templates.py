@@ -1,4 +1,4 @@
-"""Templates as the service's callers see them: which there are, how well they lie, which models carry them."""
+"""Lists templates for callers of the service: which there are, how well they fit, which models have them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,8 @@ from pipeline.templates.names import list_templates
 
 @dataclass(frozen=True, slots=True)
 class TemplateAtHand:
-    """Holds a template that jobs can name."""
+    """Holds a template that a job can name. ``registration`` has the figures that say how well it was fitted to its
+    model."""
 
     id: str
     name: str
@@ -24,8 +25,8 @@ class TemplateAtHand:
 
 
 def templates_at_hand() -> list[TemplateAtHand]:
-    """Returns the available templates, sorted by name. Raises OSError where a model's file
-    disappears while it is read."""
+    """Returns the available templates, sorted by name. One whose file cannot be used has a ``fault`` and nothing else.
+    Raises OSError if a model's file disappears while it is read."""
     found, digests = [], None
     for name, path in list_templates().items():
         try:

@@ -1,4 +1,4 @@
-"""Texts that people give: names, labels, notes. Every way in (HTTP, forms, the console) comes by here."""
+"""Checks the texts that people enter: names, labels, notes. HTTP, forms and the console all call this."""
 
 import re
 from collections.abc import Mapping
@@ -13,8 +13,9 @@ CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 
 
 def check_texts(texts: Mapping[str, str | None], subject: str = "form") -> None:
-    """Raises InputError naming the field of every text that is too long or holds characters that
-    databases cannot store."""
+    """Raises InputError naming the field of every text that is longer than ``TEXT_MOST`` characters or holds characters
+    that a database cannot store. Fields that are None are skipped. ``subject`` names in the error what the fields
+    belong to ("form", "request")."""
     faults = []
     for name, text in texts.items():
         if text is not None and len(text) > TEXT_MOST:

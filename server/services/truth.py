@@ -1,4 +1,4 @@
-"""The truth of a simulated capture on disk, and how far a result is from it.
+"""Compares a result with the true head of a simulated capture on disk.
 
 <capture>.truth/  cameras.json  head.ply  face_mask.npy  colour_mask.npy  silhouettes/  head_silhouettes/  meta.json
 """
@@ -16,8 +16,8 @@ NEAREST = 8  # vertices whose triangles are looked at; on an even mesh the neare
 
 
 def error_mm(truth: Path, result: Path) -> dict[str, float]:
-    """Computes the distance (mm) from the true face region to the surface of ``result`` as delivered: mean, median and
-    maximum, weighted by area."""
+    """Computes the distance (mm) from the true face region to the surface of ``result`` as delivered, without aligning
+    both. Returns mean, median and maximum, weighted by area."""
     head, face = read_mesh(truth / "head.ply"), np.load(truth / "face_mask.npy")
     distances = surface_distance(head.vertices[face], read_mesh(result))
     weights = _vertex_areas(head)[face]
@@ -31,8 +31,8 @@ def error_mm(truth: Path, result: Path) -> dict[str, float]:
 
 
 def surface_distance(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, " n"]:
-    """Computes the distance (mm) of each point to the nearest point on the triangles around the
-    mesh's nearest vertices."""
+    """Computes the distance (mm) of each point to the nearest point on the triangles around the mesh's ``NEAREST``
+    nearest vertices."""
     _, nearest = KDTree(mesh.vertices).query(points, k=NEAREST)
     first = np.searchsorted(np.sort(mesh.faces.ravel()), np.arange(len(mesh.vertices) + 1))
     of_vertex = np.argsort(mesh.faces.ravel(), kind="stable") // 3  # triangles, ordered by vertex

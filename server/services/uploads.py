@@ -16,17 +16,21 @@ from server.storage.store import Store, is_id, new_id
 
 
 def too_large(settings: ServiceSettings) -> TooLarge:
+    """Returns the error that refuses an upload larger than the settings allow."""
     return TooLarge("upload-too-large", compose("upload-too-large", bytes=settings.body_bytes))
 
 
 class ResumableUploads:
-    """Manages resumable uploads. The length of the file ``data`` is the offset, so that a client can continue after the
-    service was killed."""
+    """Manages resumable uploads. The offset of an upload is the length of its file ``data``, so a client can continue
+    after the service was killed."""
 
     def __init__(self, store: Store, settings: ServiceSettings) -> None:
         self._store, self._settings = store, settings
 
     def create(self, length: int, fields: dict[str, str], key: str) -> UploadRecord:
+        """Makes an upload of ``length`` bytes and returns its record. ``fields`` describe the future capture, ``key``
+        is the id of the caller's API key. Raises TooLarge, and DiskFull if the disk cannot take it beside other
+        unfinished uploads."""
         if length > self._settings.body_bytes:
             raise too_large(self._settings)
         self._store.reserve(2 * length + self._promised(), self._settings.free_bytes)
@@ -40,7 +44,7 @@ class ResumableUploads:
         return record
 
     def get(self, identity: str) -> UploadRecord:
-        """Returns an upload. Raises NotFound, also for one that expired."""
+        """Returns the record of an upload. Raises NotFound, also for one that expired."""
         if not is_id(identity):
             raise NotFound(compose("thing-upload"), identity)
         with suppress(OSError, ValueError):
@@ -51,16 +55,18 @@ class ResumableUploads:
         raise NotFound(compose("thing-upload"), identity)
 
     def offset(self, record: UploadRecord) -> int:
-        """Returns how many bytes were received: all, once the capture was made and the data deleted."""
+        """Returns how many bytes of an upload were received. That is all of them once the capture was made, when the
+        data is deleted already."""
         if record.capture is not None:
             return record.length
         return self.data(record).stat().st_size
 
     def data(self, record: UploadRecord) -> Path:
+        """Returns the path of the file that holds the bytes received so far."""
         return self._store.folder("uploads", record.id) / "data"
 
     def save(self, record: UploadRecord) -> None:
-        """Writes the record of an upload. Raises NotFound where the upload was removed."""
+        """Replaces the record of an upload atomically. Raises NotFound if the upload was removed meanwhile."""
         path = self._store.folder("uploads", record.id) / "upload.json"
         try:
             write_atomically(path, json.dumps(UPLOAD.document(record)).encode(), parents=False)
@@ -69,8 +75,8 @@ class ResumableUploads:
 
     @contextmanager
     def lock(self, identity: str) -> Iterator[None]:
-        """Locks an upload while the block runs, against writing and removal by others, in any process. Raises Conflict
-        and NotFound."""
+        """Locks an upload while the block runs, so that no other process writes or removes it. The lock ends with the
+        process. Raises Conflict if it is locked already, and NotFound."""
         with ExitStack() as stack:
             try:
                 stream = stack.enter_context((self._store.folder("uploads", identity) / "upload.json").open("rb"))
@@ -83,6 +89,7 @@ class ResumableUploads:
             yield
 
     def remove(self, identity: str) -> None:
+        """Removes an upload with its data. Does nothing if it is gone."""
         self._store.remove(self._store.folder("uploads", identity))
 
     def sweep(self) -> int:

@@ -1,8 +1,8 @@
-"""Telling other programs how a job or a batch ended: signed, retried, durable.
+"""Webhooks announce to other programs how a job or a batch ended.
 
-The message and its signature follow https://www.standardwebhooks.com: ``webhook-id``, ``webhook-timestamp`` and
-``webhook-signature: v1,<base64 HMAC-SHA256 of "id.timestamp.body">``. A delivery is a workflow of the job engine, so
-that it survives what a job survives; nine attempts over about eight minutes.
+Messages and signatures follow https://www.standardwebhooks.com: ``webhook-id``, ``webhook-timestamp`` and
+``webhook-signature: v1,<base64 HMAC-SHA256 of "id.timestamp.body">``. A delivery is a workflow of the job engine, so it
+survives a restart; it is tried nine times in about eight minutes.
 """
 
 import base64
@@ -22,7 +22,7 @@ from dbos import EnqueueOptions
 from rig.messages.message import compose
 from server.errors import NotFound
 from server.origins import parsed, target
-from server.services.jobs import APPLICATION_VERSION, DELIVERY
+from server.services.job_rows import APPLICATION_VERSION, DELIVERY
 from server.services.records import NewWebhook, Webhook
 from server.storage.database import now_sql, webhooks
 from server.storage.records import JobWebhook, WebhookMessage
@@ -33,7 +33,7 @@ TIMEOUT_S = 10.0
 
 
 class Webhooks:
-    """Manages the webhooks of the service and delivers messages to them."""
+    """Manages the webhooks of the service and delivers messages to them. Methods block."""
 
     def __init__(self, engine: sa.Engine, origins: Collection[str] = ()) -> None:
         """``origins``: where a job's own webhook may be."""
@@ -50,12 +50,13 @@ class Webhooks:
         return made
 
     def all(self) -> list[Webhook]:
+        """Returns all webhooks without their secrets, oldest first."""
         with self._engine.connect() as connection:
             rows = connection.execute(sa.select(webhooks.c.id, webhooks.c.url).order_by(webhooks.c.created))
             return [Webhook(row.id, row.url) for row in rows]
 
     def remove(self, identity: str) -> None:
-        """Removes a webhook. Raises NotFound."""
+        """Removes a webhook, which gets no further messages. Raises NotFound."""
         with self._engine.begin() as connection:
             if not connection.execute(sa.delete(webhooks).where(webhooks.c.id == identity)).rowcount:
                 raise NotFound(compose("thing-webhook"), identity)
@@ -63,8 +64,9 @@ class Webhooks:
     def announce(
         self, job_id: str, state: str, enqueue: Callable[..., Any], job_webhook: JobWebhook | None = None
     ) -> None:
-        """Queues one message for each webhook about the state of a job. Repeating the call for the same job and state
-        changes nothing."""
+        """Queues one message for each webhook about the state of a job, and one for the job's own webhook if it has
+        one. Each message has an id made of webhook, job and state, so that repeating the call changes nothing.
+        ``enqueue`` is the job engine's function."""
         for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
             identity = f"hook-{hook_id}-{job_id}-{state}"
             message: WebhookMessage = {
@@ -78,8 +80,8 @@ class Webhooks:
             enqueue(_delivery(identity), message)
 
     def announce_batch(self, batch_id: str, round_number: int, enqueue: Callable[..., Any]) -> None:
-        """Queues one message for each webhook that a batch has finished. Repeating the call for the same round changes
-        nothing."""
+        """Queues a message for each webhook that a batch has finished. A retry of failed jobs begins the batch's next
+        round; for each round a webhook gets one message, even if the call is repeated."""
         for hook in self.all():
             identity = f"hook-{hook.id}-{batch_id}-{round_number}"
             message: WebhookMessage = {
@@ -91,11 +93,11 @@ class Webhooks:
             enqueue(_delivery(identity), message)
 
     def post(self, message: WebhookMessage) -> int:
-        """Tries once to deliver a message. Returns the HTTP status of the answer, 0 without sending where the webhook
-        was removed.
+        """Tries once to deliver a message and returns the HTTP status of the answer. Returns 0 without sending if the
+        webhook was removed.
 
-        Raises httpx.HTTPError where the other side does not accept it, and InvalidInput where a job's webhook may no
-        longer be called.
+        Raises httpx.HTTPError if the receiver cannot be reached or does not accept the message, and InvalidInput if the
+        settings no longer allow the address of a job's own webhook.
         """
         if "own" in message:
             return self._post_own(message, message["own"])
@@ -137,6 +139,8 @@ def _signed(message: WebhookMessage, secret: str | None) -> tuple[bytes, dict[st
 
 
 def signed_headers(identity: str, timestamp: int, body: bytes, secret: str) -> dict[str, str]:
+    """Returns the headers that identify and sign a message, after standardwebhooks.com. ``timestamp`` is in seconds
+    since 1970, ``secret`` begins with "whsec_"."""
     key = base64.b64decode(secret.removeprefix("whsec_"))
     digest = hmac.new(key, f"{identity}.{timestamp}.".encode() + body, hashlib.sha256).digest()
     signature = "v1," + base64.b64encode(digest).decode()

@@ -1,4 +1,4 @@
-"""What a job shall do, and of which capture."""
+"""Declares what a job is to do, and checks whether it can be done."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from server.storage.records import CaptureRecord, JobWebhook
 
 @dataclass(frozen=True, slots=True)
 class ReconstructionRequest:
-    """Holds what a job is to do: a model's name and settings of the pipeline (None: the defaults), the job's name, and
-    a webhook that hears of its end beside those of the service."""
+    """Holds what a job is to do: the model's name and the settings of the pipeline (None: the defaults), the job's
+    name, and a webhook that is called at its end besides those of the service."""
 
     model: str | None = None
     settings: Mapping[str, object] | None = None
@@ -22,8 +22,8 @@ class ReconstructionRequest:
     webhook: JobWebhook | None = None
 
     def check(self) -> None:
-        """Raises InputError naming an invalid name, an unknown model, every wrong setting and a template that the model
-        cannot have, so that no job fails by them hours later."""
+        """Raises InputError naming an invalid job name, an unknown model, every wrong setting and a template that the
+        model does not have. So no job fails because of them hours later."""
         check_texts({"name": self.name}, "request")
         model, settings = self._model_faults(), self._settings_faults()
         if model and settings:
@@ -70,6 +70,6 @@ def _template_faults(name: str, model: str) -> list[Message]:
 
 
 def refuse_board(record: CaptureRecord) -> None:
-    """Raises Conflict for a capture that shows the calibration board and no head."""
+    """Raises Conflict for a capture that shows the calibration board, of which no head can be made."""
     if record.board:
         raise Conflict("board-shot", compose("board-shot"))

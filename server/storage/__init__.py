@@ -1,1 +1,1 @@
-"""The database and the data folder."""
+"""Reads and writes everything that outlives a process: the database and the data folder."""

@@ -1,7 +1,7 @@
-"""Batches in the database: what each is to make, and which job makes which capture's head.
+"""Keeps batches in the database: what each is to make, and which job makes the head of which capture.
 
-A batch has a row, each of its captures an item. An item without a job waits; what became of a job says the engine's own
-row, which is joined here and never copied, so that counts agree with the jobs at any moment. Moments are ms since 1970.
+A batch is a row, each of its captures an item. An item without a job waits. The state of a job is never copied: queries
+join the job engine's own row, so that counts agree with the jobs at any moment. Times are milliseconds since 1970.
 """
 
 import json
@@ -27,8 +27,9 @@ NONE = "-"  # in the place of a job's id: none is to be made, since the capture 
 
 @dataclass(frozen=True, slots=True)
 class BatchRow:
-    """Holds a batch. ``wish``: what its owner wants of it; ``finished``: when nothing was left to do; ``rounds``: how
-    often that was so, or failed jobs were tried again."""
+    """Holds a batch. ``wish`` is what its owner wants: running, paused or cancelled. ``finished`` is when nothing was
+    left to do (ms since 1970), None before. ``rounds`` grows whenever it finishes and whenever its failed jobs are
+    tried again."""
 
     id: str
     created: int
@@ -46,7 +47,8 @@ class BatchRow:
 
 @dataclass(frozen=True, slots=True)
 class BatchItem:
-    """Holds one capture of a batch, None where it was erased, and the latest job that makes its head."""
+    """Holds one capture of a batch, None if it was erased, and the latest job that makes its head, None while it
+    waits."""
 
     position: int
     capture_id: str | None
@@ -55,21 +57,22 @@ class BatchItem:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Counts the items of a batch: ``statuses`` are the engine's, ``waiting`` and ``gone``. ``mean_s``: mean duration
-    of the jobs that succeeded, None where none did; on SQLite the engine notes whole seconds."""
+    """Counts the items of a batch by status: the job engine's, ``waiting``, or ``gone`` if the capture or job was
+    removed. ``mean_s`` is the mean duration of the succeeded jobs, None before the first. On SQLite the engine notes
+    whole seconds."""
 
     statuses: Mapping[str, int]
     mean_s: float | None
 
 
 class BatchIndex:
-    """Manages the rows of batches. Methods block."""
+    """Reads and changes the rows of batches and their items. Methods block on the database."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine, self._status = engine, engine_jobs(engine)
 
     def add(self, row: BatchRow, captures: Sequence[str]) -> bool:
-        """Adds a batch with its captures, all of it or nothing. Returns False where the id is taken."""
+        """Adds a batch with its captures in one transaction. Returns False, without any change, if the id is taken."""
         columns = {name: getattr(row, name) for name in BatchRow.__dataclass_fields__}
         columns |= {"label": storable(row.label), "words": folded(row.label), "settings": json.dumps(row.settings)}
         items = [{"batch_id": row.id, "position": place, "capture_id": one} for place, one in enumerate(captures)]
@@ -82,6 +85,7 @@ class BatchIndex:
         return True
 
     def get(self, identity: str) -> BatchRow | None:
+        """Returns the batch with this id; None if there is none."""
         return next(iter(self.of([identity])), None)
 
     def of(self, ids: Sequence[str]) -> list[BatchRow]:
@@ -92,7 +96,8 @@ class BatchIndex:
         return [found[identity] for identity in ids if identity in found]
 
     def page(self, sought: str, state: BatchState | None, limit: int, cursor: str | None) -> CursorPage:
-        """Returns one page of batches, newest first. Raises InputError for a cursor of another list."""
+        """Returns one page of batches, newest first. All words of ``sought`` must occur in the label; a word may also
+        be the batch's id. Raises InputError for a cursor of another list."""
         rows = sa.select().select_from(batches)
         for word in words_of(sought):
             rows = rows.where(sa.or_(contains(batches.c.words, word), batches.c.id == word))
@@ -102,7 +107,8 @@ class BatchIndex:
             return page_of(connection, rows, Order(batches.c.created, batches.c.id, descending=True), limit, cursor)
 
     def unfinished(self, key: str | None = None) -> list[BatchRow]:
-        """Lists the batches with something to do, in the order in which they are served; of one API key if given."""
+        """Lists the batches that are not finished, in the order in which they are served: by priority, then oldest
+        first. ``key``: only those of this API key."""
         query = sa.select(batches).where(batches.c.finished.is_(None))
         if key is not None:
             query = query.where(batches.c.key == key)
@@ -111,7 +117,7 @@ class BatchIndex:
             return [_row(row) for row in rows]
 
     def tallies(self, ids: Collection[str]) -> dict[str, Tally]:
-        """Counts the items of each of the batches."""
+        """Counts the items of each of the batches by status."""
         item, job = batch_items.c, self._status.c
         waits = sa.or_(item.job_id.is_(None), RECALLED)
         status = sa.case((waits, WAITING), else_=sa.func.coalesce(job.status, GONE)).label("status")
@@ -129,7 +135,7 @@ class BatchIndex:
         return {identity: Tally(counts[identity], means.get(identity)) for identity in ids}
 
     def items(self, identity: str) -> Iterator[list[BatchItem]]:
-        """Yields the items of a batch in their order, in portions."""
+        """Yields the items of a batch in their order, in lists of ``AT_ONCE``."""
         item, after = batch_items.c, -1
         query = sa.select(item.position, item.capture_id, item.job_id).where(item.batch_id == identity)
         while True:
@@ -142,7 +148,7 @@ class BatchIndex:
             after = found[-1].position
 
     def active(self) -> dict[str, dict[str, str]]:
-        """Returns the engine's status of every queued or running job of a batch, by batch and job."""
+        """Returns the queued and running jobs of all batches, with the job engine's status, by batch and job."""
         item, job = batch_items.c, self._status.c
         query = sa.select(item.batch_id, item.job_id)
         found: dict[str, dict[str, str]] = {}
@@ -156,8 +162,11 @@ class BatchIndex:
         return found
 
     def waiting_within(self, connection: sa.Connection, identity: str, limit: int) -> list[BatchItem]:
-        """Returns the first items of a batch that wait, none where it is not to run. Until the end of the caller's
-        transaction nobody else gives it jobs or changes what it shall do."""
+        """Returns the first ``limit`` items of a batch that have no job; none if the batch is not running.
+
+        Locks the batch's row until the end of the caller's transaction, so that no other process gives these items jobs
+        or changes what the batch is to do.
+        """
         runs = sa.select(batches.c.id).where(batches.c.id == identity, batches.c.wish == "running")
         if connection.scalar(runs.with_for_update()) is None:
             return []
@@ -167,7 +176,8 @@ class BatchIndex:
         return [BatchItem(row.position, row.capture_id, row.job_id) for row in rows]
 
     def give_jobs_within(self, connection: sa.Connection, identity: str, jobs: Mapping[int, str | None]) -> None:
-        """Notes the job of each item, by position; None: the capture is gone, and there will be none."""
+        """Writes the job of each item, by position, in the caller's transaction. None: the capture was removed, so the
+        item gets no job."""
         place, job = sa.bindparam("place"), sa.bindparam("job")
         change = sa.update(batch_items).where(batch_items.c.batch_id == identity, batch_items.c.position == place)
         rows = [{"place": position, "job": job_id or NONE} for position, job_id in jobs.items()]
@@ -175,11 +185,11 @@ class BatchIndex:
             connection.execute(change.values(job_id=job), rows)
 
     def recall(self, identity: str, jobs: Collection[str]) -> None:
-        """Notes that these jobs of a batch are to be taken back."""
+        """Marks jobs of a batch to be taken back. The mark survives a kill, so that a later call can complete it."""
         self._change_items(identity, list(jobs), {"recalled": True})
 
     def recalled(self) -> dict[str, list[str]]:
-        """Returns the jobs that are to be taken back, by batch."""
+        """Returns the jobs that are marked to be taken back, by batch."""
         query, found = sa.select(batch_items.c.batch_id, batch_items.c.job_id).where(RECALLED), dict[str, list[str]]()
         with self._engine.connect() as connection:
             for row in connection.execute(query):
@@ -187,23 +197,26 @@ class BatchIndex:
         return found
 
     def settle_recall(self, identity: str, job_id: str, *, taken: bool) -> None:
-        """Notes that a job was taken back, so that its capture waits again, or that it had ended before."""
+        """Removes the mark from a job. If it was taken back (``taken``), its capture waits again; otherwise it had
+        ended before and stays."""
         changed = {"recalled": False, "job_id": None} if taken else {"recalled": False}
         self._change_items(identity, [job_id], changed)
 
     def with_waiting(self) -> set[str]:
-        """Returns the ids of unfinished batches with items that wait."""
+        """Returns the ids of unfinished batches with items that wait or whose job is being taken back."""
         with self._engine.connect() as connection:
             return {*connection.scalars(sa.select(batches.c.id).where(batches.c.finished.is_(None), _has_waiting()))}
 
     def change(self, identity: str, wish: Wish) -> bool:
-        """Notes what a batch shall do. Returns False where it has finished or was cancelled."""
+        """Notes whether a batch is to run, to pause or to be cancelled. Returns False, without any change, if it has
+        finished or was cancelled before."""
         change = sa.update(batches).where(batches.c.id == identity, batches.c.finished.is_(None))
         with self._engine.begin() as connection:
             return bool(connection.execute(change.where(batches.c.wish != "cancelled").values(wish=wish)).rowcount)
 
     def finish(self, row: BatchRow, moment: int) -> None:
-        """Notes that nothing of a batch is left to do, unless that changed since ``row`` was read."""
+        """Marks a batch as finished at ``moment`` (ms since 1970). Does nothing if the batch was changed since ``row``
+        was read, or has waiting items again."""
         change = sa.update(batches).where(batches.c.id == row.id, batches.c.finished.is_(None))
         change = change.where(batches.c.wish == row.wish, batches.c.rounds == row.rounds)
         if row.wish != "cancelled":
@@ -212,7 +225,8 @@ class BatchIndex:
             connection.execute(change.values(finished=moment, rounds=row.rounds + 1))
 
     def retry(self, identity: str, statuses: Collection[str]) -> int:
-        """Lets all items wait again whose job has one of the engine's ``statuses``. Returns how many."""
+        """Lets all items wait again whose job has one of the job engine's ``statuses``, and reopens the batch. Returns
+        how many."""
         item, job = batch_items.c, self._status.c
         joined = batch_items.join(self._status, job.workflow_uuid == item.job_id)
         query = sa.select(item.job_id).select_from(joined).where(item.batch_id == identity, job.status.in_(statuses))
@@ -223,7 +237,7 @@ class BatchIndex:
         return len(failed)
 
     def forget_captures(self, captures: Collection[str]) -> None:
-        """Removes the ids of erased captures, and of their jobs, from all batches."""
+        """Removes the ids of erased captures, and of their jobs, from the items of all batches."""
         listed = list(captures)
         with self._engine.begin() as connection:
             for start in range(0, len(listed), AT_ONCE):
@@ -232,6 +246,7 @@ class BatchIndex:
                 connection.execute(change.values(capture_id=None, job_id=NONE, recalled=False))
 
     def remove(self, identity: str) -> None:
+        """Removes a batch and its items in one transaction. Jobs stay."""
         with self._engine.begin() as connection:
             connection.execute(sa.delete(batch_items).where(batch_items.c.batch_id == identity))
             connection.execute(sa.delete(batches).where(batches.c.id == identity))

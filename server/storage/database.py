@@ -1,6 +1,7 @@
-"""The service's own tables, beside the job engine's in the same database (SQLite file or PostgreSQL).
+"""Defines the service's own tables, which lie beside the job engine's in one database (an SQLite file or PostgreSQL).
 
-Times are seconds since 1970 on the *database's* clock, so that two hosts whose clocks differ agree on who is silent.
+Times of workers, keys and events are seconds since 1970 on the *database's* clock. Two hosts whose clocks differ then
+agree on which worker is silent.
 """
 
 import os
@@ -160,7 +161,8 @@ webhooks = sa.Table(
 
 
 def open_database(settings: ServiceSettings) -> sa.Engine:
-    """Opens the service's database, creates its missing tables and returns the engine. Raises DatabaseUnavailable."""
+    """Opens the service's database, creates missing tables and columns, and returns the engine. Raises
+    DatabaseUnavailable."""
     url = sa.make_url(settings.url)
     if url.get_backend_name() == "sqlite":
         file = Path(str(url.database))
@@ -197,8 +199,8 @@ def _add_columns(engine: sa.Engine) -> None:
 
 
 def scrub(engine: sa.Engine) -> None:
-    """Removes from the database's files what deleted rows left in them, names of people included. What somebody is
-    reading at this moment stays until the next call."""
+    """Overwrites what deleted rows left in the database's files, names of people included. Pages that another
+    connection is reading stay until the next call."""
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
         if engine.dialect.name != "sqlite":
             tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
@@ -212,8 +214,8 @@ def scrub(engine: sa.Engine) -> None:
 
 
 def alive_workers(connection: sa.Connection, silent_s: float) -> sa.ColumnElement[bool]:
-    """Returns the SQL condition that a worker has not stopped and sent a heartbeat within the last
-    ``silent_s`` seconds."""
+    """Returns the SQL condition that a worker has not stopped and has sent a heartbeat within the last ``silent_s``
+    seconds."""
     return sa.and_(workers.c.stopped.is_(None), workers.c.seen > now_sql(connection) - silent_s)
 
 

@@ -1,4 +1,4 @@
-"""What happened to a job, in order: the log behind progress, server-sent events and the remaining time."""
+"""Stores what happened to each job, in order: the source of progress, remaining time and the event stream of HTTP."""
 
 import json
 from dataclasses import dataclass
@@ -20,12 +20,15 @@ class JobEvent:
 
 
 class EventLog:
-    """Manages the table of events. Within a job they are numbered from 1, also across workers that take it over."""
+    """Reads and writes the events of jobs. Within a job they are numbered from 1, also if another worker takes the job
+    over."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
     def append(self, job_id: str, document: EventDocument) -> None:
+        """Adds an event to a job under the next number. If another writer takes that number first, it tries the next,
+        twenty times; after that the event is dropped."""
         for _ in range(20):  # a taken-over job has two writers for a moment
             try:
                 with self._engine.begin() as connection:
@@ -37,6 +40,7 @@ class EventLog:
                 continue
 
     def since(self, job_id: str, seq: int, limit: int = 1000) -> list[JobEvent]:
+        """Returns the events of a job with numbers above ``seq``, in order, ``limit`` at most."""
         query = (
             sa.select(events).where(events.c.job_id == job_id, events.c.seq > seq).order_by(events.c.seq).limit(limit)
         )
@@ -44,7 +48,7 @@ class EventLog:
             return [JobEvent(row.seq, row.at, json.loads(row.document)) for row in connection.execute(query)]
 
     def latest(self, job_ids: list[str]) -> dict[str, JobEvent]:
-        """Returns the newest progress event of each job that has one."""
+        """Returns the newest event of each of the jobs; jobs without events are left out."""
         newest = sa.select(events.c.job_id, sa.func.max(events.c.seq).label("seq")).where(events.c.job_id.in_(job_ids))
         newest = newest.group_by(events.c.job_id).subquery()
         query = sa.select(events).join(
@@ -55,5 +59,6 @@ class EventLog:
             return {row.job_id: JobEvent(row.seq, row.at, json.loads(row.document)) for row in rows}
 
     def remove(self, job_ids: list[str]) -> None:
+        """Removes all events of these jobs."""
         with self._engine.begin() as connection:
             connection.execute(sa.delete(events).where(events.c.job_id.in_(job_ids)))

@@ -1,8 +1,8 @@
-"""Faces that were found in a capture, kept on disk, so that the pages find them once.
+"""Caches the faces found in a capture on disk, so that the pages search each capture once.
 
-A file's name is the sha256 of all that its content follows from: the capture's files, the program's version and code.
-It tells of a face, and lies where ``Store.remove_capture`` erases it with its capture, also while the faces are being
-found. A file that cannot be read is made anew; one that cannot be written is done without.
+A file's name is the SHA-256 of everything that its content depends on: the capture's files, the program's version and
+code. It describes a face, so it lies where ``Store.remove_capture`` erases it with its capture, even while a search
+runs. A file that cannot be read is made anew. One that cannot be written is not kept.
 """
 
 import hashlib
@@ -44,8 +44,8 @@ class FacesDocument(TypedDict):
 
 
 def faces_once(folder: Path, inputs: Mapping[str, str], find: Callable[[], FacesDocument]) -> FacesDocument:
-    """Returns the faces of a capture: those kept in ``folder`` from an earlier call, else what ``find`` returns, which
-    is then kept. ``inputs``: SHA-256 of the capture's files."""
+    """Returns the faces of a capture. If ``folder`` has them from an earlier call, ``find`` is not called; otherwise
+    its result is stored there. ``inputs``: SHA-256 of the capture's files by name."""
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     path = folder / (_key(inputs) + SUFFIX)

@@ -1,4 +1,5 @@
-"""How many jobs failed, by kind, whatever retention has removed of them since: what alerts go by."""
+"""Counts failed jobs by kind for the metrics. The counts stay when retention removes the jobs, so that alerts can use
+them."""
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
@@ -7,7 +8,7 @@ from server.storage.database import failures
 
 
 def note_failure(engine: sa.Engine, kind: str) -> None:
-    """Counts one failure of a kind."""
+    """Adds one to the count of a kind of failure, atomically."""
     insert = sqlite.insert if engine.dialect.name == "sqlite" else postgresql.insert
     first = insert(failures).values(kind=kind, count=1)
     with engine.begin() as connection:

@@ -1,7 +1,7 @@
-"""What jobs are found by: the service's index rows beside the job engine's own table, whose state is the one truth.
+"""Finds jobs: the service's index rows beside the job engine's own table, which alone holds a job's state.
 
-The engine's table is read here and in ``batches`` alone, by names that its migrations keep; all other dealings with it
-go through its client.
+The engine's table is read only here and in ``batches``, by columns that its migrations keep. Everything else goes
+through the engine's client.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -26,7 +26,7 @@ JobOrder = Literal["-created", "created", "-finished", "finished"]
 @dataclass(frozen=True, slots=True)
 class JobQuery:
     """Describes which jobs are listed and in what order. Every word of ``sought`` must occur in the job's name, model,
-    method, level or id, or in its capture; ``statuses`` are the engine's."""
+    method, level of detail or id, or in its capture. ``statuses`` are the job engine's."""
 
     sought: str = ""
     statuses: Sequence[str] | None = None
@@ -38,7 +38,7 @@ class JobQuery:
 
 @dataclass(frozen=True, slots=True)
 class JobOfCapture:
-    """Holds the id of a job and its status in the engine's words."""
+    """Holds the id of a job, and its status in the job engine's words ("PENDING")."""
 
     id: str
     status: str
@@ -46,35 +46,39 @@ class JobOfCapture:
 
 @dataclass(frozen=True, slots=True)
 class Queued:
-    """Holds how many jobs wait in a queue, and since when the oldest does (seconds since 1970)."""
+    """Holds how many jobs wait in a queue, and since when the oldest does (s since 1970)."""
 
     jobs: int
     since: float
 
 
 class JobIndex:
-    """Finds jobs of one of the engine's workflows. Methods block."""
+    """Finds jobs by words, capture, session, batch and state. ``workflow``: the job engine's name for this kind of job.
+    Methods block on the database."""
 
     def __init__(self, engine: sa.Engine, workflow: str) -> None:
         self._engine, self._workflow = engine, workflow
         self._status = engine_jobs(engine)
 
     def add(self, job_id: str, request: JobRequest, session: str | None) -> None:
-        """Adds a job to the index. Does nothing where the index has it already."""
+        """Adds a job to the index. Does nothing if the index has it already."""
         with suppress(IntegrityError), self._engine.begin() as connection:
             self.add_within(connection, job_id, request, session)
 
     def add_within(self, connection: sa.Connection, job_id: str, request: JobRequest, session: str | None) -> None:
-        """Adds a new job to the index, in the caller's transaction."""
+        """Adds a new job to the index in the caller's transaction. Raises IntegrityError if the index has it
+        already."""
         row = {"job_id": job_id, "capture_id": request["capture_id"], "session": session}
         connection.execute(sa.insert(job_index).values(**row, words=words_of_job(request)))
 
     def remove(self, job_id: str) -> None:
+        """Removes a job from the index. Does nothing if it is not there."""
         with self._engine.begin() as connection:
             connection.execute(sa.delete(job_index).where(job_index.c.job_id == job_id))
 
     def complete(self, requests_of: Callable[[list[str]], Mapping[str, JobRequest]]) -> int:
-        """Fills in the searched words of index rows that an earlier version wrote. Returns how many rows there were."""
+        """Fills in the words that searches compare, for index rows that an earlier version wrote without them.
+        ``requests_of`` returns the requests of jobs by id. Returns how many rows there were."""
         with self._engine.connect() as connection:
             bare = [*connection.scalars(sa.select(job_index.c.job_id).where(job_index.c.words.is_(None)))]
         for start in range(0, len(bare), AT_ONCE):
@@ -103,14 +107,14 @@ class JobIndex:
             return page_of(connection, rows, order, limit, cursor, searched=bool(query.sought))
 
     def counts(self) -> dict[str, int]:
-        """Returns the number of jobs by the engine's status."""
+        """Returns the number of jobs by the job engine's status."""
         status = self._status.c
         query = sa.select(status.status, sa.func.count()).where(status.name == self._workflow).group_by(status.status)
         with self._engine.connect() as connection:
             return {row[0]: row[1] for row in connection.execute(query)}
 
     def queued(self) -> dict[str, Queued]:
-        """Returns how many jobs wait in each queue, and since when the first of them."""
+        """Returns how many jobs wait in each queue, and since when the oldest does."""
         status = self._status.c
         query = sa.select(status.queue_name, sa.func.count(), sa.func.min(status.created_at))
         query = query.where(status.name == self._workflow, status.status.in_(ENQUEUED)).group_by(status.queue_name)
@@ -125,9 +129,11 @@ class JobIndex:
             return [*connection.scalars(query.order_by(status.created_at.desc()))]
 
     def places(self) -> dict[str, int]:
-        """Returns for each queued job how many jobs of its queue go before it: those running, then those with a lower
-        priority number, then those queued earlier. Of jobs queued in the same millisecond the lower id counts as
-        earlier, although the engine takes them in any order."""
+        """Returns for each queued job how many jobs of its queue go before it.
+
+        Running jobs go first, then those with a lower priority number, then those queued earlier. Of jobs queued in the
+        same millisecond the lower id counts as earlier, although the engine takes them in any order.
+        """
         status = self._status.c
         places: dict[str, int] = {}
         running = sa.select(status.queue_name, sa.func.count()).where(status.name == self._workflow)
@@ -143,7 +149,7 @@ class JobIndex:
         return places
 
     def of_captures(self, captures: Collection[str]) -> dict[str, list[JobOfCapture]]:
-        """Returns the jobs of each of the captures, newest first."""
+        """Returns the jobs of each of the captures, newest first. A capture without jobs has an empty list."""
         found: dict[str, list[JobOfCapture]] = {capture: [] for capture in captures}
         status, listed = self._status.c, list(captures)
         joined = job_index.join(self._status, status.workflow_uuid == job_index.c.job_id)
@@ -157,6 +163,7 @@ class JobIndex:
         return found
 
     def ids_of(self, capture: str | None, session: str | None) -> list[str]:
+        """Lists the ids of the jobs of a capture, of a session, or of both if both are not None."""
         with self._engine.connect() as connection:
             clauses = self._of(JobQuery(capture=capture, session=session))
             return [*connection.scalars(sa.select(job_index.c.job_id).where(*clauses))]
@@ -178,7 +185,7 @@ class JobIndex:
 
 
 def engine_jobs(engine: sa.Engine) -> sa.TableClause:
-    """Returns the engine's table of workflows, with the columns that are read of it."""
+    """Returns the job engine's table of workflows, with those of its columns that are read here."""
     text, number = sa.Text(), sa.BigInteger()
     names = {"workflow_uuid": text, "status": text, "name": text, "queue_name": text}
     names |= {"created_at": number, "started_at_epoch_ms": number, "completed_at": number, "priority": number}
@@ -187,6 +194,7 @@ def engine_jobs(engine: sa.Engine) -> sa.TableClause:
 
 
 def words_of_job(request: JobRequest) -> str:
+    """Returns the text that a search for jobs compares: name, model, method and level of detail, in lower case."""
     settings = request.get("settings") or {}
     chosen = [str(settings[key]) for key in ("method", "detail") if settings.get(key)]
     return folded(request.get("name"), request.get("model") or "default", *(chosen or ["contour"]))

@@ -1,7 +1,8 @@
-"""The index of captures and sessions: what they are found by, in the database, so that a page of a hundred thousand is
-one query. The records in the data folder stay the truth: rows are made of them as they are written, and ``reconcile``
-mends at each start what differs: a backup that was put back, a record that somebody removed, a folder of an earlier
-version.
+"""Indexes captures and sessions in the database, so that a page of a hundred thousand is one query.
+
+The records in the data folder are the truth, and each write of a record writes its row. ``Library.reconcile``, called
+at each start, corrects rows that differ: after a backup was restored, a record was removed by hand, or with a data
+folder of an earlier version.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -32,8 +33,8 @@ T = TypeVar("T")
 @dataclass(frozen=True, slots=True)
 class CaptureQuery:
     """Describes which captures are listed and in what order. Every word of ``sought`` must occur in the capture's
-    label, expression, tags, session, verdict, source or id; ``tag``: only captures with this tag; ``before``: only
-    captures older than this id."""
+    label, expression, tags, session, verdict, source or id. ``before``: only captures older than this id. The other
+    fields restrict the list if they are not None."""
 
     sought: str = ""
     session: str | None = None
@@ -54,27 +55,32 @@ class SubjectPage:
 
 
 class Library:
-    """Manages the index of captures and sessions in the database. Methods block."""
+    """Reads and changes the index of captures and sessions. Methods block on the database."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
     def put_capture(self, record: CaptureRecord, changed: int) -> None:
+        """Writes a capture, with its tags, to the index, replacing earlier ones. ``changed``: time of the record's file
+        (ns)."""
         self._put(capture_index, [_capture_row(record, changed)])
         self._put_tags([record])
 
     def drop_capture(self, identity: str) -> None:
+        """Removes a capture, with its tags, from the index."""
         self._drop(capture_index, [identity])
         self._drop_tags([identity])
 
     def put_session(self, record: SessionRecord, changed: int) -> None:
+        """Writes a session to the index, replacing an earlier one. ``changed``: time of the record's file (ns)."""
         self._put(session_index, [_session_row(record, changed)])
 
     def drop_session(self, identity: str) -> None:
+        """Removes a session from the index."""
         self._drop(session_index, [identity])
 
     def scrub(self) -> None:
-        """Removes from the database's files what deleted rows left in them."""
+        """Overwrites what deleted rows left in the database's files, names of people included."""
         scrub(self._engine)
 
     def captures(self, query: CaptureQuery, limit: int, cursor: str | None = None) -> CursorPage:
@@ -110,14 +116,15 @@ class Library:
         return found
 
     def tags(self, limit: int) -> list[str]:
-        """Returns the tags of all captures, the most frequent first."""
+        """Returns the tags of all captures, the most frequent first, ``limit`` at most. Tags that differ in case only
+        count as one."""
         table = capture_tags.c
         query = sa.select(sa.func.min(table.name, type_=sa.Text())).group_by(table.folded)
         with self._engine.connect() as connection:
             return [*connection.scalars(query.order_by(sa.func.count().desc(), table.folded).limit(limit))]
 
     def tags_of(self, captures: Collection[str]) -> dict[str, list[str]]:
-        """Returns the tags of each of the captures."""
+        """Returns the tags of each of these captures; captures without tags are left out."""
         found: dict[str, list[str]] = {}
         query = sa.select(capture_tags.c.capture_id, capture_tags.c.name).order_by(capture_tags.c.folded)
         with self._engine.connect() as connection:
@@ -134,7 +141,7 @@ class Library:
             return [*connection.scalars(query)]
 
     def boards_among(self, captures: Collection[str]) -> dict[str, bool]:
-        """Tells of each of the captures whether it shows the calibration board; ids of no capture are left out."""
+        """Returns for each of the captures whether it shows the calibration board. Ids of no capture are left out."""
         table, found = capture_index.c, dict[str, bool]()
         with self._engine.connect() as connection:
             for some in _portions(captures):
@@ -143,8 +150,8 @@ class Library:
         return found
 
     def heads_labelled(self, prefix: str) -> list[str]:
-        """Lists the ids of the captures that show a head and whose label begins with ``prefix``, in whatever case,
-        oldest first."""
+        """Lists the ids of the captures that show a head and whose label begins with ``prefix``, oldest first. Upper
+        and lower case count as the same."""
         table, begun = capture_index.c, folded(prefix)
         query = sa.select(table.id, table.label).where(
             table.board.is_(False), table.words.startswith(begun, autoescape=True)
@@ -154,7 +161,7 @@ class Library:
         return [row.id for row in rows if folded(row.label).startswith(begun)]
 
     def sessions_of(self, subject: str) -> list[str]:
-        """Lists the ids of the sessions of one subject; ``subject`` as ``subject_of`` returns it."""
+        """Lists the ids of the sessions of one subject, who is given by what ``subject_of`` returns."""
         with self._engine.connect() as connection:
             return [*connection.scalars(sa.select(session_index.c.id).where(session_index.c.subject == subject))]
 
@@ -202,7 +209,8 @@ class Library:
         return SubjectPage(tuple(there), page.next, page.total)
 
     def reconcile(self, store: Store) -> int:
-        """Makes the index agree with the records in the data folder. Returns how many rows differed."""
+        """Makes the index agree with the records in the data folder. Returns how many rows differed. A record that no
+        row can hold is left out and logged."""
         mended = 0
         for table, kind in ((capture_index, "captures"), (session_index, "sessions")):
             with self._engine.connect() as connection:
@@ -260,7 +268,8 @@ class Library:
 
 
 def captures_with(word: str) -> sa.ColumnElement[bool]:
-    """Returns the SQL condition that a word of a search occurs in a capture or in its session."""
+    """Returns the SQL condition that a word of a search occurs in a capture or its session, or is its id or the id's
+    end."""
     sessions = sa.select(session_index.c.id).where(sessions_with(word))
     matches = sa.or_(contains(capture_index.c.words, word), is_or_ends(capture_index.c.id, word))
     return sa.or_(matches, capture_index.c.session.in_(sessions))
@@ -272,7 +281,8 @@ def tagged(tag: str) -> sa.Select:
 
 
 def sessions_with(word: str) -> sa.ColumnElement[bool]:
-    """Returns the SQL condition that a word of a search occurs in a session."""
+    """Returns the SQL condition that a word of a search occurs in a session's label or consent note, or is its id or
+    the id's end."""
     return sa.or_(contains(session_index.c.words, word), is_or_ends(session_index.c.id, word))
 
 

@@ -1,7 +1,8 @@
-"""Pages of a list: what is asked for, a cursor that goes on where a page ended, and the condition for what comes after.
+"""Pages of a list: the query, a cursor that marks where a page ended, and the condition for rows that come after.
 
-Lists go on after a *place* (the value they are sorted by, and an id where values are equal), not after a number of
-rows: what is added or removed meanwhile neither repeats nor drops a line, and the last page costs what the first does.
+A list continues after the *place* of its last row (the value it is sorted by and, between equal values, the id), not
+after a number of rows. So rows that are added or removed meanwhile neither repeat nor drop others, and the last page is
+as fast as the first.
 """
 
 import base64
@@ -40,12 +41,13 @@ class Order:
     descending: bool
 
     def by(self) -> tuple[sa.ColumnElement, ...]:
+        """Returns the columns of the order as SQL's ORDER BY needs them."""
         columns = dict.fromkeys((self.column, self.identity))
         return tuple(column.desc() if self.descending else column.asc() for column in columns)
 
     def after(self, cursor: str) -> sa.ColumnElement[bool]:
-        """Returns the SQL condition for rows that come after a cursor. Raises InputError for a cursor of another kind
-        of list."""
+        """Returns the SQL condition for rows that come after a cursor. Raises InputError for a cursor of a list that is
+        sorted by another type."""
         place = place_of(cursor)
         if isinstance(place.value, str) != isinstance(self.column.type, sa.String):
             raise no_cursor()
@@ -60,7 +62,8 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Holds where a page ended, and how many rows the list had when its first page was made."""
+    """Holds where a page ended: the value and the id of its last row, and how many rows the list had at its first
+    page."""
 
     value: str | int
     identity: str
@@ -68,11 +71,12 @@ class Place:
 
 
 def cursor_of(value: Value, identity: str, total: int) -> str:
+    """Encodes a place as a cursor: text that clients send back and need not understand."""
     return base64.urlsafe_b64encode(json.dumps([value, identity, total]).encode()).decode().rstrip("=")
 
 
 def place_of(cursor: str) -> Place:
-    """Reads a cursor: returns the place that it names. Raises InputError."""
+    """Decodes a cursor. Raises InputError for a text that is none."""
     try:
         value, identity, total = json.loads(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)))
         text = f"{value}{identity}".encode()  # half of a surrogate pair is JSON and nothing that a database takes
@@ -90,14 +94,18 @@ def _is_whole(part: object) -> bool:
 
 
 def no_cursor() -> InputError:
+    """Returns the error for a text that is no cursor of this list."""
     return InputError("cursor", [compose("cursor-of-other-list")])
 
 
 def page_of(
     connection: sa.Connection, rows: sa.Select, order: Order, limit: int, cursor: str | None, *, searched: bool = False
 ) -> CursorPage:
-    """Returns one page of ``rows``, a query without columns. ``searched``: finding the rows takes long, so that they
-    are counted in the same query. Raises InputError for a wrong cursor."""
+    """Returns one page of a list: the rows of the query ``rows`` in ``order``, after ``cursor``, ``limit`` at most.
+
+    ``searched``: the query is slow, so the total is counted within it and not by a second one. Raises InputError for a
+    cursor of another list.
+    """
     wanted = rows.with_only_columns(order.identity.label("id"), order.column.label("value"))
     if cursor is not None:
         total, wanted = place_of(cursor).total, wanted.where(order.after(cursor))
@@ -129,10 +137,11 @@ def storable(text: str) -> str:
 
 
 def contains(column: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
+    """Returns the SQL condition that a column contains a word."""
     return column.contains(word, autoescape=True)
 
 
 def is_or_ends(identity: sa.ColumnElement[str], word: str) -> sa.ColumnElement[bool]:
-    """Returns the SQL condition that an id is ``word`` or ends with it, since pages shorten ids to their ends. Never
-    true for a short word, which would match too many ids."""
+    """Returns the SQL condition that an id is ``word`` or ends with it, since pages show only the ends of ids. A word
+    of fewer than ``ID_LEAST`` characters never matches; it would match too many."""
     return identity.endswith(word, autoescape=True) if len(word) >= ID_LEAST else sa.false()

@@ -1,7 +1,7 @@
-"""Records of the data folder and the job database, and the one name for JSON whose shape nobody here decides.
+"""Defines the records of the data folder and the job database, and a name for JSON objects of any shape.
 
-What lies on disk is read once, where it comes in, into a frozen record; a record that lacks a field is damaged. The
-job engine keeps the requests and results of jobs as they are, across upgrades of this program: those stay mappings.
+A file is read into a frozen record where it enters the program; a file that lacks a field is damaged. Requests and
+results of jobs stay mappings, since the job engine keeps them unchanged across upgrades of this program.
 """
 
 from collections.abc import Mapping
@@ -74,12 +74,12 @@ class CaptureContent:
 
 @dataclass(frozen=True, slots=True)
 class CaptureRecord:
-    """Holds a capture: its source, what people wrote about it, its content, the certificate of its shot, and the
-    verdict on it.
+    """Holds a capture: where it comes from, what people wrote about it, its content, the certificate of its shot, and
+    the verdict on it.
 
-    ``verdict``: None where the capture was not judged (the board, captures of earlier versions); ``faults``: the
-    reasons for the verdict; ``warnings``: what each result of the capture will warn of, and what its pictures show of
-    the face.
+    ``verdict``: None if the capture was not judged (the board, captures of earlier versions); ``faults``: the reasons
+    for the verdict; ``warnings``: those of the calibration and remarks on the face; ``inputs``: SHA-256 of every file
+    by name.
     """
 
     id: str
@@ -103,6 +103,8 @@ class CaptureRecord:
 
 @dataclass(frozen=True, slots=True)
 class SessionRecord:
+    """Holds a session: its label, which is the subject's name, and the note of the subject's consent."""
+
     id: str
     created: str
     label: str
@@ -124,8 +126,8 @@ class CalibrationRecord:
 
 @dataclass(frozen=True, slots=True)
 class UploadRecord:
-    """Holds a resumable upload. ``fields``: what a form would say of the capture; ``capture``: its
-    id, once it was made."""
+    """Holds a resumable upload. ``fields`` describe the future capture; ``length`` is in bytes, ``expires`` in seconds
+    since 1970; ``capture`` is the capture's id, None until it was made."""
 
     id: str
     length: int
@@ -137,20 +139,21 @@ class UploadRecord:
 
 @dataclass(frozen=True, slots=True)
 class RigAdjustment:
-    """Holds the settings that differ from rig.toml: those of cameras, by name, and the lamps that
-    are on during a shot."""
+    """Holds the settings of cameras, by name, and the lamps of a shot that the operator changed from rig.toml. None: as
+    in rig.toml."""
 
     cameras: dict[str, dict[str, float | None]]
     lights: tuple[int, ...] | None = None
 
 
 class RecordFormat(Generic[T]):
-    """Writes and reads records of one kind, as JSON objects that name their format."""
+    """Writes and reads records of one class as JSON objects whose key ``format`` names them."""
 
     def __init__(self, kind: type[T], name: str) -> None:
         self._adapter, self.name = TypeAdapter(kind), name
 
     def document(self, record: T) -> dict[str, object]:
+        """Returns the JSON object of a record."""
         return {"format": self.name, **self._adapter.dump_python(record, mode="json")}
 
     def read(self, document: object) -> T:
@@ -196,7 +199,8 @@ def read_checks(document: Any) -> dict[str, ViewDocument]:
 
 
 class JobWebhook(TypedDict):
-    """Holds the address to which the end of one job is announced. ``secret`` signs the messages."""
+    """Holds the address to which the end of one job is announced. ``secret`` signs the messages; without it they are
+    not signed."""
 
     url: str
     secret: str | None
@@ -236,8 +240,8 @@ class CalibrationOutcome(TypedDict):
 
 
 class WebhookMessage(TypedDict):
-    """Holds one message to a webhook of the service or of a job, about a job or a batch, as the job engine stores
-    it."""
+    """Holds one message to a webhook, about a job or a batch, as the job engine stores it. ``own``: the address, if the
+    message goes to a job's own webhook."""
 
     webhook: str
     own: NotRequired[JobWebhook]
@@ -248,7 +252,7 @@ class WebhookMessage(TypedDict):
 
 
 class EventDocument(TypedDict, total=False):
-    """Holds what happened to a job: a stage with its progress (0 to 1) and remaining time, or a new state."""
+    """Holds what happened to a job: a stage with its progress (0 to 1) and remaining time (s), or a new state."""
 
     state: str
     stage: str

@@ -1,8 +1,8 @@
-"""A result folder that somebody named: written beside it under another name, and moved in when it is complete, file by
-file, report.json last: the folder itself may be a mount, or where a shell stands.
+"""Replaces the result in a folder that a user named, so that it is never half written.
 
-Nothing of an earlier result stays (a head.obj that was asked for once, overlays of other cameras); what is there and no
-result's file stays as it is.
+The new result is written beside the folder and moved in when it is complete, file by file, report.json last: the folder
+itself may be a mount or a shell's working directory. All files of an earlier result are removed. Files that belong to
+no result stay.
 """
 
 import re
@@ -19,11 +19,8 @@ RESULT_FILE = re.compile(
 
 @contextmanager
 def fresh_folder(out: Path) -> Iterator[Path]:
-    """Makes an empty folder whose content replaces the result in ``out`` when the block ends without an error. After an
-    error the folder is removed.
-
-    Raises OSError at once where ``out`` cannot be written.
-    """
+    """Yields an empty folder whose content replaces the result in ``out`` when the block ends. After an error in the
+    block, ``out`` stays as it was. Raises OSError at once if ``out`` cannot be written."""
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(20, "Not a directory", str(out))
     out.parent.mkdir(parents=True, exist_ok=True)

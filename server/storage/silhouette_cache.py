@@ -1,9 +1,9 @@
-"""Silhouettes of a capture kept on disk: a restart with other settings, and the operator's pages, find them there.
+"""Caches the silhouettes of a capture on disk, for restarts with other settings and for the operator's pages.
 
-A file's name is the sha256 of all that its content follows from: the capture's files, the settings of the segmentation,
-and the code. What comes out of it is, bit for bit, what ``segment`` found. It shows a face, and lies where
-``Store.remove_capture`` erases it with its capture. A file that cannot be read is made anew; one that cannot be
-written is done without.
+A file's name is the SHA-256 of everything that its content depends on: the capture's files, the settings of the
+segmentation, and the code. What is read from it equals what ``segment`` returned, bit for bit. It shows a face, so it
+lies where ``Store.remove_capture`` erases it with its capture. A file that cannot be read is made anew. One that cannot
+be written is not kept.
 """
 
 import dataclasses
@@ -47,8 +47,8 @@ QUICK = 1  # zlib's fastest level: 35 MB become 4.7 MB in 0.2 s, and no level ge
 def segment_once(
     folder: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress
 ) -> dict[str, Silhouette]:
-    """Returns the silhouettes of a capture: those kept in ``folder`` from an earlier call, else what ``segment``
-    returns, which is then kept. The capture must have been read from files."""
+    """Returns the silhouettes of a capture. If ``folder`` has them from an earlier call, they are read; otherwise
+    ``segment`` computes them and they are stored there. The capture must have been read from files."""
     path = folder / (_key(capture, settings) + SUFFIX)
     with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
         found = _decoded(path.read_bytes())

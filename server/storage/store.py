@@ -63,6 +63,7 @@ def repeatable_id(key: str, idempotency_key: str) -> str:
 
 
 def is_id(text: str) -> bool:
+    """Returns whether a text is an id: 28 hex digits."""
     return ID.match(text) is not None
 
 
@@ -75,12 +76,24 @@ class StoredFile:
 
 
 class RecordIndex(Protocol):
-    """Declares what is called when a record is written or removed. ``changed``: time of the record's file (ns)."""
+    """Declares the methods of an index of the data folder. ``Store`` calls them after it has written or removed a
+    record."""
 
-    def put_capture(self, record: CaptureRecord, changed: int) -> None: ...
-    def drop_capture(self, identity: str) -> None: ...
-    def put_session(self, record: SessionRecord, changed: int) -> None: ...
-    def drop_session(self, identity: str) -> None: ...
+    def put_capture(self, record: CaptureRecord, changed: int) -> None:
+        """Notes that a capture's record was written at ``changed`` (time of the file, ns)."""
+        ...
+
+    def drop_capture(self, identity: str) -> None:
+        """Notes that a capture was removed."""
+        ...
+
+    def put_session(self, record: SessionRecord, changed: int) -> None:
+        """Notes that a session's record was written at ``changed`` (time of the file, ns)."""
+        ...
+
+    def drop_session(self, identity: str) -> None:
+        """Notes that a session was removed."""
+        ...
 
 
 _THINGS = {
@@ -93,7 +106,8 @@ _THINGS = {
 
 
 class Store:
-    """Manages the data folder. Every id that comes from a request passes ``is_id`` before it becomes part of a path."""
+    """Reads and changes the data folder. Methods block. Every id that comes from a request passes ``is_id`` before it
+    becomes part of a path."""
 
     def __init__(self, data: Path, index: RecordIndex | None = None) -> None:
         self.data, self._index = data, index
@@ -103,14 +117,14 @@ class Store:
         data.chmod(0o700)  # faces are biometric data
 
     def folder(self, kind: str, identity: str) -> Path:
-        """Returns the folder in which a thing of this kind and id lies or would lie. Raises NotFound for a text that is
-        no id."""
+        """Returns the folder of a thing of a kind ("captures", "jobs" and so on), whether it exists or not. Raises
+        NotFound for a text that is no id."""
         if not is_id(identity):
             raise NotFound(_THINGS.get(kind) or compose("thing-file"), identity)
         return self.data / kind / identity
 
     def ids(self, kind: str) -> list[str]:
-        """Lists the ids of all things of a kind, newest first."""
+        """Lists the ids of all things of a kind ("captures", "jobs" and so on), newest first."""
         with suppress(FileNotFoundError):
             names = (entry.name.removesuffix(".json") for entry in os.scandir(self.data / kind))
             return sorted((name for name in names if is_id(name)), reverse=True)
@@ -118,8 +132,8 @@ class Store:
 
     @contextmanager
     def incoming(self) -> Iterator[Path]:
-        """Makes a folder in which things are received while the block runs. What was not moved out of it is removed at
-        the end."""
+        """Yields a new folder for things that are being received. What was not moved out of it is removed at the end of
+        the block; after a kill ``sweep`` removes it."""
         folder = self.data / "incoming" / new_id()
         folder.mkdir(parents=True)
         try:
@@ -128,6 +142,7 @@ class Store:
             shutil.rmtree(folder, ignore_errors=True)
 
     def free_bytes(self) -> int:
+        """Returns the free bytes on the disk of the data folder."""
         return shutil.disk_usage(self.data).free
 
     def reserve(self, wanted: int, spare: int) -> None:
@@ -136,7 +151,8 @@ class Store:
             raise DiskFull
 
     def add_capture(self, folder: Path, record: CaptureRecord) -> None:
-        """Moves ``folder``, which holds ``files/``, to its final place and writes the capture's record into it."""
+        """Writes a capture's record into ``folder``, which holds ``files/``, and moves the folder to its final place in
+        one rename. After a kill the capture is complete or absent."""
         write_atomically(folder / "record.json", _encoded(CAPTURE.document(record)))
         move_durably(folder, self.folder("captures", record.id))
         self._tell(record)
@@ -199,7 +215,7 @@ class Store:
         return {}
 
     def captures(self) -> Iterator[CaptureRecord]:
-        """Yields the records of all captures, newest first."""
+        """Yields the records of all captures, newest first. Damaged records are set aside and left out."""
         for identity in self.ids("captures"):
             folder = self.data / "captures" / identity
             record = self._read(folder / "record.json", CAPTURE, folder)
@@ -207,8 +223,8 @@ class Store:
                 yield record
 
     def change_capture(self, identity: str, change: Callable[[CaptureRecord], CaptureRecord]) -> CaptureRecord:
-        """Replaces the record of a capture by what ``change`` makes of it, and returns the new
-        record. Raises NotFound."""
+        """Replaces the record of a capture by what ``change`` returns for it, and returns the new record. Changes wait
+        for each other, and the file is replaced atomically. Raises NotFound."""
         with self._change(compose("thing-capture"), identity):
             record = change(self.capture(identity))
             path = self.folder("captures", identity) / "record.json"
@@ -227,7 +243,7 @@ class Store:
                 raise NotFound(what, identity) from error
 
     def remove_capture(self, identity: str) -> None:
-        """Removes a capture and all that is cached of it, which shows the face as well."""
+        """Removes a capture and everything cached of it, which shows the face as well."""
         with self._change(compose("thing-capture"), identity):
             self.remove(self.folder("captures", identity))
             self.remove(self.cache_of(identity))
@@ -239,21 +255,23 @@ class Store:
         return self.folder("cache/captures", identity)
 
     def add_session(self, record: SessionRecord) -> None:
+        """Writes the record of a session, replacing an earlier one atomically."""
         path = self.folder("sessions", record.id).with_suffix(".json")
         write_atomically(path, _encoded(SESSION.document(record)))
         _sync_folder(path.parent)
         self._tell(record)
 
     def change_session(self, identity: str, change: Callable[[SessionRecord], SessionRecord]) -> SessionRecord:
-        """Replaces the record of a session by what ``change`` makes of it, and returns the new
-        record. Raises NotFound."""
+        """Replaces the record of a session by what ``change`` returns for it, and returns the new record. Changes wait
+        for each other, and the file is replaced atomically. Raises NotFound."""
         with self._change(compose("thing-session"), identity):
             record = change(self.session(identity))
             self.add_session(record)
         return record
 
     def remove_session(self, identity: str) -> None:
-        """Removes the record of a session, and half-written copies of it. The session's captures stay."""
+        """Removes the record of a session, and copies of it that a kill left half written. The session's captures
+        stay."""
         with self._change(compose("thing-session"), identity):
             path = self.folder("sessions", identity).with_suffix(".json")
             for part in [*unfinished(path.parent, path.name)]:
@@ -271,12 +289,14 @@ class Store:
         return record
 
     def sessions(self) -> Iterator[SessionRecord]:
+        """Yields the records of all sessions, newest first. Damaged records are set aside and left out."""
         for identity in self.ids("sessions"):
             with suppress(NotFound):
                 yield self.session(identity)
 
     def remove(self, path: Path) -> None:
-        """Deletes a file or folder. It is out of sight at once, even if the deletion is interrupted."""
+        """Deletes a file or folder. It is first renamed into ``trash``, so that it is gone from sight even if the
+        deletion is interrupted. Does nothing if it does not exist."""
         target = self.data / "trash" / f"{new_id()}"
         try:
             path.rename(target)
@@ -287,7 +307,7 @@ class Store:
         shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(missing_ok=True)
 
     def sweep(self, older_s: float) -> int:
-        """Deletes what a crash left in ``incoming`` and ``trash``, and half-written files, if untouched for ``older_s``
+        """Deletes what crashes left in ``incoming`` and ``trash``, and half-written files, if untouched for ``older_s``
         seconds. Returns how many were deleted."""
         removed = 0
         for kind in ("incoming", "trash"):
@@ -313,7 +333,7 @@ class Store:
                     yield from unfinished(Path(entry))
 
     def list_quarantined(self) -> list[str]:
-        """Lists the names of damaged records that were moved to ``set-aside``."""
+        """Lists the names of damaged records that were moved to the folder ``set-aside``."""
         return sorted(entry.name for entry in (self.data / "set-aside").iterdir())
 
     def _read(self, path: Path, wanted: RecordFormat[T], whole: Path) -> T | None:
@@ -334,8 +354,8 @@ class Store:
 
 
 def move_durably(folder: Path, target: Path) -> None:
-    """Renames a folder whose files were synced, and syncs the folders' entries. Raises OSError if ``target`` has
-    content."""
+    """Renames a folder whose files have reached the disk, and makes the rename itself durable. Raises OSError if
+    ``target`` is a folder with content."""
     for path in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
         _sync_folder(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -344,10 +364,12 @@ def move_durably(folder: Path, target: Path) -> None:
 
 
 def folder_bytes(folder: Path) -> int:
+    """Returns the size in bytes of all files below a folder."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def newest(path: Path) -> float:
+    """Returns when a path, or anything below it, was last modified (s since 1970). Raises FileNotFoundError."""
     times = [path.stat().st_mtime]
     if path.is_dir():
         times += [entry.stat().st_mtime for entry in path.rglob("*")]

@@ -1,5 +1,8 @@
-"""What a calibration runs in a child process: an archive of board pictures, or of photographs of a scene, in; a rig and
-its report out. A folder with board.toml is of a board."""
+"""The tasks of a calibration, which run in a child process: they take in an archive of pictures and compute a rig with
+its report.
+
+A folder with board.toml shows a calibration board; any other shows a scene.
+"""
 
 import hashlib
 import json
@@ -25,8 +28,8 @@ of the work corrects. Matching goes by pairs, so that more of them take longer."
 
 
 def expected(folder: Path) -> dict[str, float]:
-    """Estimates the seconds of each stage of a calibration before it begins, from the number of pictures. Larger
-    pictures take longer."""
+    """Estimates the seconds of each stage of a calibration from the number of pictures, before it begins. Larger
+    pictures take longer than that."""
     pictures = sum(path.is_file() for path in (folder / "images").rglob("*"))
     if not is_of_board(folder):
         return {stage: took * pictures for stage, took in SCENE_STAGES_S.items()}
@@ -34,14 +37,15 @@ def expected(folder: Path) -> dict[str, float]:
 
 
 def is_of_board(folder: Path) -> bool:
+    """Returns whether the pictures in a folder show a calibration board."""
     return (folder / BOARD).is_file()
 
 
 def ingest_photographs(
     context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> None:
-    """Unpacks an archive of photographs of a scene, with scale.json if there is one, into ``folder`` and checks both.
-    Raises InputError."""
+    """Unpacks an archive of photographs of a scene into ``folder``, with scale.json if there is one, and checks both.
+    Raises InputError naming every fault."""
     from calibration.scene.photographs import find_photographs
 
     target = Path(folder)
@@ -61,14 +65,14 @@ def ingest_photographs(
 
 
 def forget_scene(folder: Path) -> None:
-    """Removes the photographs of a scene when the calibration has ended: they may show a subject, and only captures can
-    be erased on request."""
+    """Removes the photographs of a scene once the calibration has ended, since they may show a person and only captures
+    can be erased on request. Does nothing for a board."""
     if not is_of_board(folder):
         shutil.rmtree(folder / "images", ignore_errors=True)
 
 
 def check_scale(folder: Path) -> None:
-    """Raises InputError for a scale.json that does not fit the photographs beside it."""
+    """Raises InputError for a scale.json that does not fit the photographs beside it. Does nothing without one."""
     from rig.formats.scale_json import read_scale
 
     if (folder / SCALE).is_file():
@@ -78,7 +82,8 @@ def check_scale(folder: Path) -> None:
 def ingest_board_pictures(
     context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits
 ) -> None:
-    """Unpacks an archive of board.toml and IMAGES/ into ``folder`` and checks both. Raises InputError."""
+    """Unpacks an archive of board.toml and IMAGES/ into ``folder`` and checks both. Raises InputError naming every
+    fault."""
     from calibration.board.board import read_board
     from calibration.board.picture_files import list_pictures
 
@@ -108,8 +113,13 @@ def calibrate_folder(
     cache: str,
     front: str | None,
 ) -> CalibrationOutcome:
-    """Calibrates from the board pictures or photographs in ``folder`` and writes the files of the calibration to
-    ``result``. Returns the outcome, as the record shows it. Raises InputError."""
+    """Calibrates from the board pictures or photographs in ``folder`` and writes cameras.json, calibration.json and
+    report.html to ``result``.
+
+    ``previous``: the last cameras.json, with which the result is compared; ``cache``: folder of detected corners;
+    ``front``: the camera that the subject faces (None: guessed). Returns the outcome for the calibration's record.
+    Raises InputError, also with the reasons why checks refuse the result.
+    """
     if not is_of_board(Path(folder)):
         return _calibrate_scene(report, Path(folder), Path(result), front)
     from calibration.board.board import read_board

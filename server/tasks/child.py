@@ -1,10 +1,11 @@
 """A warm child process that does one piece of heavy work after another.
 
 Heavy work (reconstruction, checking images, rendering the simulated studio) runs outside the process that answers
-requests or keeps a worker's heartbeat: a GL context and the interpreter lock stay out of its way, a crash in native
-code costs one job and not the process, and what does not listen to a cancellation can be killed.
+requests or keeps a worker's heartbeat. So neither a GL context nor Python's interpreter lock delays that process, a
+crash in native code costs one job only, and work that does not react to a cancellation can be killed.
 
-The child is this module run with a socket. It ends when the socket does, so that it never outlives its parent.
+The child runs this module and is connected by a socket. It ends when the socket closes, so it never outlives its
+parent.
 """
 
 import errno
@@ -41,8 +42,8 @@ Report = Progress  # as the task of a reconstruction calls it
 
 
 class WorkFailed(EigenheadError):
-    """Reports that work in a child process failed. ``kind`` names a known failure (an error of this project, full disk,
-    no memory) or a bug, whose ``trace`` is for the log."""
+    """Reports that work in a child process failed. ``kind`` is the name of an error class of this project, or
+    "disk-full", "out-of-memory", "crash" or "bug". A bug has a ``trace`` for the log."""
 
     def __init__(
         self, kind: str, message: Message | str, faults: Iterable[Message | str] = (), trace: str = ""
@@ -53,16 +54,15 @@ class WorkFailed(EigenheadError):
 
 
 class WorkerContext:
-    """Keeps resources in the child process from one piece of work to the next: each is made once, by name, and closed
-    at the end."""
+    """Keeps resources of a child process, such as a model or a renderer, from one piece of work to the next."""
 
     def __init__(self) -> None:
         self._stack = ExitStack()
         self._things: dict[str, object] = {}
 
     def keep(self, name: str, make: Callable[[], Any]) -> Any:
-        """Returns the resource called ``name``, which ``make`` makes at the first call. If that is a context manager,
-        it is entered and its value returned."""
+        """Returns the resource called ``name``. The first call makes it by ``make``; if that is a context manager, it
+        is entered and its value returned."""
         if name not in self._things:
             thing: Any = make()
             self._things[name] = self._stack.enter_context(thing) if hasattr(thing, "__exit__") else thing
@@ -75,8 +75,7 @@ class WorkerContext:
 
 
 class Child:
-    """Runs pieces of work in one child process, which is started when the first one needs it. Not for two threads at
-    once.
+    """Runs pieces of work in one child process, which starts at the first one. Two threads must not use it at once.
 
     ``variables``: environment variables of the child, which override those of this process.
     """
@@ -94,10 +93,10 @@ class Child:
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Callable[P, T]:
         """Returns a function that runs ``work`` in the child: ``child.remote(work)(name=value)`` calls ``work(context,
-        report, name=value)`` there. ``work`` must be a function of a module, since only its name is sent.
+        report, name=value)`` there. ``work`` must be a module's function, since only its name is sent.
 
-        The returned function raises Cancelled within ``PATIENCE_S`` and one poll after ``cancelled()`` becomes true;
-        InputError or WorkFailed where ``work`` raised; and WorkFailed("crash") where the child died.
+        The returned function raises Cancelled within a second after ``cancelled()`` returned True; InputError or
+        WorkFailed if ``work`` raised; and WorkFailed of the kind "crash" if the child died.
         """
 
         def call(*arguments: P.args, **named: P.kwargs) -> T:
@@ -120,6 +119,7 @@ class Child:
             raise
 
     def close(self) -> None:
+        """Kills the child process. The next piece of work starts another."""
         self._kill()
 
     def start(self) -> None:
@@ -172,7 +172,7 @@ class Child:
 
 
 class ChildProcessPool:
-    """Lends a few child processes to many threads. Each thread takes one for its work and gives it back."""
+    """Lends a fixed number of child processes to many threads. Each child serves one thread at a time."""
 
     def __init__(self, count: int, niceness: int = 0) -> None:
         self._all = [Child(niceness) for _ in range(count)]
@@ -182,7 +182,8 @@ class ChildProcessPool:
 
     @contextmanager
     def one(self, timeout_s: float | None = None) -> Iterator[Child]:
-        """Yields a child that nobody else has meanwhile. Raises queue.Empty where none is free in time."""
+        """Yields a child that no other thread has during the block, waiting for one if needed. Raises queue.Empty if
+        none is free within ``timeout_s`` seconds."""
         child = self._free.get(timeout=timeout_s)
         try:
             yield child
@@ -190,6 +191,7 @@ class ChildProcessPool:
             self._free.put(child)
 
     def close(self) -> None:
+        """Kills all child processes."""
         for child in self._all:
             child.close()
 
@@ -216,7 +218,8 @@ def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Mess
 
 
 def serve(connection: Connection) -> None:
-    """Runs the main loop of a child process. The first thread works, as a GL context requires; a second one listens."""
+    """Runs the main loop of a child process; does not return. The first thread works, as a GL context requires. A
+    second one receives requests and cancellations, and ends the process when the parent is gone."""
     requests: queue.Queue[bytes] = queue.Queue()
     stop = threading.Event()
 

@@ -1,11 +1,11 @@
-"""Whether this machine draws; runs in a child process."""
+"""Tries whether this machine has OpenGL, for drawing and for computing; runs in a child process."""
 
 from rig.progress import Progress
 from server.tasks.child import WorkerContext
 
 
 def try_egl(context: WorkerContext, report: Progress) -> str:
-    """Opens a GL context and returns the name of its device. Raises the renderer's error where that fails."""
+    """Opens a GL context and returns the name of its device. Raises EglUnavailable."""
     from rig.render.context import GlContext  # without the renderer's NumPy: half the time
 
     gl = GlContext()
@@ -16,7 +16,7 @@ def try_egl(context: WorkerContext, report: Progress) -> str:
 
 
 def try_compute(context: WorkerContext, report: Progress) -> str:
-    """Opens a compute device and says whether jobs use it by themselves. Raises ComputeUnavailable."""
+    """Opens a compute device and returns a sentence on whether jobs use it by default. Raises ComputeUnavailable."""
     from rig.render.compute import ComputeDevice, is_software
 
     with ComputeDevice.create() as device:

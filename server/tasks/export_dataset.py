@@ -1,7 +1,7 @@
-"""A capture as it lies on somebody's disk, written as a data set of views for another program.
+"""Writes a capture folder as a data set of views for another program.
 
-Cameras, masks and the views that take part are those that a reconstruction of the capture would have: cameras and masks
-that had to be found are kept beside the data set, or taken from the result that it is exported with.
+Cameras, masks and the choice of views are those of a reconstruction. Cameras and masks that the capture lacks are
+estimated and kept beside the data set, or copied from the result that it is exported with.
 """
 
 import json
@@ -31,7 +31,8 @@ NOT_OF_CAMERAS = ("masks/", "background/", "features.json")  # inputs that may d
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """Names the cameras in a data set and those left out of it, and holds the warnings of the capture."""
+    """Holds what a data set contains: its cameras, those left out, the number of points, and the warnings about the
+    capture."""
 
     cameras: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -42,8 +43,12 @@ class Exported:
 def export_folder(
     folder: Path, out: Path, form: DatasetFormat, *, result: Path | None, chosen: "Settings", report: Progress
 ) -> Exported:
-    """Writes the capture in ``folder`` to ``out`` as a data set; with ``result``, the folder of its reconstruction, the
-    head as a point cloud too. Raises InputError, and what calibration, segmentation and the choice of views raise."""
+    """Writes the capture in ``folder`` to ``out`` as a data set, replacing an earlier one. With ``result``, the folder
+    of its reconstruction, the head is written as a point cloud too.
+
+    Raises InputError naming every fault, also if ``result`` was made from other pictures, and the errors of
+    calibration, segmentation and the choice of views.
+    """
     from pipeline.results.view_dataset import ViewDataset, write_view_dataset
     from pipeline.settings import OutputSettings
     from pipeline.view_checks.usable_views import usable_views

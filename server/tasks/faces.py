@@ -1,6 +1,6 @@
-"""The faces in a capture's pictures, for the operator's pages; runs in a child process.
+"""Finds the faces in a capture's pictures, for the operator's pages; runs in a child process.
 
-Camera by camera, each picture made smaller as it is read: the networks take 192 px of a face.
+Pictures are read one after the other and reduced at once, since the networks see a face in 192 pixels.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,8 +31,8 @@ PICTURE_PX = 1600  # longer side: a face of an eighth of it has the networks' 19
 def find_capture_faces(
     context: WorkerContext, report: Progress, *, capture: str, images: Mapping[str, str]
 ) -> FacesDocument:
-    """Finds the faces in pictures of a capture. ``images``: file of each camera's picture, below the folder
-    ``capture``. Raises InputError and DamagedNetwork."""
+    """Finds the faces in a capture's pictures, and which of them is the subject's. ``images``: file of each camera's
+    picture, below the folder ``capture``. Raises InputError, and DamagedNetwork if a network's file is damaged."""
     from pipeline.faces.matching import EYE_DISTANCE_MM
     from pipeline.faces.networks import load_networks
     from pipeline.faces.sighting import reduce_picture
@@ -65,7 +65,7 @@ def find_capture_faces(
 def describe(
     subject: "SubjectFaces", rig: Rig, recorded: Rig, suggest: "Callable[[MatchedFaces], PixelsOfPoints]"
 ) -> FacesDocument:
-    """Returns the faces that were found with the reduced cameras ``rig``, in the pixels of the files' cameras
+    """Converts the faces found with the reduced cameras ``rig`` to pixels of the picture files, whose cameras are
     ``recorded``. In each picture the subject's face comes first."""
     matched = subject.matched
     faces: dict[str, list[FoundFace]] = {}

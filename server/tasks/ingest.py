@@ -1,6 +1,6 @@
-"""What happens to an uploaded archive or a capture folder before it is accepted; runs in a child process.
+"""Checks an uploaded archive or a capture folder before it is accepted; runs in a child process.
 
-Camera by camera, so that a rig of 64 large cameras is checked in the memory of one.
+It works camera by camera, so that a rig of 64 large cameras needs the memory of one.
 """
 
 import hashlib
@@ -55,10 +55,10 @@ Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as fea
 def ingest_archive(
     context: WorkerContext, report: Progress, *, archive: str, folder: str, limits: ArchiveLimits, image_pixels: int
 ) -> CaptureContent:
-    """Unpacks the archive of a capture, checks the capture, and leaves exactly its files in ``folder``. Photographs
+    """Unpacks the archive of a capture, checks it, and leaves in ``folder`` exactly the capture's files. Photographs
     without cameras are calibrated first.
 
-    Returns the content, as the capture's record holds it. Raises InputError naming every fault.
+    Returns the content for the capture's record. Raises InputError naming every fault; the folder is useless then.
     """
     target = Path(folder)
     unpacked = target.with_name(target.name + ".unpacked")
@@ -153,8 +153,8 @@ def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportW
 def ingest_folder(
     context: WorkerContext, report: Progress, *, folder: str, image_pixels: int, measured: bool = False
 ) -> CaptureContent:
-    """Checks a capture folder that the service made itself, and returns its content. ``measured``: the pictures were
-    measured when the shot was taken, so that only the subject is looked for."""
+    """Checks a capture folder that the service itself has written, and returns its content. ``measured``: the pictures
+    were measured at the shot, so only the subject's place is looked for. Raises InputError naming every fault."""
     return check_capture(Path(folder), image_pixels, report, measured=measured, networks=_face_networks(context))
 
 
@@ -167,8 +167,8 @@ def _face_networks(context: WorkerContext) -> FaceNetworks | None:
 
 
 def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image_pixels: int) -> CaptureContent:
-    """Checks a shot of the calibration board and leaves only its images in ``folder``, one a camera, of any size.
-    Returns their description. Raises InputError."""
+    """Checks a shot of the calibration board and removes everything but its images from ``folder``: one a camera, of
+    any size. Returns the content for the capture's record. Raises InputError naming the images that are too large."""
     root = Path(folder)
     for entry in root.iterdir():
         if entry.name != "images":
@@ -198,8 +198,11 @@ def check_capture(
     strays_pass: bool = False,
     networks: FaceNetworks | None = None,
 ) -> CaptureContent:
-    """Checks a capture folder and returns its content. Pictures of no camera are faults unless ``strays_pass``; with
-    ``networks`` the subject's face is looked for. Raises InputError naming every fault."""
+    """Checks a capture folder and returns its content. Raises InputError naming every fault.
+
+    ``measured``: only the subject's place is looked for in the pictures, since the shot measured the rest;
+    ``strays_pass``: accept pictures that belong to no camera; ``networks``: look for the subject's face with these.
+    """
     rig_file = find_rig_file(root)
     if rig_file is None:
         raise InputError("capture", [no_rig_fault(root)])
@@ -234,11 +237,7 @@ def check_capture(
         faults.append(compose("every-picture-its-plate"))
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
-    for path in rig_file_parts(rig_file):
-        digests[path.relative_to(root).as_posix()] = _sha256(path)
-    if has_known_length(root):
-        read_scale(root / SCALE, rig.names)
-        digests[SCALE] = _sha256(root / SCALE)
+    digests |= _camera_digests(root, rig_file, rig)
     return CaptureContent(
         cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
         front=rig.front_camera(),
@@ -248,6 +247,15 @@ def check_capture(
         checks={name: view.document() for name, view in views.items()},
         face=_face_of(small, rig, networks, is_metric=_is_metric(root)) if networks is not None and small else None,
     )
+
+
+def _camera_digests(root: Path, rig_file: Path, rig: Rig) -> dict[str, str]:
+    """Returns the SHA-256 of the rig's files and of scale.json. Raises InputError for a wrong scale.json."""
+    digests = {path.relative_to(root).as_posix(): _sha256(path) for path in rig_file_parts(rig_file)}
+    if has_known_length(root):
+        read_scale(root / SCALE, rig.names)
+        digests[SCALE] = _sha256(root / SCALE)
+    return digests
 
 
 def _features_file_faults(path: Path, rig: Rig) -> list[Message]:
@@ -289,8 +297,8 @@ def _shows_its_plate(shot: Capture, name: str) -> bool:
 
 
 def check_features(context: WorkerContext, report: Progress, *, folder: str, points: Points) -> bytes:
-    """Checks feature points (px by point and camera) against the capture in ``folder``. Returns the bytes of the
-    features.json that holds them. Raises InputError."""
+    """Checks feature points (pixels, by point and camera) against the cameras of the capture in ``folder``. Returns the
+    bytes of the features.json that holds them. Raises InputError naming every wrong point."""
     rig_file = find_rig_file(Path(folder))
     if rig_file is None:
         raise InputError("capture", [NO_RIG])

@@ -1,4 +1,4 @@
-"""What compares photographs in this process: a GPU where there is one and the settings let it, or the processor."""
+"""Chooses what compares photographs in this process: a GPU or the processor."""
 
 from typing import TYPE_CHECKING
 
@@ -15,8 +15,9 @@ MOST_THREADS = (
 
 
 def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Renderer") -> "ComputeDevice | None":
-    """Returns the device that ``chosen.device`` names, made once a process; None for the processor, and for ``auto``
-    where many threads share its loops. Raises ComputeUnavailable."""
+    """Opens the compute device that ``chosen.device`` names, once a process. Returns None if the processor compares:
+    with the device ``cpu``, and with ``auto`` without a GPU or with more than ``MOST_THREADS`` threads. Raises
+    ComputeUnavailable if ``gl`` was chosen and is not there."""
     from pipeline.compute.threads import thread_count
     from rig.render.compute import open_device
 

@@ -1,7 +1,7 @@
-"""A folder that holds nothing but photographs, and perhaps scale.json, made a capture: its cameras found, and kept.
+"""Turns a folder of photographs, with scale.json or without, into a capture: its cameras are estimated and kept.
 
-``kept`` is where each step's result stays: cameras.json, calibration.json (the figures, and what they were made of) and
-calibration.html; then masks/. A second run with the same photographs takes them from there.
+Each step leaves its result in the folder ``kept``: cameras.json, calibration.json (figures, and SHA-256 of what they
+were made from), calibration.html, masks/. A second run with the same photographs reads them from there.
 """
 
 import hashlib
@@ -49,7 +49,7 @@ CAMERAS, FIGURES, PAGE = "cameras.json", "calibration.json", "calibration.html"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """Holds the capture and rig that ``reconstruct`` needs, and the warnings from finding the cameras."""
+    """Holds the capture and rig that ``reconstruct`` needs, and the warnings from estimating the cameras."""
 
     capture: Capture
     rig: Rig
@@ -57,7 +57,7 @@ class Prepared:
 
 
 def photographs_alone(folder: Path) -> bool:
-    """Tells whether a folder has photographs but no cameras."""
+    """Returns whether a folder has photographs but no cameras, so that these must be estimated."""
     root = capture_root(folder)
     if find_rig_file(root) is not None:
         return False
@@ -67,9 +67,9 @@ def photographs_alone(folder: Path) -> bool:
 
 
 def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Progress) -> Prepared:
-    """Reads a capture folder. If it has no cameras, they are found from its photographs and kept in ``kept``.
+    """Reads a capture folder. If it has no cameras, they are estimated from its photographs and written to ``kept``.
 
-    Raises InputError naming every fault, and CalibrationRefused with the views that do not join and what to add.
+    Raises InputError naming every fault, and CalibrationRefused naming the views that do not join and what to add.
     """
     if not photographs_alone(folder):
         return Prepared(*read_scaled_capture(folder), ())
@@ -91,8 +91,9 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
 
 def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) -> tuple[Capture, Rig]:
     """Reads a capture folder with its cameras. With a scale.json beside them the cameras are scaled to millimetres.
+    ``pixels_most``: larger pictures are reduced to that many pixels.
 
-    Raises InputError naming every fault, also where the scaled cameras are in no plausible unit.
+    Raises InputError naming every fault, also if the scaled cameras are in no plausible unit.
     """
     capture, rig = read_capture(folder, pixels_most=pixels_most)
     root = capture_root(folder)
@@ -108,8 +109,8 @@ def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) 
 
 
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Progress) -> tuple[ReportWarning, ...]:
-    """Calibrates the cameras of photographs and writes cameras.json and its report to ``kept``, unless those are there
-    from the same photographs. Returns the warnings."""
+    """Calibrates the cameras of photographs and writes cameras.json and the report to ``kept``. Does nothing if those
+    are there from the same photographs. Returns the warnings. Raises InputError and CalibrationRefused."""
     made_of = _made_of(root, front)
     if (told_before := calibration_warnings(kept, made_of)) is not None:
         return told_before
@@ -139,8 +140,8 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
 
 
 def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -> tuple[ReportWarning, ...] | None:
-    """Returns the warnings that ``calibrate_photographs`` kept in ``kept``. Returns None where the cameras there are
-    not from photographs, or not from the files ``made_of`` (SHA-256 by name)."""
+    """Returns the warnings that ``calibrate_photographs`` wrote to ``kept``. Returns None if there are none, if
+    cameras.json was changed since, or if it was made from other files than ``made_of`` (SHA-256 by name)."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
         same = made_of is None or document["made_of"] == made_of
@@ -150,8 +151,8 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
 
 
 def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
-    """Checks the sizes of pictures from their headers, before anything is decoded. Raises InputError naming every
-    picture that is too large."""
+    """Raises InputError naming every picture with more than ``image_pixels`` pixels. Sizes are read from the files'
+    headers, before anything is decoded."""
     sizes = {path: picture_size(path) for path in files}
     huge = [f"{path.name} is {w} x {h} pixels" for path, (w, h) in sizes.items() if w * h > image_pixels]
     if huge:
@@ -161,8 +162,8 @@ def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
 def keep_masks(
     kept: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress
 ) -> dict[str, Silhouette]:
-    """Returns the silhouettes of a capture. If they were found from the photographs alone, they are also written to
-    masks/ in ``kept``, where a second run finds them."""
+    """Returns the silhouettes of a capture. If they had to be estimated from the photographs alone, they are also
+    written to masks/ in ``kept``, where a second run finds them."""
     from pipeline.segmentation.segment import segment
     from server.storage.silhouette_cache import SUFFIX, segment_once
 

@@ -1,6 +1,8 @@
-"""Makes ahead what a first job would wait for: the compiled loops of ``pipeline.compute.kernel_list``, in processes
-over all cores. Set-up does it (``eigenhead prepare``), and a command that finds something missing does it before its
-work."""
+"""Compiles numerical loops ahead, those that ``pipeline.compute.kernel_list`` lists, in several processes, so that no
+job waits for them.
+
+The installation does it (``eigenhead prepare``). A command that finds a loop missing does it before its work.
+"""
 
 import errno
 import logging
@@ -27,7 +29,7 @@ PROCESSES_MOST = 8  # each takes 250 MB and half a second to load what it compil
 
 
 class Prepared(NamedTuple):
-    """Holds the numbers of compiled loops: those compiled now, those still missing, and all."""
+    """Holds how many numerical loops were compiled now, are still missing, and are listed in all."""
 
     compiled: int  # now
     missing: int  # still: nothing can be kept
@@ -35,8 +37,8 @@ class Prepared(NamedTuple):
 
 
 def compile_kernel(context: WorkerContext, report: Progress, *, line: str) -> bool:
-    """Compiles the loop that a line of the list names, in a child process. Tells whether the code could be kept; if
-    not, the log says so."""
+    """Compiles the loop that a line of the list names, in a child process. Returns whether the code could be kept on
+    disk; if not, the log says so."""
     from pipeline.compute.kernel_list import Kernel
 
     kernel = Kernel.from_line(line)

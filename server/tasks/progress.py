@@ -1,8 +1,8 @@
-"""From the stages of a reconstruction to one progress and one remaining time.
+"""Computes one progress and one remaining time of a job from the progress of its stages.
 
-The pipeline reports (stage, fraction of that stage); some stages report no fraction. A stage that another one has
-interrupted ("fit", by "parts") is a stage of its own when it goes on: "fit again". How long each should take is given
-(``server.tasks.stage_durations``).
+The pipeline reports a stage and a fraction of it; some stages report no fraction. A stage that continues after another
+interrupted it counts as a stage of its own: "fit" interrupted by "parts" continues as "fit again". The expected seconds
+of each stage come from ``server.tasks.stage_durations``.
 """
 
 import time
@@ -30,7 +30,7 @@ class JobProgress:
 
     Args:
         expected: seconds of each stage, in the order in which they come.
-        clock: seconds that only grow.
+        clock: returns seconds and never goes back.
     """
 
     def __init__(self, expected: Mapping[str, float], clock: Clock = time.monotonic) -> None:
@@ -41,6 +41,7 @@ class JobProgress:
         self._fraction, self._progress = 0.0, 0.0
 
     def report(self, stage: str, fraction: float) -> None:
+        """Records that a stage is under way and which fraction of it is done, 0 to 1."""
         if stage != self.stage:
             self._close()
             self.stage, self._since = stage, self._clock()
@@ -50,17 +51,18 @@ class JobProgress:
         self._fraction = min(1.0, max(0.0, fraction))
 
     def finish(self) -> dict[str, float]:
-        """Ends the last stage and returns the seconds that every stage took."""
+        """Ends the last stage and returns the seconds that each stage took."""
         self._close()
         self.stage = self._visit = ""
         return self.seconds
 
     def remaining_s(self) -> float:
-        """Estimates the seconds until the job ends, at the pace of the stages that are done."""
+        """Estimates the seconds until the job ends. The expected times are scaled by the pace of the stages that are
+        done."""
         return (self._rest_of_stage() + self._to_come()) * self._pace()
 
     def progress(self) -> float:
-        """Returns the share of the job that is done, 0 to 0.99 and never falling. Each stage counts by its expected
+        """Returns the share of the job that is done, 0 to 0.99. It never falls. Each stage counts by its expected
         time."""
         done = sum(took for stage, took in self._expected.items() if stage in self.seconds and stage != self._visit)
         expected_s, spent = self._expected.get(self._visit, 0.0), self._spent_s() / self._pace()
@@ -103,18 +105,20 @@ class JobProgress:
 
 
 class ProgressMeter:
-    """Writes the progress and remaining time of a job to its events, within a stage at most once in ``EVERY_S``.
-    ``tick`` does so where a stage reports nothing."""
+    """Writes the progress and remaining time of a job to its events: when a stage begins, and then at most every
+    ``EVERY_S`` seconds."""
 
     def __init__(self, log: "EventLog", job_id: str, progress: JobProgress) -> None:
         self._log, self._job_id, self._progress = log, job_id, progress
         self._last = ("", 0.0)
 
     def report(self, stage: str, fraction: float) -> None:
+        """Records the progress of a stage (fraction 0 to 1), and writes an event if one is due."""
         self._progress.report(stage, fraction)
         self.tick()
 
     def tick(self) -> None:
+        """Writes an event if one is due. To be called often during stages that report no progress themselves."""
         stage, now = self._progress.stage, time.monotonic()
         if not stage or (stage == self._last[0] and now - self._last[1] < EVERY_S):
             return

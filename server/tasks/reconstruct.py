@@ -1,4 +1,5 @@
-"""What a job runs in a worker's child process: files in, ``reconstruct()``, files out."""
+"""The task of a job, which runs in a worker's child process: it reads files, calls ``reconstruct()`` and writes
+files."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -27,7 +28,10 @@ class CaptureWork(Protocol):
         cache: str,
         model: str | None,
         settings: Mapping[str, object],
-    ) -> object: ...
+    ) -> object:
+        """Works on the capture folder ``capture`` and writes the folder ``result``; ``cache`` is a folder for what a
+        later job of the capture may use again."""
+        ...
 
 
 def reconstruct_capture(
@@ -40,11 +44,11 @@ def reconstruct_capture(
     model: str | None,
     settings: Mapping[str, object],
 ) -> None:
-    """Reconstructs the capture folder ``capture`` and writes the result folder ``result``. Silhouettes of the capture
-    are kept in ``cache``.
+    """Reconstructs the capture folder ``capture`` and writes the result to the folder ``result``. Silhouettes are
+    cached in the folder ``cache``.
 
-    Raises InputError for an input that cannot be used, any EigenheadError of the pipeline, OSError for a full disk, and
-    Cancelled if ``report`` does.
+    Raises InputError for an input that cannot be used, other EigenheadErrors of the pipeline, OSError for a full disk,
+    and Cancelled if ``report`` raises it.
     """
     report("read", 0.0)  # a fresh child loads for seconds what this takes
     share_one_heap()

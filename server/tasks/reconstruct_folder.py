@@ -1,5 +1,8 @@
-"""A capture as it lies on somebody's disk, made a result folder: an archive is unpacked, cameras and masks that are
-missing are found and kept. The command line's way; a job of the service has its capture taken in before."""
+"""The task of the command line: reconstructs a capture on a user's disk. Archives are unpacked; cameras and masks that
+are missing are estimated and kept.
+
+A job of the service has its capture checked and stored before (``server.tasks.ingest``).
+"""
 
 import os
 import tempfile
@@ -21,7 +24,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def folder_of(capture: Path) -> Iterator[Path]:
-    """Yields the folder of a capture. An archive is unpacked to a temporary folder for the duration of the block.
+    """Yields the folder of a capture. An archive is unpacked to a temporary folder, which is removed after the block.
     Raises InputError."""
     if capture.is_dir():
         yield capture
@@ -42,11 +45,11 @@ def reconstruct_folder(
     chosen: "Settings",
     preparation: Progress,
 ) -> None:
-    """Reconstructs the capture in ``folder`` and writes the result to ``out``. Cameras and masks that had to be found
-    are kept in ``kept``, even if the reconstruction fails.
+    """Reconstructs the capture in ``folder`` and writes the result to ``out``. Cameras and masks that had to be
+    estimated are written to ``kept``, even if the reconstruction fails.
 
-    ``preparation`` is called with the progress before the first stage: finding cameras, compiling loops. Raises what
-    the pipeline raises, and OSError for a full disk.
+    ``preparation`` receives the progress before the first stage: estimating cameras, compiling loops. Raises the errors
+    of the pipeline, and OSError for a full disk.
     """
     from pipeline.compute.trace import span
     from server.tasks.photographs import keep_masks, read_or_calibrate
@@ -94,8 +97,8 @@ def reconstruct_beside(
     model: str | None,
     settings: Mapping[str, object],
 ) -> None:
-    """Reconstructs a capture folder or archive into the new folder ``result``, in a child of the process ``parent``.
-    All temporary files lie in the folder ``scratch``."""
+    """Reconstructs a capture folder or archive into the new folder ``result``. It runs in a child process and ends with
+    the process ``parent``. All its temporary files lie in the folder ``scratch``."""
     end_with_parent(parent)
     share_one_heap()
     from pipeline.settings import settings_from_document

@@ -1,4 +1,4 @@
-"""The settings of a job as somebody wrote them down: a TOML or JSON file, and options over it."""
+"""Reads the settings of a job from a TOML or JSON file, and overrides them by options."""
 
 import json
 import tomllib
@@ -10,7 +10,7 @@ from rig.messages.message import compose
 
 
 def read_settings_file(path: Path) -> dict[str, object]:
-    """Reads settings from a TOML or JSON file. Raises InputError."""
+    """Reads settings from a TOML or JSON file. Raises InputError if it cannot be read or holds no table."""
     try:
         text = path.read_text(encoding="utf-8-sig")  # Windows editors add a byte order mark
         braced = path.suffix == ".json" or (path.suffix != ".toml" and text.lstrip().startswith("{"))
@@ -28,13 +28,13 @@ def reason_of(error: OSError | ValueError | RecursionError) -> str:
 
 
 def settings_document(path: Path | None, **options: str | Mapping[str, object] | None) -> dict[str, object]:
-    """Returns the settings of a TOML or JSON file, if any, overridden by options; tables are
-    merged. Raises InputError."""
+    """Returns the settings of a TOML or JSON file, or none without a file, overridden by ``options``. Tables in both
+    are merged. Raises InputError if the file cannot be read."""
     return merged_settings({} if path is None else read_settings_file(path), options)
 
 
 def merged_settings(document: Mapping[str, object], over: Mapping[str, object]) -> dict[str, object]:
-    """Returns ``document`` overridden by ``over``. Tables in both are merged; None in ``over`` overrides nothing."""
+    """Returns ``document`` overridden by ``over``. Tables in both are merged. None in ``over`` overrides nothing."""
     merged = dict(document)
     for name, value in over.items():
         old = merged.get(name)

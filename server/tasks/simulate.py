@@ -1,4 +1,4 @@
-"""Taking a shot with the simulated studio; runs in a child process, which keeps the renderer and the model."""
+"""Takes shots with the simulated studio; runs in a child process, which keeps the renderer and the model."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +14,15 @@ if TYPE_CHECKING:
 
 
 class SimulatedSync(TypedDict):
+    """Holds a camera's entry in the sync certificate of a simulated shot: its delay is always 0 ms."""
+
     status: str
     skew_ms: float
 
 
 class SimulatedCertificate(TypedDict):
-    """Holds the certificate of a shot of the simulated studio."""
+    """Holds the sync certificate of a simulated shot: the subject, when each camera took its picture, and planted
+    faults."""
 
     kind: str
     subject: str
@@ -28,10 +31,10 @@ class SimulatedCertificate(TypedDict):
 
 
 def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: int | None) -> SimulatedCertificate:
-    """Takes a shot of the simulated studio: writes the capture to ``folder/files`` and its truth to ``folder/truth``.
-    Returns the certificate.
+    """Takes a shot of the simulated studio: writes the capture to ``folder/files`` and the true head to
+    ``folder/truth``. Returns the shot's certificate.
 
-    Without a seed each shot shows another subject. Feature points are left out: operators pick them later.
+    Without a seed each shot shows another subject. The capture has no feature points, since operators pick them.
     """
     from pipeline.head_model.model import load_model
     from rig.formats.capture_folder import write_capture
@@ -52,14 +55,15 @@ def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: in
 
 
 def describe(taken: "SimulatedCapture") -> SimulatedCertificate:
-    """Returns the certificate of a simulated shot, all of whose pictures are of one moment."""
+    """Returns the sync certificate of a simulated shot, all of whose pictures show the same moment."""
     cameras: dict[str, SimulatedSync] = {name: {"status": "in sync", "skew_ms": 0.0} for name in taken.rig.names}
     faults = [f.kind if f.camera is None else f"{f.kind} in {f.camera}" for f in taken.faults]
     return {"kind": "simulated", "subject": taken.scene.name, "cameras": cameras, "faults": faults}
 
 
 def look(context: WorkerContext, report: Progress, *, cameras: list[str]) -> dict[str, np.ndarray]:
-    """Returns what the named cameras of the simulated studio show (RGB). The subject is drawn once and kept."""
+    """Returns a picture (RGB) of each of the named cameras of the simulated studio, with fresh noise. The subject is
+    the same in every call."""
     from pipeline.head_model.model import load_model
     from rig.render.renderer import Renderer
     from rig.studio.scene.layout import default_layout

@@ -1,7 +1,7 @@
-"""How long each stage of a reconstruction takes on this machine: learnt from every job, by what the job makes.
+"""Learns how long each stage of a reconstruction takes on this machine, for each kind of job.
 
-The service's workers and the command line learn into one file, ``cache_folder()/durations.json``. The first job of a
-kind goes by ``FIRST_S``.
+The service's workers and the command line share one file, ``cache_folder()/durations.json``. ``FIRST_S`` is expected
+before the first job of a kind.
 """
 
 import json
@@ -37,13 +37,13 @@ LONGEST_S = 86_400.0  # what a damaged file may at most say of a stage
 
 
 def kind_of(settings: Settings) -> str:
-    """Returns the settings that decide which stages a job has and how long they take, as text such as "contour photo
-    both"."""
+    """Returns the kind of a job as text such as "contour photo both": the settings that decide which stages it has and
+    how long they take."""
     return f"{settings.method} {settings.detail or 'fine'} {settings.outputs.surface}"
 
 
 def first_guess(settings: Settings) -> dict[str, float]:
-    """Returns the seconds expected of each stage of a job with these settings, before any was measured."""
+    """Returns the seconds expected of each stage of a job with these settings before any job was measured."""
     photographs = settings.method == "contour" and settings.detail in PHOTO_LEVELS
     fine, bust = photographs and settings.detail in FINE_LEVELS, settings.outputs.surface != "head"
     parts = settings.detail in PHOTO_LEVELS or bust
@@ -63,8 +63,8 @@ def first_guess(settings: Settings) -> dict[str, float]:
 
 
 def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
-    """Returns by which factor this machine is slower than the first guess, from the measured stages of each kind of
-    job. Returns 1 where nothing was measured."""
+    """Returns how many times slower this machine is than ``FIRST_S``, from the measured stages of each kind of job; 1
+    if nothing was measured."""
     took = guessed = 0.0
     for kind, stages in learnt.items():
         simplex = kind.startswith("simplex")
@@ -75,16 +75,16 @@ def pace_of(learnt: Mapping[str, Mapping[str, float]]) -> float:
 
 
 class StageDurations:
-    """Learns how many seconds each stage of a job takes, and keeps them in ``file``. Where the file cannot be written,
-    only this process learns."""
+    """Learns how many seconds each stage of a job takes, and keeps them in ``file``. If the file cannot be written,
+    they are known to this process only."""
 
     def __init__(self, file: Path | None = None) -> None:
         self._file = file or cache_folder() / "durations.json"
         self._learnt: dict[str, dict[str, float]] = {}
 
     def of(self, settings: Settings) -> dict[str, float]:
-        """Returns the expected seconds of each stage, in the stages' order. For a kind of job that this machine never
-        ran, they are the first guess scaled by the pace of other kinds."""
+        """Returns the expected seconds of each stage, in order. For a kind of job that this machine never ran, they are
+        the first guess scaled by the pace of other kinds."""
         learnt, guess = self._read(), first_guess(settings)
         known = learnt.get(kind_of(settings))
         if known is None:
@@ -93,7 +93,8 @@ class StageDurations:
         return {stage: known.get(stage, seconds) for stage, seconds in guess.items()}
 
     def learn(self, settings: Settings, seconds: Mapping[str, float]) -> None:
-        """Adds the measured seconds of a job's stages to what is expected."""
+        """Mixes the measured seconds of a job's stages into what is expected of its kind, with the weight
+        ``LEARNING``."""
         learnt, before = self._read(), self.of(settings)
         weight = LEARNING if kind_of(settings) in learnt else 1.0
         mixed = {stage: (1 - weight) * before[stage] + weight * seconds[stage] for stage in before if stage in seconds}

@@ -1,4 +1,4 @@
-"""Subjects of the simulated studio, and the capture folders that show them."""
+"""Makes subjects of the simulated studio, and capture folders that show them."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,16 +25,16 @@ NEUTRAL: Mapping[str, float] = MappingProxyType({})
 
 
 def drawn_subject(model: HeadModel, rng: np.random.Generator, weights: Mapping[str, float] = NEUTRAL) -> Subject:
-    """Draws a subject at random from the population of a head model, all modes, with the expression that ``weights``
-    describe."""
+    """Draws a subject at random from the population of a head model, with all modes, and gives it an expression.
+    ``weights``: weights of expressions, 0 to 1, by name."""
     return model_subject(model, rng.standard_normal(len(model.modes)), f"drawn from {model.name}", weights)
 
 
 def model_subject(
     model: HeadModel, coefficients: np.ndarray, name: str, weights: Mapping[str, float] = NEUTRAL
 ) -> Subject:
-    """Makes a subject from a head model: its shape from ``coefficients`` (standard deviations), its expression from
-    ``weights``."""
+    """Makes a subject from a head model: its shape from ``coefficients`` (standard deviations; modes beyond them are
+    0), its expression from ``weights`` (0 to 1, by name)."""
     full = model.levels["full"]
     vertices = model.posed_vertices(coefficients, weights)
     landmarks = {name: vertices[index] for name, index in model.landmarks.items()}
@@ -42,10 +42,10 @@ def model_subject(
 
 
 def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression: Sequence[str] = ()) -> Subject:
-    """Returns the subject that a text names: ``random``, ``mean``, or a mesh file in the head frame (mm), whose
-    landmarks are read from the file beside it, if any. ``expression``: texts such as NAME=WEIGHT.
+    """Makes the subject that a text names: ``random``, ``mean``, or a mesh file in the head frame (mm), whose landmarks
+    are read from a file beside it. ``expression``: texts such as NAME=WEIGHT.
 
-    Raises InputError.
+    Raises InputError for an unknown expression or file, and for an expression of a mesh file.
     """
     weights = weights_from_text(expression, model.expressions.names)
     if text == "random":
@@ -63,8 +63,8 @@ def simulate_folder(
     out: Path, *, subject: str, seed: int, preset: Preset, faults: list[str], renderer: Renderer,
     expression: Sequence[str] = (),
 ) -> Path:  # fmt: skip
-    """Simulates a capture and writes it to the folder ``out`` (``eigenhead simulate``). Returns the
-    folder of the truth."""
+    """Simulates a capture and writes it to the folder ``out``, as ``eigenhead simulate`` does. Returns the folder of
+    the true head."""
     rng = np.random.default_rng(seed)
     chosen = subject_of(subject, load_model(), rng, expression)
     planted = tuple(fault_from_text(text) for text in faults)

@@ -1,4 +1,4 @@
-"""Sends the table and the contact sheet of a batch, made while they are sent."""
+"""Sends the table and the contact sheet of a batch. Both are made while they are sent."""
 
 from collections.abc import Iterator
 from typing import Literal
@@ -16,7 +16,8 @@ CLOSED = "sandbox allow-popups; default-src 'none'; style-src 'unsafe-inline'; i
 
 
 def send_table(service: Service, batch_id: str, form: TableFormat) -> Response:
-    """Returns the table of a batch. Raises NotFound, and Conflict for Parquet where pyarrow is not installed."""
+    """Returns the response that carries the table of a batch. Raises NotFound, and Conflict for Parquet if pyarrow is
+    not installed."""
     from server.batch.table_files import CSV, PARQUET, csv_lines, has_parquet, parquet_bytes
     from server.services.batch_table import batch_columns, batch_rows
 
@@ -31,8 +32,8 @@ def send_table(service: Service, batch_id: str, form: TableFormat) -> Response:
 
 
 def send_sheet(service: Service, batch_id: str) -> Response:
-    """Returns the contact sheet of a batch, on which labels of people stand: no script in it would run. Raises
-    NotFound."""
+    """Returns the response that carries the contact sheet of a batch, an HTML page. Its headers forbid scripts, since
+    people's labels stand on it. Raises NotFound."""
     from server.services.batch_table import batch_sheet
 
     lines = batch_sheet(service.batches, service.store, service.batches.get(batch_id))

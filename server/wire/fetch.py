@@ -1,6 +1,8 @@
-"""Fetches an archive from another server for a caller who names its address.
+"""Fetches an archive from another server whose address a caller names.
 
-The address is checked (server.origins), bytes and seconds are limited, and the data go straight to the data folder."""
+The address is checked (server.origins), bytes and seconds are limited, and the data are written straight to the data
+folder.
+"""
 
 from pathlib import Path
 
@@ -20,10 +22,12 @@ CONNECT_S = 10.0
 
 
 async def fetch_archive(service: Service, url: str, folder: Path) -> Path:
-    """Downloads the archive at ``url`` into ``folder`` and returns its path.
+    """Downloads the archive at ``url`` into ``folder`` and returns its path. Redirections are followed, each checked
+    like the first address.
 
     Raises InvalidInput for an address that is not allowed ("url-refused") and for a server that does not deliver the
-    archive ("import-failed"), TooLarge, DiskFull."""
+    archive ("import-failed"); TooLarge; and DiskFull.
+    """
     patience = httpx.Timeout(IDLE_TIMEOUT_S, connect=CONNECT_S)
     try:
         with anyio.fail_after(service.settings.import_s):

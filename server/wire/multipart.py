@@ -33,8 +33,8 @@ ARCHIVE = ".zip, .tar or .tar.gz"
 
 
 def described_form(file: str, fields: Iterable[str], **described: str) -> JsonObject:
-    """Returns the OpenAPI description of a multipart body: one file, text ``fields``, and further fields with
-    descriptions."""
+    """Returns the OpenAPI description of a multipart body: one file, the text fields ``fields``, and further text
+    fields with their descriptions."""
     texts: dict[str, dict[str, str]] = {name: {"type": "string"} for name in fields}
     texts |= {name: {"type": "string", "description": text} for name, text in described.items()}
     properties = {"file": {"type": "string", "format": "binary", "description": file}} | texts
@@ -43,8 +43,8 @@ def described_form(file: str, fields: Iterable[str], **described: str) -> JsonOb
 
 
 def check_length(request: Request, store: Store, settings: ServiceSettings) -> None:
-    """Checks the announced length. Raises a 413 problem if it is too much, and 507 if the disk has no space for twice
-    as much: the archive and its unpacked files."""
+    """Checks the length that a request announces. Raises TooLarge if it is more than the settings allow, and DiskFull
+    if the disk has no space for twice as much: the archive and its unpacked files."""
     text = request.headers.get("content-length")
     length = int(text) if text and text.isascii() and text.isdigit() else 0
     if length > settings.body_bytes:
@@ -57,9 +57,10 @@ async def receive_multipart(
 ) -> tuple[Path, dict[str, str]]:
     """Writes the part ``file`` of the body into ``folder`` and returns its path and the other fields.
 
-    Raises DiskFull before a block for which the disk has no space, TooLarge, and problems: 415 for another content
-    type, 400 for a body that breaks off, 408 for a client that stops sending, 422 if there is no ``file``, 413 for too
-    much."""
+    Raises DiskFull before a block for which the disk has no space; TooLarge; and problems: 415 for another content
+    type, 400 for a body that breaks off, 408 for a client that stops sending, 422 without a ``file`` or with two, 413
+    for too many or too long fields.
+    """
     kind, options = parse_options_header(request.headers.get("content-type"))
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
@@ -163,8 +164,8 @@ class _Form:
 
 
 def check_fields(names: Iterable[str], known: Collection[str]) -> None:
-    """Raises InputError naming each field that the form does not have, so that a misspelt ``settings`` is not ignored
-    in silence."""
+    """Raises InputError naming each field that is not in ``known``, with the nearest known name. Otherwise a misspelt
+    ``settings`` would be ignored."""
     faults = []
     for name in names:
         if name not in known:
@@ -185,7 +186,9 @@ async def receive_capture(
     """Receives an archive in a multipart body and makes a capture of it. Returns the capture's record and the form's
     fields.
 
-    Fields that are not in ``known`` are refused."""
+    Raises InputError for fields that are not in ``known`` and for faults of the archive, and what ``receive_multipart``
+    and ``Captures.accept`` raise.
+    """
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
@@ -195,8 +198,9 @@ async def receive_capture(
 
 
 async def receive_calibration_pictures(service: Service, request: Request) -> Calibration:
-    """Receives an archive in a multipart body and queues a calibration. It holds IMAGES/ and board.toml, or photographs
-    where the field ``from`` is ``scene``."""
+    """Receives an archive in a multipart body and queues a calibration. The archive holds IMAGES/ and board.toml or, if
+    the field ``from`` is ``scene``, photographs. Raises InputError naming every fault, and what ``receive_multipart``
+    raises."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)

@@ -1,5 +1,5 @@
-"""Limits how long a body may be silent. A client that vanished sends nothing more, and would otherwise hold its
-connection and the locks taken for it for ever."""
+"""Limits the pause between two pieces of a request's body. A client that vanished sends nothing more, and would
+otherwise keep its connection and its locks for ever."""
 
 from collections.abc import AsyncIterator
 
@@ -14,7 +14,7 @@ IDLE_TIMEOUT_S = (
 
 
 async def with_idle_timeout(stream: AsyncIterator[bytes], silent_s: float) -> AsyncIterator[bytes]:
-    """Yields the pieces of ``stream``. Raises a 408 problem if one does not arrive within ``silent_s`` seconds; the
+    """Yields the pieces of ``stream``. Raises a 408 problem if one does not arrive within ``silent_s`` seconds. The
     total time is not limited."""
     while (piece := await _next(stream, silent_s)) is not None:
         yield piece

@@ -1,5 +1,5 @@
-"""Turns errors into RFC 9457 documents ``application/problem+json``: a stable ``type``, and every fault in
-``errors``."""
+"""Turns errors into problem documents (RFC 9457, ``application/problem+json``) with a stable ``type`` and every fault
+in ``errors``."""
 
 import errno
 from collections.abc import Iterable, Mapping, Sequence
@@ -50,6 +50,7 @@ MESSAGE_SCHEMA = {
 
 PROBLEM_SCHEMA = {
     "type": "object",
+    "description": "Describes why a request was refused or failed, after RFC 9457.",
     "required": ["type", "title", "status", "detail", "errors"],
     "properties": {
         "type": {"type": "string", "description": f"stable name, {URN}<kind>"},
@@ -67,6 +68,8 @@ Responses = dict[int | str, dict[str, Any]]  # FastAPI's type of a route's ``res
 
 
 class ProblemDocument(TypedDict):
+    """Holds the JSON of a problem: the members of RFC 9457, the faults as texts and, for translation, as messages."""
+
     type: str
     title: str
     status: int
@@ -93,12 +96,12 @@ STATUS_OF: dict[type[Refused], int] = {
 
 
 def status_of(refusal: type[Refused]) -> int:
-    """Returns the HTTP status of a class of refusals."""
+    """Returns the HTTP status of a class of refusals: its own in ``STATUS_OF``, or that of its nearest ancestor."""
     return next(STATUS_OF[kind] for kind in refusal.__mro__ if kind in STATUS_OF)
 
 
 class Problem(EigenheadError):
-    """Reports a refusal with its HTTP status: one of HTTP itself, or one of the service."""
+    """Reports a refusal together with its HTTP status. ``kind`` is the end of the document's ``type``."""
 
     def __init__(
         self,
@@ -113,7 +116,7 @@ class Problem(EigenheadError):
         self.errors, self.headers = tuple(message_of(error) for error in errors), dict(headers or {})
 
     def document(self) -> ProblemDocument:
-        """Returns the problem document."""
+        """Returns the problem as a JSON document of RFC 9457."""
         return {
             "type": URN + self.kind,
             "title": PROBLEM_TYPES.get(self.kind, self.kind),
@@ -125,12 +128,12 @@ class Problem(EigenheadError):
         }
 
     def response(self) -> JSONResponse:
-        """Returns the HTTP response that carries the document."""
+        """Returns the HTTP response that carries the problem document."""
         return JSONResponse(self.document(), self.status, headers=self.headers, media_type=MEDIA_TYPE)
 
 
 def problem_from(error: Exception) -> Problem:
-    """Returns the problem for an error. An unexpected error becomes a 500 that says so and hides its details."""
+    """Converts an error to a problem. An unexpected error is logged and becomes a 500 problem without details."""
     if isinstance(error, Problem):
         return error
     if isinstance(error, InputError):
@@ -164,7 +167,8 @@ def _fault_of(error: Mapping[str, Any]) -> Message | str:
 
 
 def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:
-    """Makes the app answer every error with a problem document. ``routes`` are all of the app's routes."""
+    """Makes the app answer every error with a problem document. ``routes`` are all of the app's routes; a 405 names the
+    methods that they allow."""
 
     async def answer(request: Request, error: Exception) -> JSONResponse:
         problem = problem_from(error)
@@ -188,7 +192,8 @@ def _methods_of(routes: Sequence[APIRoute], path: str) -> list[str]:
 
 
 def documented(*statuses: int) -> Responses:
-    """Returns the ``responses`` of a route that may refuse with these statuses."""
+    """Returns the OpenAPI ``responses`` of a route that may refuse with these statuses, and with those that every route
+    may refuse with."""
     body = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     every = {401, 403, 422, 429, 500, 503, *statuses}
     return {status: {"description": HTTPStatus(status).phrase, "content": body} for status in sorted(every)}

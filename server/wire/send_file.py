@@ -31,8 +31,12 @@ RANGE = re.compile(r"^bytes=(\d{1,18})?-(\d{1,18})?$")
 
 
 def send_file(request: Request, file: StoredFile) -> Response:
-    """Answers with the file: status 200, 206 for a byte range, or 304 if the client has it. Raises a 416 problem for a
-    range beyond the file, and 404 if the file is missing. Other forms of Range are ignored, as RFC 9110 allows."""
+    """Returns the response that carries a file: status 200, 206 for one byte range, or 304 if the client has it
+    already.
+
+    Raises a 416 problem for a range beyond the file, and 404 if the file is missing. Other forms of the Range header
+    are ignored, as RFC 9110 allows.
+    """
     path, etag = file.path, f'"{file.sha256}"'
     if not path.is_file():
         raise Problem(404, "not-found", compose("file-gone"))
@@ -49,10 +53,11 @@ def send_file(request: Request, file: StoredFile) -> Response:
 def send_archive(
     request: Request, folder: Path, files: Mapping[str, FileEntry], name: str | None = "result.zip"
 ) -> Response:
-    """Sends the named files below ``folder`` as an uncompressed .zip without times, so that equal files give equal
-    bytes.
+    """Returns the response that carries the named files below ``folder`` as one uncompressed .zip, or 304 if the client
+    has it already. The .zip holds no times, so that equal files give equal bytes.
 
-    ``name`` is the file name that a browser suggests; with None the link on the page decides."""
+    ``name`` is the file name that a browser suggests. With None the page's link decides.
+    """
     digest = hashlib.sha256("\n".join(f"{name} {file['sha256']}" for name, file in files.items()).encode()).hexdigest()
     headers = {"ETag": f'"{digest}"', "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
     headers["Content-Disposition"] = "attachment" if name is None else f'attachment; filename="{name}"'

@@ -1,4 +1,4 @@
-"""Which workers live: whose silence or absence says that one is gone."""
+"""Decides which workers are dead, by their heartbeats and their processes."""
 
 import sqlalchemy as sa
 
@@ -8,7 +8,7 @@ from server.storage.database import now_sql, workers
 
 def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> list[str]:
     """Lists the ids of dead workers: those that stopped, whose process on this machine is gone, or that sent no
-    heartbeat for ``silent_s``."""
+    heartbeat for ``silent_s`` seconds. ``except_id`` is never listed."""
     machine = process_identity()[0]
     with engine.connect() as connection:
         silent = (workers.c.seen < now_sql(connection) - silent_s).label("silent")

@@ -1,13 +1,13 @@
 """The worker: takes jobs from a queue, runs each in a child process, and takes over the jobs of workers that died.
 
-A job is three durable steps around one ``reconstruct()``: *ingest* (the capture is there, the disk has room), *fit*
-(the child writes a complete result folder under a name of this attempt), *publish* (rename). A worker that is killed in
-any of them leaves a job that another one starts again at the step that was cut off; the bytes of a result do not
-depend on who made it, so that it does not matter if two did.
+A job is three durable steps around one ``reconstruct()``. *Ingest* checks that the capture exists and the disk has
+space. *Fit* has the child write a complete result folder under a name of this attempt. *Publish* renames that folder.
+If a worker is killed in a step, another worker starts this step again. The bytes of a result do not depend on the
+worker, so it does no harm if two workers do the same step.
 
-Every worker writes a heartbeat row. Whoever finds one that is stopped, whose process is gone (same machine), or that is
-silent for ``silent_s``, puts its jobs back into their queue; the engine changes only rows that still belong to the dead
-worker, so that two that try do no harm.
+Every worker writes a heartbeat row. A worker that finds another dead (stopped, its process gone on the same machine, or
+silent for ``silent_s``) puts its jobs back into their queue. The engine changes only rows that still belong to the dead
+worker, so several workers may do this at once.
 """
 
 import hashlib
@@ -39,7 +39,7 @@ from server.problem_types import type_of_failure
 from server.processes import process_identity
 from server.services import calibrations
 from server.services.failures import JobFailed
-from server.services.jobs import DELIVERY, WORKFLOW
+from server.services.job_rows import DELIVERY, WORKFLOW
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.database import now_sql, open_database, workers
@@ -61,7 +61,8 @@ log = structlog.get_logger()
 
 
 class Worker:
-    """Runs the one worker of this process (the job engine is a singleton)."""
+    """Takes jobs from one queue, which the settings name, and runs them. The job engine is a singleton, so a process
+    has one worker."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
@@ -77,6 +78,8 @@ class Worker:
         self._states = _StateWatch(settings.poll_s)
 
     def start(self) -> None:
+        """Writes the first heartbeat, starts the job engine and begins to take jobs. Returns at once; the jobs run in
+        threads."""
         DBOS(config=engine_config(self.settings, self.id))
         self._register()
         DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE])
@@ -94,8 +97,8 @@ class Worker:
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
     def run_until_stopped(self) -> None:
-        """Runs jobs until ``stop`` is called or a signal comes. A job that is running then is left
-        to the next worker."""
+        """Runs jobs until ``stop`` is called or SIGTERM or SIGINT arrives, then ends the process. A job that is running
+        then is taken over by another worker."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: self._stop.set())
         while not self._stop.wait(0.5):
@@ -106,6 +109,7 @@ class Worker:
         os._exit(0)  # an orderly end of the engine would record a job that is cut off here as failed
 
     def stop(self) -> None:
+        """Makes ``run_until_stopped`` end the process, within half a second."""
         self._stop.set()
 
     def _register(self) -> None:
@@ -161,7 +165,8 @@ class Worker:
         del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
 
     def ingest(self, job_id: str, request: JobRequest) -> None:
-        """Raises early, and with a clear reason, what would make the fit fail late."""
+        """Checks that a job's capture exists and that the disk has space, and makes the job's folder. Raises JobFailed
+        with a clear reason for what would make the fit fail later."""
         self.events.append(job_id, {"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None})
         self.store.folder("jobs", job_id).mkdir(parents=True, exist_ok=True)  # where its log goes
         log.info("job started", capture=request["capture_id"])
@@ -172,7 +177,11 @@ class Worker:
             raise JobFailed(error.kind, error.detail) from error
 
     def fit(self, job_id: str, request: JobRequest) -> str:
-        """Runs the reconstruction of a job in a child process. Returns the name of the attempt's folder."""
+        """Reconstructs a job's capture in a child process. Returns the name of the folder with the complete result.
+
+        Raises JobFailed for what no repetition would mend, and Cancelled. After any error the attempt's folder is
+        removed.
+        """
         name = f"attempt-{secrets.token_hex(6)}"
         folder = self.store.folder("jobs", job_id) / name
         settings = request.get("settings") or {}
@@ -205,7 +214,9 @@ class Worker:
         return name
 
     def calibrate(self, identity: str) -> CalibrationOutcome:
-        """Computes one calibration. Its folder is written under a temporary name and renamed at the end."""
+        """Computes one calibration in a child process and returns its outcome. The result is written under a temporary
+        name and renamed at the end. Pictures of a scene are removed then, and also after a failure that no repetition
+        would mend (JobFailed)."""
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
@@ -238,8 +249,11 @@ class Worker:
         return result
 
     def publish(self, job_id: str, attempt: str) -> dict[str, FileEntry]:
-        """Gives the result of an attempt its final name. Returns size and SHA-256 of every file; if another worker has
-        published it, of that worker's files, which have the same bytes."""
+        """Renames the folder of an attempt to ``result`` and removes other attempts. Returns size and SHA-256 of every
+        file by name.
+
+        If another worker has published a result of the job already, that one stays; its files have the same bytes.
+        """
         folder = self.store.folder("jobs", job_id)
         target = folder / "result"
         if not target.is_dir():
@@ -255,8 +269,8 @@ class Worker:
         return files
 
     def publish_outcome(self, job_id: str, state: str, job_webhook: JobWebhook | None = None) -> None:
-        """Announces how a job ended: as the last event of its stream, with the warnings that an operator must act on,
-        and to the webhooks of the service and of the job."""
+        """Writes how a job ended as the last event of its stream, with the warnings that an operator must act on, and
+        queues messages to the webhooks of the service and of the job."""
         warnings = warnings_of(self.store.folder("jobs", job_id) / "result" / "report.json")
         for warning in warnings:
             log.warning(warning["message"], code=warning["code"])
@@ -266,7 +280,7 @@ class Worker:
         self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options, job_webhook=job_webhook)
 
     def count_failure(self, kind: str) -> None:
-        """Counts a failed job for the metrics. A database that is away then lacks one."""
+        """Counts a failed job for the metrics. If the database does not answer, the failure is not counted."""
         with suppress(SQLAlchemyError):
             note_failure(self.engine, kind)
 
@@ -328,7 +342,7 @@ class Worker:
 
 
 def warnings_of(report: Path) -> list[MessageDocument]:
-    """Returns the warnings in the report.json of a result."""
+    """Returns the warnings in a report.json; none if it is missing or holds none."""
     try:
         return json.loads(report.read_bytes())["warnings"]
     except (OSError, ValueError, KeyError, TypeError):  # no result, or another kind of work
@@ -356,7 +370,7 @@ class _StateWatch:
 
 
 def described(folder: Path) -> dict[str, FileEntry]:
-    """Returns size and SHA-256 of every file below ``folder``, by the file's relative name."""
+    """Returns size and SHA-256 of every file below ``folder``, by its relative name."""
     files: dict[str, FileEntry] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         with path.open("rb") as stream:
@@ -366,8 +380,8 @@ def described(folder: Path) -> dict[str, FileEntry]:
 
 
 def run_worker(settings: ServiceSettings, *, until_eof: bool = False) -> None:
-    """Runs the worker process. With ``until_eof`` it stops at the end of its standard input, that is when its parent
-    ends."""
+    """Runs a worker until it is stopped; does not return. With ``until_eof`` it also stops at the end of its standard
+    input, that is when its parent ends."""
     worker = Worker(settings)
     worker.start()
     if until_eof:

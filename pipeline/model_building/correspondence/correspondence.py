@@ -37,7 +37,7 @@ _SMOOTHINGS = 4  # pairs of steps: they halve the noise of points; 8 would remov
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Holds the settings of one stage of searching a head's points on a scan. Lengths in mm."""
+    """Holds the limits of one stage in which points of a head are searched on a scan. Lengths in mm."""
 
     steps: int
     reach_mm: float  # a match farther than this is another part of the head
@@ -140,7 +140,8 @@ def _averaging(faces: Int[np.ndarray, "F 3"], count: int) -> sparse.csr_array:
 
 
 def nearest_mean(shapes: Float[np.ndarray, "N L 3"]) -> int:
-    """Returns the index of the shape closest to the mean of all (step 1 of section 3.2)."""
+    """Returns the index of the shape closest to the mean of all, which becomes the reference (step 1 of section
+    3.2)."""
     return int(((shapes - shapes.mean(0)) ** 2).sum((1, 2)).argmin())
 
 
@@ -168,8 +169,9 @@ def warp_and_resample(
     cylinder: CylinderIndex,
     matching: Matching,
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Bool[np.ndarray, " V"]]:
-    """Runs steps 3 and 4 of section 3.2. Returns the warped reference, its resampling on the target, and where that is
-    void; void vertices keep the warped position."""
+    """Warps the reference to the target's landmarks and resamples it on the target's surface (steps 3 and 4 of section
+    3.2). Returns the warped reference, its resampling, and where the target has no surface; such vertices keep the
+    warped position."""
     warped = landmark_warp(shape[index], marks, shape, smoothing=matching.landmark_smoothing_mm)
     angles, heights, radii = coordinates(warped)
     cast = cylinder.cast(angles, heights, radii)

@@ -1,4 +1,5 @@
-"""Contains the compiled loops of ``pipeline.model_building.correspondence.cylinder``."""
+"""Compiled loops of ``pipeline.model_building.correspondence.cylinder``. The axis of the cylinder is y; an angle is
+counted about it from z towards x."""
 
 import numpy as np
 
@@ -10,7 +11,8 @@ CELLS_ROUND = 288  # 2 mm at 92 mm from the axis
 
 @njit(cache=True)
 def cells_spanned(vertices, face, low, rows):  # pragma: no cover - compiled
-    """Returns first and last column (unwrapped) and row of the cells that a triangle may touch."""
+    """Returns the first and last column (these may exceed a full turn) and the first and last row of the grid cells
+    that a triangle may touch. ``low`` is the height (mm) of the grid's lower end."""
     angle0 = np.arctan2(vertices[face[0], 0], vertices[face[0], 2])
     first = last = angle0
     bottom = top = vertices[face[0], 1]
@@ -29,8 +31,8 @@ def cells_spanned(vertices, face, low, rows):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
-    """Lists the triangles in each cell of the (angle, height) grid. Returns where each cell's list starts, and the
-    lists."""
+    """Sorts triangles into a grid of cells in angle and height, ``rows`` of ``CELLS_ROUND`` cells. Returns ``start``
+    and ``members``: the triangles of cell i are ``members[start[i]:start[i + 1]]``."""
     counts = np.zeros(rows * CELLS_ROUND + 1, np.int64)
     for f in range(len(faces)):
         a, b, c, d = cells_spanned(vertices, faces[f], low, rows)
@@ -52,8 +54,12 @@ def bin_triangles(vertices, faces, low, rows):  # pragma: no cover - compiled
 
 @njit(cache=True)
 def cast_rays(vertices, faces, low, rows, start, members, angles, heights, wanted):  # pragma: no cover - compiled
-    """Returns radius (mm) and triangle of each ray's hit: that nearest to the ``wanted`` radius, or the outermost; NaN
-    and -1 where there is none."""
+    """Casts horizontal rays from the y axis, each at an angle (rad) and a height (mm). Returns the radius (mm) and the
+    triangle of each ray's hit: the one nearest to its ``wanted`` radius, or the outermost one if that is infinite; NaN
+    and -1 without hit.
+
+    Intersections are after Moeller and Trumbore 1997. ``start`` and ``members`` are the results of ``bin_triangles``.
+    """
     radii, triangles = np.full(len(angles), np.nan), np.full(len(angles), -1, np.int64)
     width = 2 * np.pi / CELLS_ROUND
     for k in range(len(angles)):

@@ -28,8 +28,8 @@ class Workers:
     def over(
         self, work: Callable[[Item], Result], items: Sequence[Item], stage: str, report: Progress | None
     ) -> list[Result]:
-        """Runs ``work`` over the items and returns the results in their order. Raises the exception of the earliest
-        failing item."""
+        """Runs ``work`` on the items and returns the results in their order. Raises the exception of the first item
+        that fails."""
         results = map(work, items) if self.pool is None else self.pool.map(work, items, chunksize=_CHUNK)
         out = []
         for result in results:

@@ -143,8 +143,8 @@ def _hole_faults(scan: Scan, template: HeadModel) -> list[str]:
 
 
 def voids(scan: Scan, template: HeadModel) -> tuple[Bool[np.ndarray, "H A"], Bool[np.ndarray, "H A"]]:
-    """Returns the cells of 4 mm (height, angle), from chin to above the brow, that have no surface, and which cells are
-    face."""
+    """Returns the cells (4 mm wide, by height and angle, from chin to above the brow) in which the scan has no surface,
+    and which of all cells belong to the face."""
     marks, placed = stacked(scan.landmarks), _placed(scan, template)
     at = dict(zip(NAMES, rigid_fit(marks, _mean_marks(template)).apply(marks), strict=True))
     heights = np.arange(at["gnathion"][1] + 4, at["glabella"][1] + 35, _CELL_MM)

@@ -100,8 +100,8 @@ def read_base(source: Source) -> Base:
 
 
 def read_targets(source: Source, folders: tuple[str, ...], vertices: int) -> dict[str, Float[np.ndarray, "V 3"]]:
-    """Returns the displacements of the targets directly in the given folders (MakeHuman units, float32), by file name
-    without suffix."""
+    """Reads MakeHuman's targets, which are sparse displacements of the base mesh, from the given folders (without their
+    subfolders). Returns them by file name without suffix, for all ``vertices``, in decimetres (float32)."""
     wanted = [
         name
         for name in source.names()
@@ -145,7 +145,8 @@ class HeadCut:
 
     @property
     def place(self) -> dict[int, int]:
-        """Returns the cage index of each base vertex that the cut has not moved."""
+        """Returns, for each vertex of the base mesh, its index in the cage; vertices that the cut moved or removed have
+        none."""
         return {int(self.kept[k]): int(k) for k in np.flatnonzero(self.share == 0)}
 
     def cage(self, vertices: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V0 3"]:

@@ -85,7 +85,8 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """Holds all displacements of the base mesh from which subjects are mixed."""
+    """Holds all displacements of the base mesh from which subjects are mixed: MakeHuman's macro targets (ancestry, sex,
+    age, muscle, weight) and its local targets (nose, mouth and so on)."""
 
     macro: Mapping[str, Float[np.ndarray, "V 3"]]
     local: Mapping[str, Mapping[str, Float[np.ndarray, "V 3"]]]  # by folder
@@ -99,7 +100,8 @@ def read_all(source: Source, base: Base, folders: tuple[str, ...]) -> Targets:
 
 
 def macro_weights(rng: np.random.Generator, male: bool, sampling: Sampling) -> dict[str, float]:
-    """Returns random weights of the macro targets of one adult: products of ancestry, sex, age, muscle and weight."""
+    """Draws one adult: random weights of MakeHuman's macro targets, the displacements for combinations of ancestry,
+    sex, age, muscle and weight. The weight of a combination is the product of its factors' weights."""
     race = dict(zip(RACES, rng.dirichlet([sampling.ancestry] * len(RACES)), strict=True))
     maleness = rng.beta(6, 1.2) if male else rng.beta(1.2, 6)
     old = rng.beta(1.0, 2.0)  # 0 is 25 years, 1 is 90 (MakeHuman); half of the subjects are under 44
@@ -121,8 +123,8 @@ def _three(value: float, name: str) -> dict[str, float]:
 
 
 def controls(names: list[str]) -> dict[str, tuple[str | None, str | None]]:
-    """Returns the targets grouped into controls: by name, the target below zero and the target above zero. A target
-    without opposite has only the latter."""
+    """Groups targets into controls, by name: a pair of opposite targets, such as narrower and wider. A target without
+    an opposite has only the latter."""
     left = {n for n in names if not n.startswith(_LEFT_OUT)}
     out: dict[str, tuple[str | None, str | None]] = {}
     for name in sorted(left):
@@ -136,7 +138,8 @@ def controls(names: list[str]) -> dict[str, tuple[str | None, str | None]]:
 
 
 def local_weights(rng: np.random.Generator, names: list[str], width: float, sampling: Sampling) -> dict[str, float]:
-    """Returns random weights of the targets of one folder. Left and right of a control share most of their value."""
+    """Draws random weights of the local targets of one folder. Left and right of a control share most of their
+    value."""
     shared: dict[str, float] = {}
     out = {}
     for control, (below, above) in controls(names).items():
@@ -162,8 +165,8 @@ def _clipped(rng: np.random.Generator, limit: float) -> float:
 def sample_shapes(
     base: Base, targets: Targets, sampling: Sampling, *, report: Progress | None = None
 ) -> Float[np.ndarray, "N V 3"]:
-    """Returns the base meshes (MakeHuman units) of all subjects, males first. Subject k depends only on the seed and
-    k."""
+    """Draws the subjects of the database. Returns their whole base meshes (decimetres), males first. Subject k depends
+    only on the seed and k."""
     shapes = []
     for k in range(SUBJECTS["total"]):
         rng = np.random.default_rng([sampling.seed, k])

@@ -27,7 +27,7 @@ _SHARPENINGS = 4  # steps of the iteration in ``corresponded_cages``
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Built:
-    """Holds a model made of scans, and for each scan whether it was used, repaired or skipped."""
+    """Holds a model built from scans, and the names of the scans that were used, repaired or skipped."""
 
     parts: ModelParts
     used: tuple[str, ...]

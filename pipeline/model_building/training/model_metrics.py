@@ -71,10 +71,11 @@ def specificity(
 def of_draws(
     model: HeadModel, *, heads: int = 138, used: int = 60, draws: int = 200, seed: int = 0
 ) -> dict[str, float]:
-    """Computes generalisation and specificity (mm) for ``heads`` random draws of a model in place of real subjects.
+    """Computes generalisation and specificity (mm) with ``heads`` random heads of a model in place of real subjects.
 
-    It serves models whose subjects are not published, and others for comparison. A Gaussian has no outliers and uses
-    all its modes, so the figures differ from those of real subjects."""
+    It serves models whose subjects are not published. A Gaussian has no outliers and uses all its modes, so that the
+    figures differ from those of real subjects.
+    """
     rng = np.random.default_rng(seed)
     flat = model.modes.reshape(len(model.modes), -1)
     drawn = model.mean + (rng.standard_normal((heads, len(flat))) @ flat).reshape(heads, *model.mean.shape)

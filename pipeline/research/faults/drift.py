@@ -1,15 +1,15 @@
-"""How often is a camera that was turned named, and how often a good one?
+"""Measures how often a camera that was turned is named, and how often a good one is.
 
 Every capture is another random head of the model's span with hair and a shirt, and another calibration error. One
-random camera is turned by ``TURN_DEG`` about an axis across its view. Conditions in which nobody moved:
+random camera is turned by ``TURN_DEG`` about an axis across its view. Conditions in which no camera moved:
 
 - nothing wrong;
-- every mask dilated by ``LOOSE_PX``, and the mask of one camera alone;
+- every mask dilated by ``LOOSE_PX``, or the mask of one camera alone;
 - three views that cut the subject off;
-- a close-up with twice the pixels a millimetre, most of whose tangent planes touch the crown, with tight and with loose
+- a close-up with twice the pixels per millimetre, most of whose tangent planes touch the crown, with tight and loose
   masks.
 
-A camera may be named as moved (its view is left out) or as one whose mask is loose or that moved (the view is kept).
+A camera may be named as moved (its view is left out), or as one that moved or has a loose mask (the view is kept).
 """
 
 from collections.abc import Callable, Mapping
@@ -47,8 +47,8 @@ def drift(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns shares of turned cameras that are named, and good cameras that are, by condition and by what is said of
-    them."""
+    """Runs this module's experiment. Returns the share of turned cameras that are named, and of good cameras that are,
+    by condition and by warning."""
     records = Records(folder, "drift", key_of(model.sha256, camera_drift, tangency, TURN_DEG, LOOSE_PX))
     span, rows = with_modes(model, 60), []
     for i, subject in enumerate(random_subjects(subjects, seed=17)):
@@ -60,7 +60,7 @@ def drift(
 
 
 def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
-    """Returns what is said of every camera that is named, by condition."""
+    """Draws one capture. Returns the code of the warning for every camera that is named, by condition."""
     rig = default_layout()
     turned, near, *cut = rng.permutation(rig.names)[: 2 + CUT_VIEWS].tolist()
     others = {near: _renamed(close_up(rig[near]), "near")}
@@ -88,12 +88,12 @@ def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.
 
 
 def said_of(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
-    """Returns codes of the cameras that are named."""
+    """Returns the codes of the warnings about cameras, by camera."""
     return {found.camera: found.code for found in find_drift(silhouettes, rig)}
 
 
 def loosened(silhouettes: Mapping[str, Silhouette]) -> dict[str, Silhouette]:
-    """Returns silhouettes of the masks dilated by ``LOOSE_PX``."""
+    """Returns silhouettes whose masks are dilated by ``LOOSE_PX``."""
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * LOOSE_PX + 1, 2 * LOOSE_PX + 1))
     masks = {name: cv2.dilate(s.mask.view(np.uint8), disk).view(bool) for name, s in silhouettes.items()}
     return {name: silhouette_from_mask(mask) for name, mask in masks.items()}
@@ -124,6 +124,7 @@ def _with(rig: Rig, seen: Mapping[str, Silhouette], instead: Mapping[str, Camera
 
 
 def figures(rows: list[Row]) -> dict[str, float]:
+    """Counts, over all captures, how often the turned camera was named, and how often a good one was, by condition."""
     turned = [row["said"]["turned"].get(row["turned_camera"]) for row in rows]
     found: dict[str, float] = {
         "captures": len(rows),
@@ -142,7 +143,7 @@ def figures(rows: list[Row]) -> dict[str, float]:
 
 
 def as_markdown(found: Mapping[str, float]) -> str:
-    """Returns captures by condition in which a good camera is named."""
+    """Returns a Markdown table: for each condition, the number of captures in which a good camera is named."""
     whats = ("moved", "loose_or_moved")
     rows = [[name, *(found[f"{name}_good_called_{what}"] for what in whats)] for name in CONDITIONS]
     summary = f"turned cameras named: {found['turned_named']:.0f} of {found['captures']:.0f}, "

@@ -1,13 +1,13 @@
-"""How often are exchanged pictures named and put right, and how often good ones called exchanged?
+"""Measures how often exchanged pictures are detected and repaired, and how often good ones are called exchanged.
 
-``exchanges``: captures of random heads, every other one bare, the rest with hair, strands and a shirt, cameras off
-by what a calibration leaves. In each, the files of two cameras are exchanged, those of three moved round in a ring,
-and one camera's files copied over another's. They go through ``assign_images`` as a job's do, with ready masks. An
-exchange is repaired where the fit ends within ``WORST_RATIO`` of the error of the same capture unexchanged; where every
-silhouette is the same again, so is the fit. What was copied over is lost, and nothing can bring it back: beside the
-ratio stands whether the capture ended as the unexchanged one without that view (``lost_view_only``).
+``exchanges`` simulates captures of random heads, every other one without hair, the rest with hair, strands and a shirt,
+with cameras off by what a calibration leaves. In each, the files of two cameras are exchanged, those of three are
+rotated, or one camera's files are copied over another's. They go through ``assign_images`` as in a job, with given
+masks. An exchange counts as repaired if the fit ends within ``WORST_RATIO`` of the error of the same capture
+unexchanged; if every silhouette is the same again, so is the fit. A picture that was copied over is lost for good. So
+it is also recorded whether the capture ended like the unexchanged one without that view (``lost_view_only``).
 
-``false_alarms``: captures of the same kinds with nothing wrong, silhouettes alone; every code that is told is counted.
+``false_alarms`` runs captures of the same kinds with nothing wrong, silhouettes alone, and counts every warning.
 """
 
 from collections.abc import Callable, Mapping
@@ -55,7 +55,8 @@ def exchanges(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 12,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns shares of exchanges that are named and repaired, by kind."""
+    """Simulates captures whose pictures are filed under the wrong cameras. Returns the shares of these exchanges that
+    are detected and repaired, by kind of exchange."""
     records = Records(folder, "exchanges", key_of(model.sha256, *ASKED, *CONTOUR))
     rows = _rows(_exchanged_row, model, renderer, records, report, seed=18, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}
@@ -72,9 +73,10 @@ def false_alarms(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 50,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns good captures in which pictures are called exchanged, or a camera moved or its mask loose."""
+    """Simulates good captures. Returns how many get a warning that pictures are exchanged, or that a camera moved or
+    has a loose mask."""
     records = Records(folder, "false_alarms", key_of(model.sha256, *ASKED, camera_drift))
-    rows = _rows(_told_of_good, model, renderer, records, report, seed=19, subjects=subjects)
+    rows = _rows(_warnings_of_good, model, renderer, records, report, seed=19, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}
     found |= {code: sum(code in row["codes"] for row in rows) for code in GOOD_CODES}
     return {"figures": found, "rows": rows, "markdown": markdown.of_figures(found)}
@@ -176,7 +178,7 @@ def _error_mm(model: HeadModel, subject: Planted, silhouettes: Mapping[str, Silh
     return mean_error_mm(model, fit_contour(model, subject.start, silhouettes, rig, FittingSettings()), subject)
 
 
-def _told_of_good(
+def _warnings_of_good(
     model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator, *, worn: bool
 ) -> Row:
     """Codes of what is told of one good capture."""

@@ -1,9 +1,9 @@
-"""Whole jobs of the default level on pictures in which something is wrong that a studio meets: strands of hair across
-the outline in every view, somebody's hand before the face in one, somebody behind the subject in one, an operator's
-mask that belongs elsewhere in one, one camera half a pixel off.
+"""Runs whole jobs of the default level on pictures with faults that occur in studios: strands of hair across the
+outline in every view, a hand before the face in one, a person behind the subject in one, an operator's mask in the
+wrong position in one, one camera half a pixel off.
 
-What must not happen is a spike (surface that the file calls seen, far from anything there is), a hole, or an error of
-the face that nobody is told of.
+The result must have no spike (surface that the file calls seen, far from anything real), no hole, and no error of the
+face without a warning.
 """
 
 from collections.abc import Callable, Mapping
@@ -46,15 +46,15 @@ SEED = 400
 def planted(
     model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = 2, folder: Path | None = None
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<fault>_<quantity>``, the mean over the subjects
-    that it did not end, ``refused`` the share that it did.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is ``<fault>_<quantity>``,
+    the mean over the subjects whose job had a result; ``refused`` is the share of those without one.
 
     Args:
-        model: fitted, and drawn from.
+        model: fitted; heads are drawn from it, too.
         renderer: for the studio.
-        report: told the subject and fault, and the share done.
-        subjects: heads in the studio, each with every fault.
-        folder: keeps rows, so that a stopped run goes on, and a picture of every job.
+        report: called with subject, fault and the share done.
+        subjects: number of heads, each with every fault.
+        folder: keeps rows, so that a stopped run can continue, and a picture of every job.
     """
     records = Records(folder, "planted", key_of(model.sha256, Settings()))
     rows = []
@@ -72,7 +72,7 @@ def planted(
 
 
 def planted_row(known: Known, model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
-    """Returns one job: what it was refused for, or what came of it."""
+    """Runs one job. Returns why it was refused, or the errors of its result."""
     try:
         found = reconstruct(ReconstructionContext(known.capture, known.rig, model, Settings(), renderer))
     except EigenheadError as error:
@@ -100,7 +100,7 @@ def planted_row(known: Known, model: HeadModel, renderer: Renderer, picture: Pat
 
 
 def strands(known: Known, rng: np.random.Generator) -> Known:
-    """Plants loose hair that stands off the head, other strands in every view: thinner than a mask can follow."""
+    """Plants loose hair that stands off the head, with other strands in every view: thinner than a mask can follow."""
     images = {}
     for camera in known.rig:
         image, mask = known.capture.images[camera.name].copy(), subject_mask(known, camera)
@@ -138,7 +138,7 @@ def hand(known: Known, rng: np.random.Generator) -> Known:
 
 
 def behind(known: Known, rng: np.random.Generator) -> Known:
-    """Plants somebody who stands behind the subject, in the sight of one camera."""
+    """Plants a person who stands behind the subject, visible to one camera."""
     camera = known.rig[HIT]
     image, mask, scale = known.capture.images[HIT].copy(), subject_mask(known, camera), px_per_mm(known, camera)
     columns = np.nonzero(mask.any(axis=0))[0]
@@ -161,7 +161,7 @@ def wrong_mask(known: Known, rng: np.random.Generator) -> Known:
 
 
 def half_a_pixel_off(known: Known, rng: np.random.Generator) -> Known:
-    """Turns one camera after calibration, by less than anybody sees."""
+    """Turns one camera after calibration by an angle too small to notice."""
     camera = known.rig[HIT]
     turn = RigidTransform(rotation_from_vector(np.array([0.0, OFF_PX / camera.intrinsics.fx, 0.0])), np.zeros(3))
     turned = replace(camera, camera_from_world=turn @ camera.camera_from_world)
@@ -179,7 +179,7 @@ PLANTS: Mapping[str, Callable[[Known, np.random.Generator], Known]] = {
 
 
 def subject_mask(known: Known, camera: Camera) -> Bool[np.ndarray, "h w"]:
-    """Marks about where the subject is: what two cameras see of it, its gaps closed."""
+    """Returns an approximate mask of the subject: what two cameras see of it, with gaps closed."""
     height, width = known.capture.images[camera.name].shape[:2]
     drawn = np.zeros((height, width), np.uint8)
     radius = max(2, round(2.0 * px_per_mm(known, camera)))
@@ -192,7 +192,7 @@ def subject_mask(known: Known, camera: Camera) -> Bool[np.ndarray, "h w"]:
 
 
 def px_per_mm(known: Known, camera: Camera) -> float:
-    """Returns it of the head's middle."""
+    """Returns how many pixels a millimetre in the middle of the head covers in a camera."""
     depth = camera.camera_from_world.apply(known.mesh.vertices.mean(axis=0))[2]
     return float(camera.intrinsics.fx / depth)
 

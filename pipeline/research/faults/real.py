@@ -1,8 +1,8 @@
-"""Real photographs, judged like a benchmark: a head from eleven views, held against those that it never saw.
+"""Judges reconstructions from real photographs: a head from eleven views, compared with views that were not used.
 
-No truth of a real surface is at hand. What is: photographs that were left out (their outlines, where somebody drew
-them, and their colours), and the points on which any two neighbouring views agree, left-out ones included. Cameras and
-masks are found from all photographs; the surface from the eleven alone.
+The true surface is not known. Known are the photographs that were left out (their colours, and their outlines where
+somebody drew them), and points on which two neighbouring views agree, those left out included. Cameras and masks are
+estimated from all photographs; the surface from the eleven alone.
 """
 
 import time
@@ -54,8 +54,8 @@ class RealCapture:
 def real(
     model: HeadModel, captures: list[RealCapture], *, renderer: Renderer, settings: Settings, report: Progress
 ) -> Outcome:
-    """Returns rows of every capture, and their figures. Raises InputError where a folder has no more views than are
-    used."""
+    """Runs this module's experiment. Returns a row for every capture, and their figures. Raises InputError if a folder
+    has no more views than are used."""
     rows: list[Row] = []
     for one in captures:
         rows.append({"name": one.name, **judge(model, one, renderer=renderer, settings=settings, report=report)})
@@ -71,7 +71,7 @@ def real(
 def judge(
     model: HeadModel, real_capture: RealCapture, *, renderer: Renderer, settings: Settings, report: Progress
 ) -> Row:
-    """Returns the bust of eleven views, against the others."""
+    """Reconstructs the bust from eleven views, and compares it with the others."""
     started = time.perf_counter()
     silhouettes = segment(real_capture.capture, real_capture.rig, settings.segmentation, report=report)
     seconds_masks = time.perf_counter() - started
@@ -124,8 +124,8 @@ def judge(
 
 
 def choose(real_capture: RealCapture, sound: list[str], silhouettes: Mapping[str, Silhouette]) -> list[str]:
-    """Returns the eleven: spread, where there are enough none that somebody drew an outline of, and none that cuts the
-    subject off."""
+    """Chooses the eleven views: spread evenly, if possible none with a drawn outline, and none that cuts the subject
+    off."""
     undrawn = [name for name in sound if name not in real_capture.drawn]
     whole = [name for name in undrawn if not silhouettes[name].quality.cut_off]
     enough = next((names for names in (whole, undrawn) if len(names) >= USED), sound)
@@ -141,15 +141,15 @@ def views_in_front(rig: Rig, front: str | None) -> list[str]:
 
 
 def surface_of(done: Reconstruction) -> tuple[Mesh, UInt8[np.ndarray, "v 3"]]:
-    """Returns the bust, or the head where the photographs told none."""
+    """Returns the bust, or the head if there is none."""
     if done.bust is None:
         return done.mesh_world, done.texturing.vertices.colours
     return done.bust.mesh_world, done.bust.colours
 
 
 def outline_px(camera: Camera, mesh: Mesh, mask: Bool[np.ndarray, "h w"]) -> float:
-    """Returns the median distance of the surface's outline from the mask's, px, where neither is cut off by the image's
-    border."""
+    """Returns the median distance (px) of the surface's outline from the mask's, where neither is cut off by the
+    image's border."""
     shown = np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])
     distance = np.abs(signed_distance(mask))
     rim = shown & ~eroded(shown, 1)
@@ -165,7 +165,8 @@ def psnr_db(
     image: UInt8[np.ndarray, "h w 3"],
     silhouette: Silhouette,
 ) -> float:
-    """Computes it of the surface in its vertex colours against a photograph, inside both outlines, exposure fitted."""
+    """Computes the PSNR (dB) between the surface in its vertex colours and a photograph, inside both outlines, with the
+    exposure fitted."""
     drawn = picture(camera, mesh.vertices, mesh.faces, colours).astype(np.float64)
     shown = np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])
     inside = eroded(shown, INSIDE_PX) & (silhouette.distance < -INSIDE_PX) & (image.max(axis=2) < CLIPPED)
@@ -184,8 +185,8 @@ def psnr_db(
 def distances_mm(
     real_capture: RealCapture, views: list[str], silhouettes: Mapping[str, Silhouette], mesh: Mesh
 ) -> Float[np.ndarray, " n"]:
-    """Returns distances of the points that neighbouring views (of ``views``) agree on, where their masks show the
-    subject."""
+    """Returns the distances (mm) between the surface and points on which neighbouring ``views`` agree, where their
+    masks show the subject."""
     points = find_scene_points(real_capture.capture.images, real_capture.rig.subset(views))
     subject = np.zeros(len(points.points), int)
     for name in points.rows:

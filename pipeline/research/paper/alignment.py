@@ -1,9 +1,9 @@
-"""How often is the alignment found without feature points?
+"""Measures how often the alignment is found without feature points.
 
-Random heads with hair and a shirt, turned by up to 30 degrees (yaw), 15 (pitch) and 15 (roll) and up to 60 mm off the
-rig's centre; every draw has another world frame, and its front camera is the one that the operator names. Right is
-within 2 degrees and 3 mm of the truth after the fit: Procrustes of the face region against its true vertices, and the
-distance of their means.
+Random heads with hair and a shirt are turned by up to 30 degrees (yaw), 15 (pitch) and 15 (roll), and moved up to 60 mm
+off the rig's centre. Each has another world frame, and its front camera is the one that the operator names. An
+alignment is right if it is within 2 degrees and 3 mm of the truth after the fit: Procrustes of the face region against
+its true vertices, and the distance of their means.
 """
 
 import time
@@ -55,7 +55,7 @@ def alignment(
 
 
 def draw(model: HeadModel, seed: int, renderer: Renderer) -> Row:
-    """Returns one subject in one world."""
+    """Runs the search on one random subject in its own world frame."""
     rng = np.random.default_rng([77, seed])
     rig = default_layout()
     subject = random_sitter(rig, rng)
@@ -83,7 +83,7 @@ def draw(model: HeadModel, seed: int, renderer: Renderer) -> Row:
 
 
 def random_sitter(rig: Rig, rng: np.random.Generator) -> Planted:
-    """Returns a head that the model says, turned and shifted as far as a subject in the rig may be."""
+    """Draws a head of the model, turned and shifted as far as a subject in the rig may be."""
     coefficients = np.clip(rng.standard_normal(60), -2, 2)
     yaw, pitch, roll = rng.uniform(-1, 1, 3) * np.radians(TURN_DEG)
     about = [rotation_from_vector(angle * np.eye(3)[axis]) for axis, angle in ((1, yaw), (0, pitch), (2, roll))]

@@ -1,7 +1,9 @@
-"""How often does the contour solver arrive, from the mean head at a start as feature points leave it?
+"""Measures how often the contour solver converges to the right head, from the mean head at a start as feature points
+leave it.
 
-Random heads of section 5.2's kind, bare, on exact cameras with binary masks; a fit has arrived where its mean error
-over the face is under 0.3 mm. Beside them heads drawn as the model says, z ~ N(0, 1), whose start is twice as far off.
+Heads are drawn as in section 5.2, without hair, with exact cameras and binary masks. A fit is right if its mean error
+over the face is below 0.3 mm. A second set of heads is drawn from the model, z ~ N(0, I), whose start is twice as far
+off.
 """
 
 from collections.abc import Callable
@@ -29,7 +31,7 @@ def convergence(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 500,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns the share of the draws that arrive, and the errors, of both kinds."""
+    """Runs this module's experiment. Returns, for both sets of heads, the share that converges and the errors."""
     records = Records(folder, "convergence", key_of(model.sha256, FittingSettings(), *CONTOUR))
     span, rig = with_modes(model, 60), exact(default_layout())
     jobs: list[tuple[str, Planted]] = []

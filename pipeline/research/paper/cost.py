@@ -1,9 +1,9 @@
-"""Eq. (4) against eq. (5) where the subject has hair, for both solvers.
+"""Compares the paper's eqs. (4) and (5) as costs for subjects with hair, with both solvers.
 
-The simplex minimises either to the letter (every pixel of the image has its say), and eq. (5) with the face's outline
-alone speaking, as this project uses it. What the two costs are to a contour: eq. (5) forgives what lies far from the
-input's contour, eq. (4) does not. So the contour solver runs with its robust scale, and with one so wide that no
-outlier is forgiven. The simplex has the true alignment; errors are over the face, mm.
+The simplex minimises each as written (every pixel of the image counts), and eq. (5) with only the face's outline, as
+this project uses it. For a contour the difference is this: eq. (5) hardly penalises what lies far from the input's
+contour, eq. (4) does. So the contour solver runs with its robust scale, and with one so wide that no outlier loses
+weight. The simplex has the true alignment. Errors are over the face, mm.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ from rig.studio.scene.layout import default_layout
 
 
 class SimplexCost(TypedDict):
-    """Holds which pixels count, and whether by eq. (5) or eq. (4)."""
+    """Holds which pixels count, and whether they are weighted by eq. (5) or counted by eq. (4)."""
 
     speaking: Literal["face", "all"]
     weighted: bool
@@ -56,7 +56,7 @@ def cost(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns errors by solver and cost, and of the mean head."""
+    """Runs this module's experiment. Returns the errors by solver and cost, and those of the mean head."""
     sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "cost", key_of(model.sha256, FittingSettings(), STYLE, *sources))
     span, rig = with_modes(model, 60), exact(default_layout())

@@ -1,14 +1,14 @@
-"""Beyond the span: eigenheads alone, with kernel modes, and with photographs, side by side with a visual hull.
+"""Compares levels of detail: eigenheads alone, with kernel modes, and with photographs, together with a visual hull.
 
-Every figure is of the whole reconstruction from photographs: own masks, own alignment, calibration as given. Distances
-are from the true face region, weighted by area, to the surface as delivered, with no realignment. Subjects:
+Every figure is of a whole reconstruction from photographs: own masks, own alignment, calibration as given. Distances
+are from the true face region, weighted by area, to the delivered surface, without realignment. Subjects:
 
 - captures with a truth beside them (``<name>`` and ``<name>.truth``), rendered by another program;
-- random heads of another population, all its modes, photographed in the simulated studio;
-- random heads of the model's own 60 modes in the same studio, which the span can hold: what does more freedom cost?
+- random heads of another population, with all its modes, photographed in the simulated studio;
+- random heads of the model's own 60 modes in the same studio, which the span contains: what do more modes cost there?
 
-Beside the errors: each camera held out and predicted from the others, a bumped camera and a wrong mask, and how many
-true vertices the posterior's 95 % intervals hold along the normal.
+Further figures: each camera left out and predicted from the others, a moved camera and a wrong mask, and how many true
+vertices lie in the posterior's 95 % intervals along the normal.
 """
 
 import hashlib
@@ -84,7 +84,7 @@ class Known:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """Holds what one level of detail made of a capture."""
+    """Holds the fit of one level of detail to a capture."""
 
     fit: Fit
     model: HeadModel  # with the modes that the fit has
@@ -92,6 +92,7 @@ class Fitted:
     seconds: float
 
     def mesh(self) -> Mesh:
+        """Returns the fitted head on the full level, world frame, mm."""
         vertices = self.fit.world_from_head.apply(self.model.vertices(self.fit.coefficients))
         return Mesh(vertices, self.model.levels["full"].faces)
 
@@ -108,11 +109,19 @@ def run(
     held_out: bool = True,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat, ``<subject>_<model>_<level>_<quantity>``.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
+    ``<subject>_<model>_<level>_<quantity>``.
 
-    ``models``: by the name that the figures carry; the first one is used for draws, faults and held-out cameras.
-    ``captures``: folders with a truth beside them. ``others``: the population that the draws come from. Rows are kept
-    in ``folder`` and not computed again.
+    Args:
+        models: by the name in the figures; the first one is used for random heads, faults and left-out cameras.
+        captures: folders with a truth beside them.
+        renderer: for the studio.
+        report: progress.
+        others: the population from which random heads are drawn.
+        draws: number of random heads of it.
+        in_span: number of random heads of the first model's span.
+        held_out: whether cameras are left out and predicted.
+        folder: keeps rows, which are not computed again.
     """
     records = Records(folder, "detail", _key(models, others))
     label, model = next(iter(models.items()))
@@ -164,7 +173,7 @@ def photographed(
     fault: Fault | None = None,
     preset: Preset = PRESET,
 ) -> Known:
-    """Returns a random head in the simulated studio. The same seed makes the same head, look and pose, whatever the
+    """Photographs a random head in the simulated studio. The same seed gives the same head, look and pose, whatever the
     fault."""
     rng = np.random.default_rng((9, seed))
     coefficients = spread * rng.standard_normal(modes)
@@ -180,7 +189,7 @@ def photographed(
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
-    """Returns every level of detail on one subject: ``{level: {quantity: value}}``."""
+    """Runs every level of detail on one subject. Returns ``{level: {quantity: value}}``."""
     subject = known()
     return {
         level: {
@@ -196,7 +205,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) 
 def every_level(
     capture: Capture, rig: Rig, model: HeadModel, levels: tuple[Level, ...], renderer: Renderer
 ) -> dict[Level, Fitted]:
-    """Fits every level of detail, masks and alignment made once for all of them."""
+    """Fits every level of detail to a capture; masks and alignment are computed once for all."""
     context = ReconstructionContext(capture, rig, model, Settings(), renderer)
     run = Recorder(discard_progress)
     views = run(find_views, context)
@@ -212,6 +221,7 @@ def every_level(
 
 
 def hull_row(known: Callable[[], Known]) -> Row:
+    """Computes the visual hull of a capture, and returns its distances (mm) from the true face."""
     subject = known()
     silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=discard_progress)
     return {"hull": surface_error(subject, visual_hull(silhouettes, subject.rig))}
@@ -256,10 +266,11 @@ def along_normal(
 
 
 def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) -> Row:
-    """Fits with all cameras but one, and predicts that one: RMS distance of the true face's outline to the predicted
-    one, where the photograph shows it and where hair covers it too; PSNR over the face.
+    """Fits with all cameras but one, and predicts that camera's picture.
 
-    From the true outline to ours, since ours goes on where the true one hides behind shoulders, which no model has.
+    Figures are the RMS distance (px) of the true face's outline to the predicted one, where the photograph shows it and
+    also where hair covers it, and the PSNR over the face. The distance is from the true outline to the predicted one,
+    since the latter continues where shoulders, which no model has, hide the former.
     """
     known, settings = read_known(path), Settings()
     silhouettes = segment(known.capture, known.rig, settings.segmentation, report=discard_progress)
@@ -312,8 +323,8 @@ def colour_psnr(
     face: Bool[np.ndarray, " v"],
     mask: Bool[np.ndarray, "h w"],
 ) -> float:
-    """Returns dB between a photograph and the coloured mesh over the pixels of the face, after one gain a channel:
-    cameras differ in exposure, and a camera that was left out has none."""
+    """Returns the PSNR (dB) between a photograph and the coloured mesh over the pixels of the face. One gain for each
+    channel is fitted, since cameras differ in exposure, and one that was left out has none."""
     pixels, depths = camera.project(mesh.vertices), camera_depths(camera, mesh.vertices)
     _, seen = rasterise(pixels, depths, mesh.faces, *image.shape[:2])
     drawn = interpolate(seen, pixels, depths, mesh.faces, colours.astype(np.float32))
@@ -324,8 +335,8 @@ def colour_psnr(
 
 
 def figures(rows: list[Row]) -> dict[str, float]:
-    """Returns figures: of a subject its own values; of draws, in-span heads and held-out cameras means and worst
-    ones."""
+    """Summarises the rows: values of each subject, and means and worst values over random heads, heads in the span, and
+    left-out cameras."""
     values: dict[str, list[float]] = {}
     for row in rows:
         subject, _, label = row["name"].rpartition("_")

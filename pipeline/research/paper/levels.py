@@ -1,8 +1,10 @@
-"""What the hierarchy of section 5.1 buys: time and error of full images and meshes, 95/50 and 99/75 (mesh decimated by
-so many percent, image reduced by so many), each alone and with the coarse answer as its start.
+"""Measures what the hierarchy of section 5.1 saves: time and error of full images and meshes, and of the levels 95/50
+and 99/75 (mesh decimated by so many percent, image reduced by so many), each alone and with the coarse result as its
+start.
 
-The simplex has the true alignment. Its full level takes minutes a subject, so that only the first ``FULL_SUBJECTS`` see
-it. Beside it the contour solver on images of full, half and a quarter of the size, which has levels of its own.
+The simplex has the true alignment. Its full level takes minutes for each subject, so that only the first
+``FULL_SUBJECTS`` get it. For comparison, the contour solver runs on images of full, half and a quarter of the size; it
+has levels of its own.
 """
 
 import time
@@ -42,7 +44,7 @@ def levels(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns seconds, evaluations and errors by hierarchy."""
+    """Runs this module's experiment. Returns seconds, evaluations and errors by hierarchy."""
     sources = (*CONTOUR, objective, schedule, simplex)
     records = Records(folder, "levels", key_of(model.sha256, FittingSettings(), *sources))
     span, rig = with_modes(model, 60), exact(default_layout())

@@ -1,9 +1,10 @@
-"""How far the contour solver is from the physical limit: RMSE over the Cramer-Rao bound, and interval coverage.
+"""Measures how close the contour solver is to the physical limit: RMSE divided by the Cramer-Rao bound, and the
+coverage of its intervals.
 
-Gaussian noise of standard deviation sigma moves the true sub-pixel outline along its normals (binary masks are no
-regular problem); its correlation along the outline has the integral l. Bare heads, exact cameras, pose and scale
-unknown. The bound is ``e^2 = tr(B I^-1 B^T) / V`` over the face's vertices, with I the Fisher information of the rim at
-the truth plus the prior.
+Gaussian noise of standard deviation sigma moves the true sub-pixel outline along its normals (with binary masks the
+problem would not be regular); the integral of its correlation along the outline is l. Heads without hair, exact
+cameras, pose and scale unknown. The bound is ``e^2 = tr(B I^-1 B^T) / V`` over the face's vertices, with I the Fisher
+information of the rim at the truth plus the prior's.
 """
 
 from collections.abc import Callable
@@ -39,7 +40,8 @@ UNROBUST_PX = 1e3  # a robust scale so wide that the bound knows of no outliers
 def limit(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 15, draws: int = 2
 ) -> Outcome:
-    """Returns eta and coverage over ``subjects`` x ``draws`` for each noise."""
+    """Runs this module's experiment. Returns, for each noise, the efficiency (error over bound) and the coverage over
+    ``subjects`` heads with ``draws`` noises each."""
     span, rig = with_modes(model, 60), exact(default_layout())
     planted = random_subjects(subjects, seed=91)
     rows = []
@@ -90,7 +92,8 @@ def _row(
 
 
 def settings_for(sigma: float) -> FittingSettings:
-    """Returns settings in which the noise is stated, so that nothing is estimated; four sigma is no outlier."""
+    """Returns settings in which the noise is stated, so that it is not estimated, and residuals of up to four sigma are
+    no outliers."""
     return FittingSettings(
         contour_noise_px=sigma, contour_correlation_px=CORRELATION_PX, robust_px=max(1.5, 6.0 * sigma)
     )
@@ -110,7 +113,8 @@ def bound_mm(model: HeadModel, subject: Planted, clean: dict[str, Silhouette], r
 
 
 def rms_deviation_mm(model: HeadModel, fit: Fit) -> float:
-    """Returns sqrt(tr(B C B^T) / V) over the face region, all three axes."""
+    """Returns the RMS standard deviation (mm) of the face region's vertices that the fit states, sqrt(tr(B C B^T) / V),
+    over all three axes."""
     assert fit.covariance is not None
     factor = np.linalg.cholesky(fit.covariance)
     region = np.flatnonzero(model.levels["full"].face_region)[::7]  # the trace is smooth: every seventh vertex will do
@@ -127,10 +131,11 @@ def rms_deviation_mm(model: HeadModel, fit: Fit) -> float:
 
 
 def with_noise(silhouette: Silhouette, sigma: float, correlation: float, rng: np.random.Generator) -> Silhouette:
-    """Returns the silhouette with its contour moved along its normals by a random process of the arc length.
+    """Adds noise to a silhouette: moves its contour along its normals at random, with standard deviation ``sigma`` and
+    correlation length ``correlation`` along the contour (px).
 
-    Near the contour every pixel takes the displacement of its nearest contour point, so that the signed distance keeps
-    its slope across the contour, as the distance to any contour does; a random field over the image would not.
+    Near the contour every pixel is moved like its nearest contour point. The signed distance thus keeps its slope of 1
+    across the contour, which it would not with noise drawn for each pixel of the image.
     """
     points, arc = contour_points(silhouette.distance)
     band = np.abs(silhouette.distance) < BAND_PX
@@ -143,8 +148,8 @@ def with_noise(silhouette: Silhouette, sigma: float, correlation: float, rng: np
 
 
 def contour_points(distance: Float32[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Returns points (x, y) on the zero contour, STEP_PX or less apart, and the arc length (px) at each; a gap of 1,000
-    px between pieces makes their noise independent."""
+    """Returns points (x, y) on the contour, at most STEP_PX apart, and the arc length (px) at each. Between separate
+    pieces the arc length jumps by 1,000 px, so that their noise is independent."""
     slopes = np.stack([np.gradient(distance, axis=1), np.gradient(distance, axis=0)], axis=-1)
     pieces, _ = cv2.findContours((distance < 0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     points, arcs, end = [], [], 0.0
@@ -163,11 +168,11 @@ def contour_points(distance: Float32[np.ndarray, "h w"]) -> tuple[Float[np.ndarr
 def contour_process(
     arc: Float[np.ndarray, " n"], sigma: float, correlation: float, rng: np.random.Generator
 ) -> Float[np.ndarray, " n"]:
-    """Returns a Gaussian process at the arc lengths: read between pixels it has the standard deviation sigma and the
+    """Draws a Gaussian process at the arc lengths. Read between pixels it has the standard deviation sigma and the
     correlation exp(-x^2 / 4 a^2), whose integral is ``correlation`` for a = l / (2 sqrt(pi)).
 
-    Reading bilinearly is one more filter, a triangle of variance 1/6 px^2, so that the process itself is that much
-    narrower and stronger.
+    Bilinear reading is one more filter, a triangle of variance 1/6 px^2; the process itself is narrower and stronger by
+    as much.
     """
     read = correlation / (2.0 * np.sqrt(np.pi))
     width = np.sqrt(max(read**2 - 1.0 / 6.0, 0.04))

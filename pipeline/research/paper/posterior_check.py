@@ -1,13 +1,14 @@
-"""Is the Laplace posterior of a fit the posterior? A preconditioned Crank-Nicolson chain asks.
+"""Checks whether the Laplace posterior of a fit is the true posterior, by a Markov chain: preconditioned
+Crank-Nicolson.
 
 Cotter, Roberts, Stuart and White, *MCMC methods for functions*, Statistical Science 2013. With the fit's mode m and
-covariance C the proposal ``m + sqrt(1 - b^2) (x - m) + b N(0, C)`` leaves N(m, C) as it is, so that a step is accepted
-by what the cost says beyond its quadratic form: always, were the posterior Gaussian. The chain's standard deviations
-over the Laplace ones are near 1 where the covariance may be believed.
+covariance C, the proposal ``m + sqrt(1 - b^2) (x - m) + b N(0, C)`` leaves N(m, C) unchanged. A step is then accepted
+by the difference between the cost and its quadratic approximation: always, if the posterior were Gaussian. If the
+covariance is right, the chain's standard deviations divided by the Laplace ones are near 1.
 
-Bare heads, exact cameras, contours with Gaussian noise of 0.3 px whose size is stated (``limit``); coefficients, pose
-and scale. Half a cost is a negative logarithm of density. Chains run on the decimated mesh (``p95``), whose own
-contours they are given, since a step must not take a tenth of a second.
+Heads without hair, exact cameras, contours with Gaussian noise of 0.3 px whose size is stated (``limit``); unknowns are
+coefficients, pose and scale. Half a cost is a negative log density. Chains run on the decimated mesh (``p95``), with
+contours made from it, since a step must take less than a tenth of a second.
 """
 
 from collections.abc import Callable
@@ -36,7 +37,8 @@ STEPS, FORGOTTEN = 12_000, 2_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Draws as steps from the mode (coefficients, rotation, translation, log scale), and the share accepted."""
+    """Holds the chain's draws, as steps from the mode (coefficients, rotation, translation, log scale), and the share
+    of accepted proposals."""
 
     draws: Float[np.ndarray, "n p"]
     accepted: float
@@ -46,8 +48,8 @@ def posterior_check(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns chain over Laplace: standard deviations of coefficients and pose, and of the face's points along the
-    axes."""
+    """Runs this module's experiment. Returns the chain's standard deviations divided by the Laplace ones: of
+    coefficients and pose, and of the face's points along the axes."""
     records = Records(folder, "posterior", key_of(model.sha256, *CONTOUR, STEPS, BETA))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []
@@ -96,7 +98,7 @@ def run_chain(
     rng: np.random.Generator,
     steps: int = STEPS,
 ) -> Chain:
-    """Returns the chain from the mode; the first ``FORGOTTEN`` draws are dropped."""
+    """Runs the chain from the mode, and returns its draws without the first ``FORGOTTEN``."""
     factor = np.linalg.cholesky(covariance)
     whole, _ = started_problem(problem, first_evidence(problem.settings), stage, UNROBUST_PX, mode)
 

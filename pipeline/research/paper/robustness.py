@@ -1,20 +1,22 @@
-"""What the contour solver loses when the input is worse than it should be.
+"""Measures how much the contour solver loses when its input is worse than it should be.
 
-Bare heads of section 5.2's kind on exact cameras with binary masks are the base; every other condition has the same
-heads and the same start, and its error is given beside the base's:
+The base are heads without hair as in section 5.2, with exact cameras and binary masks. Every other condition has the
+same heads and the same start, and its error is compared with the base's:
 
 - one and three cameras missing, drawn anew for each head;
 - hair over the ears, and hair with a fringe down the forehead, both with a shirt;
-- a fifth of each contour wrong: disks of 6 to 18 px stuck on or bitten out along it;
+- a fifth of each contour wrong: disks of 6 to 18 px added or cut out along it;
 - images of a half and a quarter of the size.
 
-Calibration errors of 0.1, 0.2 and 0.5 px (a head moves by so much in each image) are measured against the joint bound:
-the Cramer-Rao bound of shape, pose and cameras together for 0.3 px of Gaussian contour noise, the errors known in size
-alone. Once they are stated as the cameras' covariance, once they are not, and the solver takes its default of 0.2 px.
+Calibration errors of 0.1, 0.2 and 0.5 px (a head moves by so much in each image) are compared with the joint bound: the
+Cramer-Rao bound of shape, pose and cameras together for 0.3 px of Gaussian contour noise, when only the size of the
+errors is known. They are stated as the cameras' covariance in one run; in the other they are not, and the solver
+assumes its default of 0.2 px.
 
-Two cameras swapped, one camera knocked by 1 and by 5 degrees: the subject has hair and a shirt, the masks go through
-``reconstruct``'s own checks (agreement of the masks, drift), and a fault counts as found where every bad camera is left
-out by name. The error is that of the fit to the remaining cameras, beside the same capture's without the fault.
+Two cameras swapped, and one camera turned by 1 and by 5 degrees: the subject has hair and a shirt, and the masks go
+through ``reconstruct``'s own checks (agreement of the masks, drift). A fault counts as found if every bad camera is
+left out by name. The error is that of the fit to the remaining cameras, compared with the same capture's without the
+fault.
 """
 
 from collections.abc import Callable, Mapping
@@ -67,7 +69,8 @@ def robustness(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns errors by condition, their ratios to the base and to the bound, and how often faults are found."""
+    """Returns the contour solver's errors under each condition of this module, their ratios to those of perfect input
+    and to the best possible error (the Cramer-Rao bound), and how often faulty cameras are found."""
     records = Records(folder, "robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
     span = with_modes(model, 60)
     rows = []
@@ -88,16 +91,19 @@ Condition = Callable[[HeadModel, Planted, Renderer, np.random.Generator], Row]
 
 
 def fitted(model: HeadModel, subject: Planted, silhouettes: Mapping[str, Silhouette], rig: Rig) -> Row:
+    """Fits the contours, and returns the mean distance (mm) of the face region's vertices from their true positions."""
     fit = fit_contour(model, subject.start, silhouettes, rig, FittingSettings())
     return {"error_mm": mean_error_mm(model, fit, subject)}
 
 
 def resolution(scale: float, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
+    """Fits a subject to silhouettes drawn at ``scale`` times the usual resolution."""
     rig = exact(default_layout())
     return fitted(model, subject, binary_silhouettes(model, subject, rig, renderer, scale), rig.scaled(scale))
 
 
 def missing(count: int, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
+    """Fits a subject without ``count`` of the cameras, drawn at random."""
     rig = exact(default_layout())
     lost = sorted(rng.choice(rig.names, count, replace=False).tolist())
     rest = rig.subset(name for name in rig.names if name not in lost)
@@ -105,18 +111,20 @@ def missing(count: int, model: HeadModel, subject: Planted, renderer: Renderer, 
 
 
 def worn(style: HairStyle, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
+    """Fits a subject whose silhouettes contain hair of a style."""
     rig = exact(default_layout())
     return fitted(model, subject, worn_silhouettes(model, subject, rig, renderer, style, rng), rig)
 
 
 def wrong_contours(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
+    """Fits a subject to silhouettes with parts of their contours spoiled."""
     rig = exact(default_layout())
     clean = binary_silhouettes(model, subject, rig, renderer)
     return fitted(model, subject, {n: silhouette_from_mask(spoiled(s.mask, rng)) for n, s in clean.items()}, rig)
 
 
 def spoiled(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Bool[np.ndarray, "h w"]:
-    """Returns the mask with ``WRONG_SHARE`` of its contour inside disks that were stuck on or bitten out."""
+    """Returns the mask with disks added or cut out until ``WRONG_SHARE`` of its contour is wrong."""
     edge = mask & ~_eroded(mask)
     at = np.argwhere(edge)
     wrong, out = np.zeros(len(at), bool), mask.copy()
@@ -140,8 +148,8 @@ def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def calibration(
     error_px: float, known: bool, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator
 ) -> Row:
-    """Returns root mean square error and the joint bound; the cameras that take the picture are where the rig does not
-    say."""
+    """Fits a subject with cameras that stand elsewhere than the rig says, by ``error_px`` in the image. ``known``: the
+    rig states that error as covariance. Returns the root mean square error and the joint Cramer-Rao bound, mm."""
     rig, clean = default_layout(), _clean(model, subject, renderer)
     believed = off_by(stated(rig, error_px) if known else rig, error_px, rng)
     noisy = {n: limit.with_noise(s, CONTOUR_NOISE_PX, limit.CORRELATION_PX, rng) for n, s in clean.items()}
@@ -161,8 +169,8 @@ def _clean(model: HeadModel, subject: Planted, renderer: Renderer) -> dict[str, 
 
 
 def faulty(kind: str, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator) -> Row:
-    """Returns which cameras ``reconstruct`` leaves out, and what is left of the error; ``none`` tells of false
-    alarms."""
+    """Fits a subject with a fault of the cameras. Returns which cameras ``reconstruct`` leaves out, and the remaining
+    error; the kind ``none`` shows false alarms."""
     rig = default_layout()
     first, second = rng.choice(rig.names, 2, replace=False).tolist()
     true, bad = rig, []
@@ -206,6 +214,9 @@ FAULTS = ("no_fault", "swapped", *(f"knocked_{turn:g}deg" for turn in KNOCKS_DEG
 
 
 def figures(rows: list[Row]) -> dict[str, float]:
+    """Returns, for each condition, the mean and the largest error (mm), their ratio to the undisturbed case and, where
+    they apply, the ratio to the Cramér-Rao bound and the shares of faults that were found and of good cameras that were
+    left out."""
     found: dict[str, float] = {"subjects": len(rows)}
     for name in CONDITIONS:
         errors = np.array([row[name]["error_mm"] for row in rows])
@@ -223,6 +234,7 @@ def figures(rows: list[Row]) -> dict[str, float]:
 
 
 def as_markdown(found: Mapping[str, float]) -> str:
+    """Returns the figures as a Markdown table with a row for each condition."""
     columns = ("mm", "worst_mm", "ratio", "over_bound", "found", "others_left_out")
     rows = [[name, *(found.get(f"{name}_{column}") for column in columns)] for name in CONDITIONS]
     header = ("condition", "error, mm", "worst", "times the base", "RMSE / bound", "found", "good cameras left out")

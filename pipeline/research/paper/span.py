@@ -1,8 +1,8 @@
-"""How well can a model reach a real face at all? The floor of every result made with it.
+"""Measures how closely a model can represent a real face: the lowest error of any result made with it.
 
-A model is fitted straight to a true surface (face region), pose free, scale fixed, prior N(0, I), and the distance
-that remains is its floor: what no camera arrangement and no solver can go below within its span. Truths are rendered
-captures' subjects (folders with head.ply, face_mask.npy, meta.json) and random draws of a second model.
+A model is fitted directly to a true surface (face region), with free pose, fixed scale, prior N(0, I). The remaining
+distance is its floor: no cameras and no solver can do better within its span. Truths are the subjects of rendered
+captures (folders with head.ply, face_mask.npy, meta.json), and random heads of a second model.
 """
 
 import json
@@ -45,12 +45,12 @@ def run(
     counts: Sequence[int] = (60, 0),
     report: Progress | None = None,
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``: floors of each model on each truth, for each count of modes (0:
-    all).
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``: floors of each model on each truth,
+    for each count of modes (0: all).
 
     ``figures`` is flat: ``<model>_<modes>_<truth>_{median,mean}_mm`` and ``_largest_sigma`` for each single truth, and
-    ``<model>_<modes>_draws_...`` as means over the truths whose names start with ``draw:``. Beside them
-    ``<model>_own_draws_{generalisation,specificity}_mm``: a low floor alone is no merit.
+    ``<model>_<modes>_draws_...`` as means over the truths whose names start with ``draw:``; besides these
+    ``<model>_own_draws_{generalisation,specificity}_mm``, since a low floor alone is no merit.
     """
     rows = []
     jobs = [(name, truth, count) for name in models for truth in truths for count in counts]
@@ -65,7 +65,7 @@ def run(
 
 
 def floor(name: str, model: HeadModel, truth: Truth, count: int = 0) -> dict:
-    """Returns one row: distances (mm, area-weighted) of the true face to the model's best likeness of it."""
+    """Returns one row: distances (mm, area-weighted) between the true face and the model's best fit to it."""
     used = min(count or len(model.modes), len(model.modes))
     fit = best_likeness(model, truth, used)
     z = np.abs(fit.coefficients)
@@ -84,7 +84,8 @@ def floor(name: str, model: HeadModel, truth: Truth, count: int = 0) -> dict:
 
 
 def best_likeness(model: HeadModel, truth: Truth, count: int) -> SurfaceFit:
-    """Returns the model fitted to the truth's points, from the seven feature points on; distances to every point."""
+    """Fits the model to the truth's points, starting from the seven feature points. Returns the fit, with distances to
+    every point."""
     ours = model.vertices(np.zeros(0))
     source = np.array([ours[model.landmarks[name]] for name in truth.features])
     start = rigid_fit(source, np.array(list(truth.features.values())))
@@ -102,7 +103,7 @@ def weighted_quantile(values: Float[np.ndarray, " N"], weights: Float[np.ndarray
 
 
 def read_truth(folder: Path) -> Truth:
-    """Returns a truth folder as the simulator and the shared captures write it. Raises InputError."""
+    """Reads a truth folder, as the simulator and the shared captures have it. Raises InputError."""
     missing = [f"{n} is missing" for n in ("head.ply", "face_mask.npy", "meta.json") if not (folder / n).is_file()]
     if missing:
         raise InputError(str(folder), missing)

@@ -1,8 +1,8 @@
-"""Tables 1 to 3 of the paper: accuracy over 100 subjects, correlations, arrangements of eleven cameras.
+"""Repeats tables 1 to 3 of the paper: accuracy over 100 subjects, correlations, arrangements of eleven cameras.
 
 XOR: pixels that differ at full mesh and image resolution, all cameras together (eq. 4). L2: root of the sum of squared
-distances of corresponding vertices of the whole mesh, in mm. Hausdorff: largest distance from a vertex of one mesh to
-the nearest of the other, both ways, in mm. The paper does not state its units; its database is another.
+distances of corresponding vertices of the whole mesh, mm. Hausdorff: largest distance from a vertex of one mesh to the
+nearest of the other, both ways, mm. The paper does not state its units; its database is another.
 """
 
 from collections.abc import Mapping
@@ -134,7 +134,7 @@ def table3(
     simplex_subjects: int = 25,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns the four arrangements of section 5.3."""
+    """Computes table 3: the accuracy with the four arrangements of cameras of section 5.3."""
     figures, rows, table = {}, {}, []
     for name in ARRANGEMENTS:
         rig = arrangement(name)
@@ -154,7 +154,7 @@ def table3(
 
 
 def correlation(rows: list[Row], one: str, two: str) -> float | None:
-    """Returns Pearson's; None of fewer than three rows."""
+    """Returns Pearson's correlation of two quantities over the rows; None for fewer than three rows."""
     values = np.array([[row[one], row[two]] for row in rows])
     return float(np.corrcoef(values.T)[0, 1]) if len(values) > 2 else None
 

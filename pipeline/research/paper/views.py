@@ -1,11 +1,11 @@
-"""Where should the cameras stand? An A-optimal choice from the Fisher information of the rim, which the paper leaves
-open (section 6), against its four arrangements of eleven (section 5.3).
+"""Plans where cameras should stand: an A-optimal choice from the Fisher information of the rim, which the paper leaves
+open (section 6), compared with its four arrangements of eleven (section 5.3).
 
-Candidates lie on the sphere that the paper's cameras are taken from: azimuth -90 to 90 and elevation -40 to 40 degrees.
-The information of a set of views is the sum of theirs, plus the prior; pose and scale are unknown, and only the face's
-rim speaks, since hair and clothes hide the rest. The set is chosen greedily and improved by exchanges for the mean over
-some heads of ``e^2 = tr(B I^-1 B^T) / V`` (fitting.md, the physical limit), and scored on other heads: by the same
-limit, and by the error of fits to heads with hair.
+Candidates lie on the sphere of the paper's cameras: azimuth -90 to 90 and elevation -40 to 40 degrees. The information
+of a set of views is the sum of theirs plus the prior's. Pose and scale are unknown, and only the face's rim counts,
+since hair and clothes hide the rest. The set is chosen greedily and improved by exchanges for the mean over some heads
+of ``e^2 = tr(B I^-1 B^T) / V`` (fitting.md, the physical limit). It is scored on other heads: by the same limit, and by
+the error of fits to heads with hair.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,8 +44,8 @@ def views(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 12,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns the planned directions, and limit and error of every arrangement over ``subjects`` heads not planned
-    on."""
+    """Runs this module's experiment. Returns the planned directions, and limit and error of every arrangement over
+    ``subjects`` heads that were not used for planning."""
     span = with_modes(model, 60)
     records = Records(folder, "views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
     heads = random_subjects(CHOSEN_ON + subjects, seed=33)
@@ -136,10 +136,8 @@ def face_quadratic(model: HeadModel, head: Planted) -> Float[np.ndarray, "p p"]:
 def a_optimal(
     heads: Sequence[tuple[Information, Float[np.ndarray, "_ _"]]], count: int, before: Float[np.ndarray, "p p"]
 ) -> list[int]:
-    """Indices of ``count`` views with the least mean of ``tr(G (sum I_k + prior)^-1)``: greedily, then by exchanges.
-
-    ``heads``: information of every candidate, and G, for each head.
-    """
+    """Chooses ``count`` views with the smallest mean of ``tr(G (sum I_k + prior)^-1)``, greedily and then by exchanges.
+    Returns their indices. ``heads`` has, for each head, the information of every candidate, and G."""
 
     def loss(chosen: list[int]) -> float:
         faint = 1e-9 * np.eye(len(before))  # one view alone leaves the pose open

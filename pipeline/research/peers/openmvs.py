@@ -1,9 +1,9 @@
-"""OpenMVS as a peer: our undistorted photographs, masks and cameras as its input, its programs run, its surface back.
+"""Runs OpenMVS for comparison, on this project's undistorted photographs, masks and cameras.
 
-It is AGPL, so that nothing of it is part of the project: a user builds it and names the folder of its programs
-(https://github.com/cdcseacave/openMVS; InterfaceCOLMAP, DensifyPointCloud, ReconstructMesh, RefineMesh). It gets what
-its makers ask for: a COLMAP model in text (https://colmap.github.io/format.html#text-format) whose points say which
-views belong together. Those are points of the visual hull, in every view that looks at their side of it.
+OpenMVS is under the AGPL, so that nothing of it is part of the project: a user builds it and names the folder of its
+programs (https://github.com/cdcseacave/openMVS; InterfaceCOLMAP, DensifyPointCloud, ReconstructMesh, RefineMesh). Its
+input is what its makers ask for: a COLMAP model in text (https://colmap.github.io/format.html#text-format) whose points
+say which views belong together. These are points of the visual hull, in every view that sees their side of it.
 """
 
 import resource
@@ -48,13 +48,13 @@ def programs_in(folder: Path) -> dict[str, Path]:
 def surface_by_openmvs(
     depth_maps: Sequence[DepthMap], hull_world: Mesh, programs: Mapping[str, Path], folder: Path
 ) -> tuple[Mesh, float]:
-    """Returns its refined surface (world frame, mm) and the CPU seconds that its programs took.
+    """Runs OpenMVS. Returns its refined surface (world frame, mm) and the processor seconds of its programs.
 
     Args:
         depth_maps: for their cameras, photographs and masks; their depth is not used.
         hull_world: the visual hull.
         programs: by name.
-        folder: empty; the input and all that the programs write.
+        folder: empty; receives the input and all that the programs write.
 
     Raises PeerFailed with the program's last words.
     """
@@ -91,7 +91,7 @@ def write_input(depth_maps: Sequence[DepthMap], hull_world: Mesh, folder: Path) 
     rng = np.random.default_rng(0)
     rows = rng.permutation(len(hull_world.vertices))[:SEEDS]
     points, normals = hull_world.vertices[rows], hull_world.normals()[rows]
-    seen = np.stack([_looks_at(each.camera, points, normals) for each in depth_maps])
+    seen = np.stack([_faces_camera(each.camera, points, normals) for each in depth_maps])
     points, seen = points[seen.sum(axis=0) >= 2], seen[:, seen.sum(axis=0) >= 2]
     for name in ("images", "masks", "sparse"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -124,7 +124,7 @@ def _numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.17g}" for value in values)
 
 
-def _looks_at(
+def _faces_camera(
     camera: Camera, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
     towards = camera.centre_world - points

@@ -1,23 +1,23 @@
-"""Ours beside what others would use, in one run: the same subjects, the same masks.
+"""Compares this project's solver with others in one run, on the same subjects and masks.
 
-Peers search the 60 coefficients at the true pose, which is the best case for them: the paper never moves the pose after
-the feature points. Ours starts 2 degrees and 4 mm off and has to find pose and scale as well.
+The others search the 60 coefficients at the true pose, which is the best case for them: the paper never changes the
+pose that the feature points give. This project's starts 2 degrees and 4 mm off, and has to find pose and scale as well.
 
-- ``simplex``: scipy's Nelder-Mead as the paper has it: eq. (5) on the renderer, its two levels (section 5.1), its
-  initial simplex (section 4.4); a level ends at a relative spread of 1e-4 or 3,500 evaluations. The face's outline
-  speaks alone, which served it better and faster than the whole head's (0.73 mm against 0.84, 1.68 against 2.16).
+- ``simplex``: scipy's Nelder-Mead as in the paper: eq. (5) on the renderer, its two levels (section 5.1), its initial
+  simplex (section 4.4). A level ends at a relative spread of 1e-4 or 3,500 evaluations. Only the face's outline counts,
+  which was better and faster than the whole head's (0.73 mm against 0.84, 1.68 against 2.16).
 - ``simplex_adaptive``: the same with the parameters of Gao and Han 2012.
-- ``cma``: CMA-ES with a diagonal covariance (Hansen's ``cma``); the full one needs more than 3,500 evaluations in 60
-  dimensions to learn anything.
-- ``bobyqa``: Py-BOBYQA, quadratic models through 121 points; 1,000 evaluations a level at most, since in 60 dimensions
-  its own algebra takes longer than they do.
+- ``cma``: CMA-ES with a diagonal covariance (Hansen's ``cma``); a full covariance in 60 dimensions needs more than
+  3,500 evaluations before it helps.
+- ``bobyqa``: Py-BOBYQA, quadratic models through 121 points, with at most 1,000 evaluations a level, since in 60
+  dimensions its own algebra takes longer than these.
 - ``soft``: a soft rasteriser with Adam (soft_rasteriser.py).
-- ``contour_all`` and ``soft_all``: with every mode of the model instead of 60, which only those that know derivatives
-  can search. The database's subjects are then in the span, as the paper's were in its database.
+- ``contour_all`` and ``soft_all``: with every mode of the model instead of 60, which only solvers with derivatives can
+  search. The database's subjects are then in the span, as the paper's were in its database.
 - ``hull``: the visual hull. It has no vertices to compare, so its error is the distance of the true face to it.
 
-The error is the mean over the face region's vertices, world frame, no realignment. Seconds are those of the search from
-silhouettes to vertices, each solver warm, all on the same cores. Needs the dependency group ``peers``.
+The error is the mean over the face region's vertices, world frame, without realignment. Seconds are those of the search
+from silhouettes to vertices, each solver warmed up, all on the same cores. Needs the dependency group ``peers``.
 """
 
 # pyright: reportMissingImports=false
@@ -63,7 +63,7 @@ BOBYQA_RADII = ((1.0, 0.05), (0.5, 0.02))  # first and last trust region of each
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """Holds one subject as all solvers get it."""
+    """Holds one subject, as every solver gets it."""
 
     whole: HeadModel
     model: HeadModel  # its first 60 modes, which every solver has
@@ -74,13 +74,14 @@ class Task:
 
 
 class Counted:
-    """Holds a function that counts its calls and their seconds."""
+    """Wraps a function and counts its calls and their seconds."""
 
     def __init__(self, function: Callable[[np.ndarray], float]) -> None:
         self._function = function
         self.calls, self.seconds = 0, 0.0
 
     def __call__(self, x: Float[np.ndarray, " m"]) -> float:
+        """Returns the function's value at ``x``, and counts the call."""
         began = time.perf_counter()
         value = self._function(x)
         self.calls += 1
@@ -95,8 +96,8 @@ def peers(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 10,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns seconds, evaluations and errors of every solver on ``subjects`` of section 5.2's hundred, evenly
-    taken."""
+    """Runs this module's experiment. Returns seconds, evaluations and errors of every solver on ``subjects`` of section
+    5.2's hundred, taken at even steps."""
     span, rig = with_modes(model, MODES), exact(default_layout())
     everyone = subjects_of_section_5_2(model, 100)
     chosen = [everyone[i] for i in np.linspace(0, len(everyone) - 1, subjects).round().astype(int)]
@@ -118,18 +119,18 @@ def peers(
 
 
 def machine(renderer: Renderer) -> str:
-    """Returns what seconds depend on."""
+    """Describes the machine and libraries on which seconds depend."""
     return f"{len(os.sched_getaffinity(0))} cores, {renderer.context.description}"
 
 
 def mean_head(subject: Planted) -> Fit:
-    """Returns where the peers start: the mean head at the true pose."""
+    """Returns the start of the other solvers: the mean head at the true pose."""
     return Fit("mean head", np.zeros(MODES), subject.world_from_head, 0, "")
 
 
 def timed(name: str, solve: Callable[[Task], Row], task: Task, warm: set[str]) -> Row:
-    """Returns the solver's row with its seconds; before its first one, compiled code is warmed up where there is
-    any."""
+    """Runs a solver and returns its row with its seconds. Before the first run of a solver with compiled code, it is
+    warmed up."""
     if name in WARMED and name not in warm:
         solve(task)
     warm.add(name)
@@ -139,7 +140,7 @@ def timed(name: str, solve: Callable[[Task], Row], task: Task, warm: set[str]) -
 
 
 def derivative_free(minimise: Minimiser) -> Callable[[Task], Row]:
-    """Returns a solver that knows only the values of eq. (5), on the paper's two levels."""
+    """Returns a solver that runs ``minimise`` on values of eq. (5) alone, on the paper's two levels."""
 
     def solve(task: Task) -> Row:
         coefficients, calls, seconds = np.zeros(MODES), 0, 0.0
@@ -159,12 +160,14 @@ def derivative_free(minimise: Minimiser) -> Callable[[Task], Row]:
 
 
 def error_row(task: Task, fit: Fit) -> Row:
+    """Returns the mean distance (mm) of the face region's vertices from their true positions, and the evaluations that
+    the fit took."""
     return {"error_mm": mean_error_mm(task.whole, fit, task.subject), "evaluations": fit.evaluations}
 
 
 def nelder_mead(function: Counted, start: Float[np.ndarray, " m"], *, adaptive: bool) -> Float[np.ndarray, " m"]:
-    """Runs scipy's, stopped by the relative spread of its values, which scipy itself does not offer: it is run a few
-    moves at a time, and goes on from its own simplex, whose values are remembered."""
+    """Minimises a function by SciPy's downhill simplex, until the relative spread of its values is small. SciPy has no
+    such rule: it is run for a few moves at a time, and goes on from its own simplex, whose values are remembered."""
     known: dict[bytes, float] = {}
 
     def remembered(x: Float[np.ndarray, " m"]) -> float:
@@ -186,6 +189,7 @@ def nelder_mead(function: Counted, start: Float[np.ndarray, " m"], *, adaptive: 
 
 
 def diagonal_cma(function: Counted, start: Float[np.ndarray, " m"], level: int) -> Float[np.ndarray, " m"]:
+    """Minimises a function by CMA-ES with a diagonal covariance (the library cma), from the same seed each time."""
     import cma
 
     options = {"CMA_diagonal": True, "maxfevals": LIMIT, "seed": 1, "verbose": -9}
@@ -195,6 +199,7 @@ def diagonal_cma(function: Counted, start: Float[np.ndarray, " m"], level: int) 
 
 
 def bobyqa(function: Counted, start: Float[np.ndarray, " m"], level: int) -> Float[np.ndarray, " m"]:
+    """Minimises a function by BOBYQA, Powell's trust region without derivatives (the library Py-BOBYQA)."""
     import pybobyqa
 
     first, last = BOBYQA_RADII[level]
@@ -205,6 +210,8 @@ def bobyqa(function: Counted, start: Float[np.ndarray, " m"], level: int) -> Flo
 
 
 def soft(task: Task, *, whole: bool = False) -> Row:
+    """Fits the shape with a differentiable soft rasteriser. ``whole`` takes all modes of the model, else as many as the
+    paper."""
     pose, model = task.subject.world_from_head, task.whole if whole else task.model
     coefficients, steps = soft_rasteriser.fit_soft(
         model, pose, task.silhouettes, task.rig, renderer=task.renderer, modes=len(model.modes)
@@ -213,7 +220,7 @@ def soft(task: Task, *, whole: bool = False) -> Row:
 
 
 def hull(task: Task) -> Row:
-    """Returns the distance of the true face's vertices to the hull."""
+    """Computes the visual hull, and returns the mean distance (mm) of the true face's vertices from it."""
     mesh = visual_hull(task.silhouettes, task.rig)
     face = task.subject.vertices(task.whole)[task.model.levels["full"].face_region]
     distances = SurfaceIndex(mesh.vertices, mesh.faces, 1.0).closest(face).distances
@@ -221,6 +228,8 @@ def hull(task: Task) -> Row:
 
 
 def ours(task: Task, *, whole: bool = False) -> Row:
+    """Fits the shape with this project's contour solver. ``whole`` takes all modes of the model, else as many as the
+    paper."""
     model = task.whole if whole else task.model
     fit = fit_contour(model, task.subject.start, task.silhouettes, task.rig, FittingSettings())
     return error_row(task, fit)
@@ -242,7 +251,8 @@ WARMED = ("contour", "contour_all", "hull", "soft", "soft_all")
 
 
 def figures(rows: list[Row]) -> dict[str, float]:
-    """Means over the subjects; ratios of sums, so that no subject counts more than its seconds."""
+    """Returns the means over the subjects, by solver, and each solver's ratios to the contour solver. These are ratios
+    of sums, so that no subject counts more than its seconds."""
     found: dict[str, float] = {"subjects": len(rows)}
     found["mean_head_mm"] = float(np.mean([row["mean_head_mm"] for row in rows]))
     total = {name: {q: sum(row[name][q] for row in rows) for q in ("seconds", "error_mm")} for name in SOLVERS}
@@ -256,6 +266,8 @@ def figures(rows: list[Row]) -> dict[str, float]:
 
 
 def as_markdown(found: dict[str, float]) -> str:
+    """Returns the figures as a Markdown table with a row for each solver."""
+
     def row(name: str) -> list[markdown.Cell]:
         quantities = ("seconds", "evaluations", "ms_per_evaluation", "error_mm")
         ratios = (f"speedup_over_{name}", f"error_ratio_{name}")

@@ -1,12 +1,11 @@
-"""A soft rasteriser and Adam: silhouettes that can be differentiated, as a peer of the contour solver.
+"""Fits a head with a soft rasteriser and Adam: silhouettes that can be differentiated, for comparison with the contour
+solver.
 
 Liu, Li, Chen and Li, *Soft Rasterizer*, ICCV 2019: a pixel at distance d from a triangle is covered by it with the
 probability ``sigmoid(+-d^2 / sigma^2)`` (plus inside), and by the mesh with ``1 - prod(1 - p)`` over its triangles. As
-PyTorch3D does, pairs of pixel and triangle are looked up once a step, without derivatives, and only where the outline
-is near; the probabilities themselves are JAX's, on its CPU build, and so are the derivatives. The loss compares with
-the input mask's area in every pixel; Adam minimises it with a shrinking sigma.
-
-Needs the dependency group ``peers``.
+in PyTorch3D, pairs of pixels and triangles are looked up once a step, without derivatives, and only near the outline.
+The probabilities and their derivatives are computed by JAX on the processor. The loss compares them with the area that
+the input mask covers in every pixel; Adam minimises it with a shrinking sigma. Needs the dependency group ``peers``.
 """
 
 # pyright: reportMissingImports=false
@@ -36,7 +35,7 @@ DECAY = (0.9, 0.999)  # Adam's
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Holds steps of Adam at one sigma (px of the reduced image), and their size (standard deviations)."""
+    """Holds a number of steps of Adam at one sigma (px of the reduced image), and their size (standard deviations)."""
 
     steps: int
     sigma_px: float
@@ -66,7 +65,8 @@ def fit_soft(
     modes: int = 60,
     phases: tuple[Phase, ...] = PHASES,
 ) -> tuple[Float[np.ndarray, " m"], int]:
-    """Returns coefficients (standard deviations) at a given pose, and the number of gradients taken."""
+    """Fits the head's coefficients at a given pose with Adam. Returns the coefficients (standard deviations), and the
+    number of gradients that were computed."""
     scaled, faces = rig.scaled(IMAGE_SCALE), model.levels[MESH].faces
     coverage = np.stack([input_coverage(silhouettes[camera.name], IMAGE_SCALE) for camera in scaled])
     shape = shape_of(model, world_from_head, scaled, modes)
@@ -220,9 +220,10 @@ def _search(points, faces, index, reach):
 
 
 def padded(pairs: Pairs) -> tuple[np.ndarray, ...]:
-    """Returns pixel, target, weight, row, corner, present: of few sizes, since JAX compiles for each."""
+    """Returns pixel, target, weight, row, corner and present, padded to one of a few sizes, since JAX compiles for each
+    size."""
     pixels, count = len(pairs.pixel), len(pairs.row)
-    more, spare = _room(pixels + 1) - pixels, _room(count) - count
+    more, spare = _capacity(pixels + 1) - pixels, _capacity(count) - count
     return (
         np.pad(pairs.pixel, ((0, more), (0, 0))),
         np.pad(pairs.target, (0, more)),
@@ -233,7 +234,7 @@ def padded(pairs: Pairs) -> tuple[np.ndarray, ...]:
     )
 
 
-def _room(count: int) -> int:
+def _capacity(count: int) -> int:
     """The next of 1, 1.5, 2, 3, 4, 6, 8 ..."""
     power = 1 << max(count - 1, 1).bit_length()
     return power * 3 // 4 if count <= power * 3 // 4 else power

@@ -1,1 +1,1 @@
-"""Measures pose, face, lids and expressions of people before few, many and narrow cameras."""
+"""Measures pose, face, lids and expressions of living people with few, many and narrow-angled cameras."""

@@ -1,9 +1,10 @@
-"""Heads that make faces beside the same heads that do not: what the fit delivers, and what it says of the expression.
+"""Measures heads with an expression and the same heads without: the delivered surface, and the expression that is
+reported.
 
-Heads of a model's own population (all modes) in the simulated studio, each photographed with a drawn expression and
-neutral, and reconstructed with the model and, *before*, with the same model without its expressions. Distances as
-``detail`` has them (true face to delivered surface, by area); ``vertex`` is how far a vertex of the face is from where
-it truly is, sliding along the surface included. Weights are compared over the ten largest of each head.
+Heads of a model's own population (all modes) in the simulated studio are photographed with a random expression and
+neutral. They are reconstructed with the model and, *before*, with the same model without its expressions. Distances are
+as in ``detail`` (from the true face to the delivered surface, by area). ``vertex`` is how far a vertex of the face is
+from its true position, sliding along the surface included. Weights are compared over the ten largest of each head.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,11 +43,15 @@ def expressions(
     models: Mapping[str, HeadModel], *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 4,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
-    """Returns ``<model>_posed_median_mm``, ``<model>_neutral_before_median_mm`` and so on. Of weights:
-    ``<model>_weights_correlation`` over the ten largest of each posed head, ``..._but_eyes`` the same without those of
-    lids and looks, ``..._true`` over those that it truly has, ``..._all`` over all that any of them has or is told to
-    have; ``<model>_weights_off`` is how far the true ones are told off in the mean, ``<model>_off_<expression>`` the
-    same of one, and ``<model>_weights_told_of_none`` the sum of what a posed head is told beside its own."""
+    """Runs this module's experiment. Returns distances by model: ``<model>_posed_median_mm``,
+    ``<model>_neutral_before_median_mm`` and so on.
+
+    Of the expression weights there are the correlation with the true ones (``<model>_weights_correlation`` over the ten
+    largest of each head; ``..._but_eyes`` without lids and gaze; ``..._true`` over those that are not 0; ``..._all``
+    over all that are not 0 or reported for any head), the mean error of the true ones (``<model>_weights_off``;
+    ``<model>_off_<expression>`` of one), and the sum of weights reported for expressions that a head does not have
+    (``<model>_weights_told_of_none``).
+    """
     code = (*CONTOUR, expression_evidence, expression_reading)
     kept = {
         label: Records(folder, f"expressions-{label}", key_of(model.sha256, Settings(), *code))
@@ -61,7 +66,7 @@ def expressions(
 
 
 def drawn_weights(rng: np.random.Generator, names: tuple[str, ...]) -> dict[str, float]:
-    """Returns a few expressions at random, and more often than not a smile about as strong on both sides."""
+    """Draws a few expressions at random; more often than not among them a smile about as strong on both sides."""
     chosen = rng.choice(len(names), rng.integers(FEW, MANY), replace=False)
     found = {names[k]: float(rng.uniform(*WEIGHTS)) for k in chosen}
     if rng.random() < SMILING:

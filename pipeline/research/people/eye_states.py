@@ -1,7 +1,7 @@
-"""Eyes that are open, half closed and closed: how often is the warning ``eyes-closed`` wrong?
+"""Measures how often the warning ``eyes-closed`` is wrong, for eyes that are open, half closed and closed.
 
-Heads of both models in the studio, each with open, half closed and closed lids; every fourth head moves one eye alone.
-The warning is right where it names the eyes whose lids meet and no others: half closed lids are no closed ones.
+Heads of both models in the studio have open, half closed and closed lids; every fourth head moves one eye alone. The
+warning is right if it names exactly the eyes whose lids meet; half closed lids do not count as closed.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -46,16 +46,16 @@ def eyes(
     heads: int = HEADS,
     folder: Path | None = None,
 ) -> Outcome:
-    """Computes ``eyes_wrong`` of ``eyes_heads``, and ``eyes_<state>_wrong``.
+    """Runs this module's experiment. Returns ``eyes_wrong`` of ``eyes_heads``, and ``eyes_<state>_wrong``.
 
     Args:
-        models: that heads are drawn from, by name.
-        job: the product's whole job.
+        models: from which heads are drawn, by name.
+        job: runs a whole job.
         renderer: for the studio.
-        report: told the head and the share done.
-        key: names all that the rows depend on, as in ``Records``.
-        heads: of each model, each in all three states.
-        folder: keeps rows, so that a stopped run goes on.
+        report: called with the head and the share done.
+        key: names everything that the rows depend on, as in ``Records``.
+        heads: number for each model, each in all three states.
+        folder: keeps rows, so that a stopped run can continue.
     """
     records, rows = Records(folder, "people-eyes", key), []
     cases = [*product(range(heads), models.items(), STATES)]
@@ -69,31 +69,31 @@ def eyes(
 
 
 def eye_row(model: HeadModel, number: int, state: str, job: Job, renderer: Renderer) -> Row:
-    """Runs one job: which eyes are closed, and which ones the operator is told of."""
+    """Runs one job. Returns which eyes are closed, and which ones the warning names."""
     closed = closed_sides(number) if state == "closed" else frozenset[str]()
     shot = photograph_eyes(model, number, STATES[state], renderer)
     try:
         warnings = job(shot.capture, shot.rig).warnings
     except EigenheadError as error:
         return {"closed": sorted(closed), "refused": str(error)[:120], "is_wrong": True}
-    named = told_sides(warnings)
+    named = warned_sides(warnings)
     return {"closed": sorted(closed), "told": sorted(named), "is_wrong": named != closed}
 
 
 def closed_sides(number: int) -> frozenset[str]:
-    """Returns the eyes that head ``number`` moves."""
+    """Returns the eyes that head ``number`` closes."""
     return frozenset(SIDES if number % WINKS_EVERY else SIDES[:1])
 
 
-def told_sides(warnings: Sequence[ReportWarning]) -> frozenset[str]:
-    """Returns the eyes that ``eyes-closed`` names; both where it names none."""
+def warned_sides(warnings: Sequence[ReportWarning]) -> frozenset[str]:
+    """Returns the eyes that the warning ``eyes-closed`` names; both if it names none."""
     texts = [warning.text for warning in warnings if warning.code == "eyes-closed"]
     return frozenset(side for side in SIDES for text in texts if side in text or not any(s in text for s in SIDES))
 
 
 def photograph_eyes(model: HeadModel, number: int, share: float, renderer: Renderer) -> SimulatedCapture:
-    """Photographs head ``number`` with its lids ``share`` of the way down. Raises InputError for a model whose eyes do
-    not close."""
+    """Photographs head ``number`` with its lids closed by ``share``. Raises InputError for a model whose eyes do not
+    close."""
     weights = {blink_of(model, side): share for side in closed_sides(number)}
     head = model.posed_vertices(
         SPREAD * np.random.default_rng((SEED, number)).standard_normal(len(model.modes)), weights
@@ -122,7 +122,7 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Writes a Markdown table, the wrong ones marked."""
+    """Returns a Markdown table of the rows, in which wrong ones are marked."""
     header = ("head", "closed", "told", "wrong")
     cells = [
         [

@@ -1,10 +1,10 @@
-"""Living people: which captures end without a warning and with a wrong pose?
+"""Measures how captures of living people end: with a right pose, with a warning, or wrong without one.
 
-Whole jobs on captures with a truth and on heads in the studio, before rigs of many kinds and with plates, true masks or
-neither. A row has the rigid motion between the delivered face and the true one, distances of the seen true face to the
-delivered surface, what the file states as their standard deviation, and what the operator is told. A result that is
-wrong by pose or by its own statement, and that no warning about the result's plausibility accompanies, is *silently
-wrong*: that number must be 0.
+Whole jobs run on captures with a truth and on heads in the studio, with rigs of many kinds, and with plates, true masks
+or neither. A row has the rigid motion between the delivered face and the true one, the distances of the visible true
+face to the delivered surface, the standard deviation that the file states for them, and the warnings. A result that is
+wrong by its pose or by its own stated deviation, without a warning about plausibility, is *silently wrong*: their
+number must be 0.
 """
 
 import time
@@ -62,20 +62,21 @@ def people(
     detail: str | None = None,
     folder: Path | None = None,
 ) -> Outcome:
-    """Computes ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat, ``<kind>_<evidence>_<quantity>`` and
-    ``<quantity>`` over all rows, ``eyes_wrong`` among them where eyes are asked for.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
+    ``<kind>_<evidence>_<quantity>`` and ``<quantity>`` over all rows, with ``eyes_wrong`` among them if eyes are
+    requested.
 
     Args:
-        model: fitted, and drawn from.
-        others: another population to draw from, where there is one.
+        model: fitted; heads are drawn from it, too.
+        others: another population to draw from, if there is one.
         captures: folders with a truth beside them.
         renderer: for the studio.
-        report: told the case and the share done.
-        subjects: heads in the studio of every kind, 1 by default; of eyes heads of each model, 10 by default.
-        only: kinds, subjects or evidence; of those of one sort any, of different sorts all must fit a row. ``eyes``
-            alone looks at eyes alone.
+        report: called with the case and the share done.
+        subjects: heads in the studio for every kind (1 by default); for eyes, heads of each model (10 by default).
+        only: kinds, subjects or evidence to run. A row must match one word of each sort that is given. ``eyes`` runs
+            the eyes alone.
         detail: level of detail, None for the default.
-        folder: keeps rows, so that a stopped run goes on.
+        folder: keeps rows, so that a stopped run can continue.
     """
     settings = replace(Settings(), detail=detail, outputs=OutputSettings(surface="head"))
     key = key_of(model.sha256, settings, people_subjects, pose_error, view_subsets, eye_states)
@@ -101,7 +102,7 @@ def people(
 
 
 def select_cases(cases: Sequence[Case], only: Sequence[str]) -> list[Case]:
-    """Returns the cases that fit ``only``, as in ``people``. Raises InputError where a word fits none."""
+    """Returns the cases that match ``only``, as in ``people``. Raises InputError for a word that matches none."""
     sorts = [tuple(dict.fromkeys(values)) for values in zip(*(_labels(case) for case in cases), strict=True)]
     unknown = [word for word in only if not any(word in sort for sort in sorts)]
     if unknown:
@@ -120,7 +121,7 @@ def _labels(case: Case) -> tuple[str, str, str]:
 
 
 def judge_case(case: Case, model: HeadModel, settings: Settings, renderer: Renderer) -> Row:
-    """Runs one job and judges it. A refusal and a crash are findings, too: the row says so."""
+    """Runs one job and judges it. A refusal or a crash is a finding, too, and noted in the row."""
     person, began = case.read(), time.perf_counter()
     try:
         result = run_job(person.capture, person.rig, model, settings, renderer)
@@ -134,12 +135,12 @@ def judge_case(case: Case, model: HeadModel, settings: Settings, renderer: Rende
 
 
 def run_job(capture: Capture, rig: Rig, model: HeadModel, settings: Settings, renderer: Renderer) -> Reconstruction:
-    """Runs the product's whole job."""
+    """Runs a whole job, as the product does."""
     return reconstruct(ReconstructionContext(capture, rig, model, settings, renderer))
 
 
 def judge_result(person: Person, result: Reconstruction, model: HeadModel) -> Row:
-    """Computes what a row says of a delivered head."""
+    """Computes the figures of a delivered head."""
     pose = face_pose_error(person, result, model)
     face = model.levels["full"].face_region
     row: Row = {
@@ -164,8 +165,8 @@ def face_pose_error(person: Person, result: Reconstruction, model: HeadModel) ->
 
 
 def face_error(person: Person, result: Reconstruction) -> Row:
-    """Computes distances (mm, by area) of the seen true face to the delivered surface, and what they are by the stated
-    deviation there; nothing where no camera pair sees the face."""
+    """Computes the distances (mm, by area) of the visible true face to the delivered surface, and their ratios to the
+    stated deviation there; empty if no two cameras see the face."""
     if not person.seen.any():
         return {}
     mesh = result.mesh_world
@@ -182,7 +183,8 @@ def face_error(person: Person, result: Reconstruction) -> Row:
 
 
 def is_wrong(row: Row) -> bool:
-    """Tells whether a delivered head needs a warning: its pose is off, or more than its own statement allows."""
+    """Tells whether a delivered head should have a warning: its pose is wrong, or its errors are larger than it
+    states."""
     off = row["turn_deg"] > MAX_TURN_DEG or row["shift_mm"] > MAX_SHIFT_MM
     return bool(off or row.get("deviations_off", 0.0) > MAX_DEVIATIONS)
 
@@ -203,7 +205,7 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def groups(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    """Returns kinds and evidence that rows have, few cameras first."""
+    """Returns the pairs of kind and evidence that occur in the rows, few cameras first."""
     there = {(row["kind"], row["evidence"]) for row in rows}
     return sorted(there, key=lambda group: (*_by_count(group[0]), EVIDENCE.index(group[1])))
 
@@ -213,8 +215,8 @@ def _of_group(rows: Sequence[Row], kind: str, evidence: str) -> list[Row]:
 
 
 def summary(prefix: str, rows: Sequence[Row]) -> dict[str, float]:
-    """Computes counts, the share without a warning, and the worst of these; medians over the delivered heads. Nothing
-    of no rows, and no figure that has no heads."""
+    """Computes counts, the share without a warning, and the worst case of these, with medians over the delivered heads.
+    Figures that no head has are left out."""
     if not rows:
         return {}
     delivered = [row for row in rows if "turn_deg" in row]
@@ -237,7 +239,7 @@ def summary(prefix: str, rows: Sequence[Row]) -> dict[str, float]:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Writes a Markdown table, a row a case; ``!`` marks what is silently wrong."""
+    """Returns a Markdown table with a row for each case; ``!`` marks results that are silently wrong."""
     header = (
         *("rig", "evidence", "subject", "turn, deg", "shift, mm", "face median, mm", "p90", "stated, mm"),
         *("off, stated", "in 95 %", "told", "s"),
@@ -247,7 +249,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def summary_table(rows: Sequence[Row]) -> str:
-    """Writes a Markdown table, a row for each kind of rig with each evidence."""
+    """Returns a Markdown table with a row for each kind of rig and evidence."""
     keys = ("rows", "refused", "crashed", "unwarned_share", "worst_unwarned_turn_deg", "worst_unwarned_shift_mm")
     header = (
         *("rig", "evidence", "rows", "refused", "crashed", "share not warned of", "its worst turn, deg"),

@@ -1,8 +1,6 @@
-"""Whom ``experiments people`` reconstructs: captures with a truth beside them, whole and by subsets of their views, and
-heads in the simulated studio before rigs of many kinds.
-
-A person comes with plates, with true masks, or with neither: what real studios have of them.
-"""
+"""Provides the subjects of ``experiments people``: captures with a truth beside them, with all or some of their views,
+and heads in the simulated studio with rigs of many kinds. Each comes with plates, with true masks, or with neither, as
+in real studios."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -70,7 +68,8 @@ class Person:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Holds one row of the table, before it is computed. ``kind``: how many cameras stand how."""
+    """Holds one row of the table before it is computed. ``kind`` is the arrangement of cameras; ``evidence`` says
+    whether there are plates, masks or neither."""
 
     subject: str
     kind: str
@@ -79,6 +78,7 @@ class Case:
 
     @property
     def name(self) -> str:
+        """Returns the row's name: subject, arrangement of cameras, and what is known."""
         return f"{self.subject} {self.kind} {self.evidence}"
 
 
@@ -113,11 +113,8 @@ class CaptureWithTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudioKind:
-    """Holds a rig in the studio and who sits before it. ``kind`` as in ``Case``; ``what`` tells it from others of its
-    kind.
-
-    ``pose_deg``: yaw to the subject's left, pitch downwards, roll to its left shoulder.
-    """
+    """Holds a rig in the studio and the subject in front of it. ``kind`` is as in ``Case``; ``what`` distinguishes it
+    from others of its kind. ``pose_deg``: yaw to the subject's left, pitch downwards, roll to its left shoulder."""
 
     what: str
     kind: str
@@ -183,8 +180,8 @@ def capture_cases(folder: Path) -> Iterator[Case]:
 
 
 def studio_cases(fitted: HeadModel, others: HeadModel | None, renderer: Renderer, subjects: int) -> Iterator[Case]:
-    """Yields ``subjects`` heads for each of the studio's kinds, drawn in turn from another population and from the
-    fitted model (from that alone where there is no other), each with every kind of evidence."""
+    """Yields ``subjects`` heads for each of the studio's kinds, each with every kind of evidence. They are drawn
+    alternately from another population and from the fitted model, or from that alone if there is no other."""
     for number in range(subjects):
         for row, studio in enumerate(STUDIO_KINDS):
             drawn = fitted if others is None or (row + number) % 2 else others

@@ -1,10 +1,10 @@
-"""How far a delivered face is turned and shifted from where it truly is: the rigid motion that takes the one to the
+"""Measures how far a delivered face is turned and shifted from the truth: the rigid motion that takes the one to the
 other.
 
-Where both have the same vertices, these correspond (Kabsch 1976). Otherwise the motion starts from landmarks, whose
-places on a head are known whichever way it faces, and is refined on distances along the truth's normals (Chen and
+If both have the same vertices, these correspond (Kabsch 1976). Otherwise the motion starts from landmarks, whose
+positions on a head are known whatever its direction, and is refined on distances along the truth's normals (Chen and
 Medioni 1992) over the face. Closest points alone would lay a face that looks backwards on the back of the true head and
-call it right, so a refinement that leaves its landmarks is discarded.
+call it right, so that a refinement that moves away from its landmarks is discarded.
 """
 
 from collections.abc import Mapping
@@ -33,8 +33,8 @@ SURFACE_WORTH = 60.0  # observations that the face's points count as, for they e
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseError:
-    """Holds how far the pose is off. ``truth_from_result``: what takes the delivered face to the true one; ``shift_mm``
-    is how far it moves the middle of the delivered face."""
+    """Holds the error of a pose: the motion from the delivered face to the true one, its angle, and how far it moves
+    the middle of the delivered face."""
 
     truth_from_result: RigidTransform
     turn_deg: float

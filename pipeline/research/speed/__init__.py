@@ -1,1 +1,1 @@
-"""Measures where a job's processor seconds go, and what more cores would do."""
+"""Measures where a job's processor seconds go, and how much faster more cores would make it."""

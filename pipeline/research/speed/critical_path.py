@@ -1,10 +1,9 @@
-"""How long a job would take on more cores, by the processor seconds of its slices in a trace.
+"""Computes how long a job would take on more cores, from the processor seconds of its slices in a trace.
 
-What is in no shared loop stays as it is: it takes one core. A loop's slices are scheduled as
-``pipeline.compute.threads`` does it, the next one to whoever is free first. Cores are all alike and do not hold each
-other up (no memory that is too slow, no interpreter lock), so that the seconds are a bound from below; nested loops
-have the cores that the slices around them leave. A stage in the background takes no longer than the stages before it
-where there are cores for both.
+Work outside of shared loops stays on one core. A loop's slices are scheduled as in ``pipeline.compute.threads``: the
+next one goes to the core that is free first. Cores are assumed to be alike and not to delay each other (by slow memory,
+or the interpreter's lock), so that the seconds are a lower bound. Nested loops have the cores that the slices around
+them leave. A stage in the background takes no longer than the stages before it, if there are cores for both.
 """
 
 import heapq
@@ -19,20 +18,21 @@ from pipeline.compute.trace import FORMAT
 
 @dataclass(slots=True, eq=False)
 class Slice:
-    """Holds a slice's processor seconds, those of loops within left out, and these loops."""
+    """Holds one slice of a loop: its processor seconds without those of loops inside it, and these loops."""
 
     first: int
     serial_s: float
     loops: "list[Loop]" = field(default_factory=list)
 
     def seconds(self, cores: int) -> float:
-        """Returns how long it takes where so many cores are free for the loops within."""
+        """Returns how long the slice takes if the loops inside it have so many cores."""
         return self.serial_s + sum(loop.seconds(cores) for loop in self.loops)
 
 
 @dataclass(slots=True, eq=False)
 class Loop:
-    """Holds a loop over ``count`` items as it was cut; the slices of a ``single`` one are cut no coarser."""
+    """Holds a loop over ``count`` items, and the slices into which it was cut for threads. If ``single``, it was cut
+    into single items and cannot be cut further."""
 
     name: str
     count: int
@@ -40,7 +40,7 @@ class Loop:
     slices: list[Slice] = field(default_factory=list)
 
     def seconds(self, cores: int) -> float:
-        """Returns how long the loop takes on so many cores, cut for them."""
+        """Returns how long the loop takes if it is cut for, and run on, so many cores."""
         groups = self._groups(cores)
         within = max(1, cores // max(1, len(groups)))
         return schedule([sum(part.seconds(within) for part in group) for group in groups], cores)
@@ -57,7 +57,8 @@ class Loop:
 
 @dataclass(slots=True, eq=False)
 class Section:
-    """Holds a stage or a part of one: its visits' processor seconds of all threads, and the loops that it shares."""
+    """Holds the work of a stage or of a part of one: processor seconds of all threads, and the loops that threads
+    share."""
 
     name: str
     cpu_s: float = 0.0
@@ -74,13 +75,14 @@ class Section:
         return max(0.0, self.cpu_s - self.shared_s)
 
     def seconds(self, cores: int) -> float:
+        """Returns how long the section takes on so many cores."""
         return self.serial_s + sum(loop.seconds(cores) for loop in self.loops)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JobWork:
-    """Holds what a job worked: by stage in their order, ``start`` (what was loaded before) and ``between`` the stages
-    included; and by part, named "stage: part"."""
+    """Holds the work of a job: by stage in their order, with ``start`` (what was loaded before) and ``between`` the
+    stages; and by part, named "stage: part"."""
 
     stages: tuple[Section, ...]
     parts: tuple[Section, ...]
@@ -88,6 +90,7 @@ class JobWork:
 
     @property
     def cpu_s(self) -> float:
+        """Returns the processor seconds of all stages."""
         return sum(stage.cpu_s for stage in self.stages)
 
     @property
@@ -113,7 +116,8 @@ class JobWork:
 
 
 def schedule(seconds: Sequence[float], cores: int) -> float:
-    """Returns when the last of them ends where each begins, in order, on the core that is free first."""
+    """Schedules pieces of work, each on the core that is free first, in their order. Returns the time at which the last
+    one ends."""
     free = [0.0] * cores
     for duration in seconds:
         heapq.heapreplace(free, free[0] + duration)
@@ -121,7 +125,7 @@ def schedule(seconds: Sequence[float], cores: int) -> float:
 
 
 def work_of(document: Mapping[str, Any]) -> JobWork:
-    """Returns the work that a trace's document tells of. Raises ValueError for another format."""
+    """Reads the work of a job from a trace's document. Raises ValueError for another format."""
     if document.get("format") != FORMAT:
         raise ValueError(f"format {document.get('format')!r} for {FORMAT!r}")
     spans = [event for event in document["traceEvents"] if event["ph"] == "X"]

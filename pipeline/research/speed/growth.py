@@ -1,8 +1,9 @@
-"""How a default job's processor seconds and memory grow with the number of views and with the size of the pictures.
+"""Measures how a default job's processor seconds and memory grow with the number of views and with the size of the
+pictures.
 
-The studio takes the same head with more cameras, or with larger sensors; the command line reconstructs it with one
-thread. Exponents are slopes of log seconds over log views or log pixels, by least squares, from twice the smallest on:
-1 is growth in proportion, less than that fixed work.
+The studio photographs the same head with more cameras, or with larger sensors; the command line reconstructs it with
+one thread. Exponents are slopes of log seconds over log views or log pixels, by least squares, from twice the smallest
+size on: 1 is proportional growth, and less than 1 means a fixed part.
 """
 
 import tempfile
@@ -38,7 +39,7 @@ TURN_DEG = 7.0  # each further round of the default directions is turned by so m
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Holds a rig's number of views and the millions of pixels of each."""
+    """Holds one size of a job: number of views and millions of pixels of each. ``kind`` says which of both grows."""
 
     kind: Kind
     views: int
@@ -46,10 +47,11 @@ class Size:
 
     @property
     def name(self) -> str:
+        """Returns the size in words: number of views and millions of pixels."""
         return f"{self.views} views of {self.megapixels:.2g} Mpx"
 
     def rig(self) -> Rig:
-        """Returns the default rig with so many cameras and pixels: further ones stand between its own."""
+        """Returns the default rig with so many cameras and pixels; further cameras stand between the default ones."""
         rounds = -(-self.views // len(DEFAULT_DIRECTIONS_DEG))
         turned = [
             (azimuth + TURN_DEG * ((turn + 1) // 2) * (-1) ** turn, elevation + 3.0 * turn)
@@ -102,7 +104,8 @@ def growth(
 
 
 def exponent(rows: Sequence[Mapping[str, float]], quantity: str, cost: str) -> float:
-    """Returns the exponent with which a cost grows with a quantity, among rows of twice the least quantity and more."""
+    """Returns the exponent with which a cost grows with a quantity, over rows with at least twice the smallest
+    quantity."""
     counted = [row for row in rows if row[quantity] >= 2.0 * rows[0][quantity]]
     logs = np.log([[row[quantity], row[cost]] for row in counted])
     return float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0])

@@ -1,9 +1,9 @@
-"""What more cores would do for a default job: where its processor seconds go, which of them are shared out, and how
-long the job would take by them.
+"""Estimates what more cores would gain for a default job: where its processor seconds go, which of them are shared by
+threads, and how long the job would then take.
 
-A capture is reconstructed by the command line, with one thread and with as many as there are CPUs. All but the seconds
-by the clock follows from processor seconds of the first, which a busy machine changes little. Peak memory is the
-child's, of its whole life.
+A capture is reconstructed by the command line, with one thread and with as many as there are processors. Everything but
+the wall-clock seconds is computed from the processor seconds of the first run, which a busy machine changes little.
+Peak memory is that of the child process over its whole life.
 """
 
 import json
@@ -33,7 +33,7 @@ MIN_S = 0.02  # of a part or loop that is listed
 
 
 class JobFailed(EigenheadError):
-    """Reports a job that did not end well, with the last it said."""
+    """Reports a job that failed, with the last lines of its output."""
 
     def __init__(self, capture: Path, said: str) -> None:
         super().__init__(f"{capture} could not be reconstructed: {said}")
@@ -41,8 +41,8 @@ class JobFailed(EigenheadError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JobCommand:
-    """Holds the program that reconstructs a capture where ``CAPTURE --out FOLDER --trace FILE`` follows, and its
-    variables."""
+    """Holds the command line that reconstructs a capture, to which ``CAPTURE --out FOLDER --trace FILE`` is appended,
+    and its environment variables."""
 
     words: Sequence[str]
     variables: Mapping[str, str]
@@ -108,8 +108,8 @@ def _by_cores(seconds) -> dict[str, float]:
 
 
 def run_job(capture: Path, command: JobCommand, threads: int, folder: Path | None) -> Row:
-    """Runs a job in a child. Returns its seconds by the clock, processor seconds, peak memory (MB) and what its trace
-    says, as ``row_of`` has it. The trace is left in ``folder``. Raises JobFailed."""
+    """Runs a job in a child process. Returns its wall-clock seconds, processor seconds, peak memory (MB), and the
+    figures of its trace (``row_of``). The trace is left in ``folder``. Raises JobFailed."""
     with tempfile.TemporaryDirectory() as scratch:
         kept = Path(scratch) if folder is None else folder
         kept.mkdir(parents=True, exist_ok=True)
@@ -126,9 +126,9 @@ def run_job(capture: Path, command: JobCommand, threads: int, folder: Path | Non
         if child.returncode:
             lines = log.read_text(errors="replace").strip().splitlines()
             raise JobFailed(capture, lines[-1] if lines else f"exit status {child.returncode}")
-        work = row_of(work_of(json.loads(path.read_text())))
-    spent = {"wall_s": wall_s, "process_cpu_s": usage.ru_utime + usage.ru_stime, "peak_mb": usage.ru_maxrss / 1024}
-    return spent | work
+        document = json.loads(path.read_text())
+    spent = {"wall_s": wall_s, "process_cpu_s": usage.ru_utime + usage.ru_stime, "peak_mb": document["peak_memory_mb"]}
+    return spent | row_of(work_of(document))
 
 
 def _figures(row: Row) -> dict[str, float]:

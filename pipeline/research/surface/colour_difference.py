@@ -1,4 +1,4 @@
-"""CIEDE2000, the difference of two colours as the eye sees it (CIE 142-2001)."""
+"""Computes CIEDE2000, the visible difference of two colours (CIE 142-2001)."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,15 +11,15 @@ XYZ_FROM_RGB = np.array(
 
 
 def lab_from_srgb(codes: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns CIE L*a*b*, D65, of sRGB. OpenCV's tables are off by 0.2."""
+    """Converts sRGB codes to CIE L*a*b*, D65. (OpenCV's tables are wrong by up to 0.2.)"""
     xyz = linear_from_srgb(codes / 255.0) @ (XYZ_FROM_RGB / XYZ_FROM_RGB.sum(axis=1, keepdims=True)).T
     x, y, z = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116).T
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
 
 
 def difference_2000(one: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Computes it of pairs of L*a*b* colours, the weights k all 1 (Sharma, Wu and Dalal, *The CIEDE2000
-    Color-Difference Formula*, Color Research and Application 2005; the equations' numbers are theirs)."""
+    """Computes CIEDE2000 of pairs of L*a*b* colours, with all weights k = 1 (Sharma, Wu and Dalal, *The CIEDE2000
+    Color-Difference Formula*, Color Research and Application 2005, whose equations the comments number)."""
     (l1, a1, b1), (l2, a2, b2) = one.T, other.T
     mean = (np.hypot(a1, b1) + np.hypot(a2, b2)) / 2
     stretch = 1.5 - 0.5 * np.sqrt(mean**7 / (mean**7 + 25.0**7))  # eq. (4), and 1 added as eq. (5) has it

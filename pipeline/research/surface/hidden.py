@@ -1,14 +1,16 @@
-"""Skin that the cameras see and skin that hair or clothes hide, apart and by region: error, and how often the stated
-interval holds it, at every level of detail; the same of landmarks and measurements.
+"""Measures skin that cameras see and skin that hair or clothes hide, separately and by region: errors, and how often
+the stated interval contains the truth, at every level of detail; the same for landmarks and measurements.
 
-Subjects are heads of the model's span in the studio, under hair that covers ears and forehead, heads of another
-population there under any hair, and, where asked for, captures with a truth beside them. Each is reconstructed whole at
-every level, from the same silhouettes. Distances are from the true surface to the head as delivered, weighted by area;
-regions are the model's, carried to the truth by the nearest vertex. A place lies within its interval where that
-distance is below 1.96 times the deviation (``quality``) stated there. What hardly a direction from outside reaches,
-nostrils and the inside of the mouth, is nobody's skin and does not count. A landmark counts by its coordinates, a
-measurement by its length. Another population has its landmarks where its makers put them, millimetres along the surface
-from ours: that counts as error, as it does for whoever compares two programs.
+Subjects are heads of the model's span in the studio, with hair over ears and forehead; heads of another population
+there, with any hair; and on request captures with a truth beside them. Each is reconstructed at every level, from the
+same silhouettes. Distances are from the true surface to the delivered head, weighted by area. Regions are the model's,
+transferred to the truth by the nearest vertex. A point lies in its interval if that distance is below 1.96 times the
+deviation (``quality``) stated there. Nostrils and the inside of the mouth, which are hardly visible from any direction,
+do not count.
+
+A landmark counts by its coordinates, a measurement by its length. Another population has its landmarks where its makers
+placed them, millimetres along the surface from this project's; that counts as error, as for anybody who compares two
+programs.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -76,18 +78,18 @@ def hidden(
     subjects: int = 4,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<level>_<seen|hidden>_<region>_<quantity>``
-    or ``<group>_<level>_<landmarks|measurements>_within_95``, the mean over the group: ``studio``, ``draws``, both as
-    ``all``, or a capture by its name.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is
+    ``<group>_<level>_<seen|hidden>_<region>_<quantity>`` or ``<group>_<level>_<landmarks|measurements>_within_95``, the
+    mean over the group: ``studio``, ``draws``, both as ``all``, or a capture by its name.
 
     Args:
-        model: fitted, and drawn from.
+        model: fitted; heads are drawn from it, too.
         captures: folders with a truth beside them, by name.
         renderer: for the studio.
-        report: told the subject and the share done.
-        others: another population to draw as many heads from.
+        report: called with the subject and the share done.
+        others: another population, from which as many heads are drawn.
         subjects: heads of each population.
-        folder: keeps rows, so that a stopped run goes on.
+        folder: keeps rows, so that a stopped run can continue.
     """
     key = key_of(
         model.sha256, others.sha256 if others else "", Settings(), posterior, span_misfit, photo_refine, measurements
@@ -138,13 +140,13 @@ def landmark_figures(
     found: Mapping[str, Landmark],
     lengths: Mapping[str, Measurement],
 ) -> dict[str, float]:
-    """Returns the median error and stated deviation (mm), and share within 95 % intervals, of landmarks (by coordinate)
-    and of measurements; nothing where no landmark is known.
+    """Returns the median error and stated deviation (mm), and the share within 95 % intervals, of landmarks (by
+    coordinate) and of measurements; empty if no landmark is known.
 
     Args:
-        true: world frame, mm, by name.
-        found: of the head as delivered.
-        lengths: the same.
+        true: the true landmarks, world frame, mm, by name.
+        found: those of the delivered head.
+        lengths: the measurements of the delivered head.
     """
     off, stated = [], []
     for name, mark in found.items():
@@ -176,12 +178,12 @@ def skin_figures(
     deviation_mm: Float[np.ndarray, " v"],
     regions: Mapping[str, Bool[np.ndarray, " v"]],
 ) -> dict[str, float]:
-    """Returns the median distance (mm), share within the stated interval and median stated deviation (mm) of the true
-    skin, by what is seen of it and by region; ``all`` are all of them together.
+    """Returns the median distance (mm), the share within the stated interval, and the median stated deviation (mm) of
+    the true skin, by whether it is seen and by region; the region ``all`` is all of them together.
 
     Args:
         known: the truth, with its visible points.
-        head_world: the head as delivered, mm.
+        head_world: the delivered head, mm.
         deviation_mm: stated at its vertices.
         regions: of its vertices, by name.
     """
@@ -211,8 +213,7 @@ def skin_figures(
 
 
 def reached_from_outside(mesh: Mesh) -> Bool[np.ndarray, " v"]:
-    """Returns which vertices are seen from several directions far away: nostrils and the inside of a mouth are none of
-    them."""
+    """Tells which vertices are visible from several directions far away; nostrils and the inside of a mouth are not."""
     centre = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
     radius = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
     focal, middle = 0.5 * OUTSIDE_PX * OUTSIDE_MM / (1.05 * radius), 0.5 * (OUTSIDE_PX - 1)
@@ -232,7 +233,7 @@ def reached_from_outside(mesh: Mesh) -> Bool[np.ndarray, " v"]:
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
-    """Means over the subjects of each group, of what they have, and over those of all populations together."""
+    """Returns means over the subjects of each group, and over those of all populations together."""
     values: dict[str, list[float]] = {}
     for row in rows:
         groups = (row["group"], "all") if row["group"] in POOLED else (row["group"],)
@@ -244,8 +245,8 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def as_markdown(found: Mapping[str, float]) -> str:
-    """Returns shares within 95 % intervals by group and level, and of seen and hidden skin median error and
-    deviation."""
+    """Returns a Markdown table: shares within 95 % intervals by group and level, and median error and deviation of seen
+    and of hidden skin."""
     columns = ("seen_all", "seen_face", "hidden_all", "hidden_face", "landmarks", "measurements")
     present = [key.removesuffix("_seen_all_within_95") for key in found if key.endswith("_seen_all_within_95")]
     rows = [

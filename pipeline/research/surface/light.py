@@ -1,10 +1,10 @@
-"""What taking the light off is worth: one subject in three lights, as textures and as albedos.
+"""Measures how well the albedo removes light: one subject in three lights, as textures and as albedos.
 
-Compared are texels of the face that all three captures saw, by CIEDE2000, a pair of lights at a time: head.glb's
-texture against texture/albedo.png. ``_level`` is the same with each image's overall colour brought to the first one's
-(the median by channel, in linear light): what is left is shading and shadow alone. The heads are fitted anew for each
-light, so that both figures hold what the fits and the cameras' noise differ by; ``floor`` is that, the same light shot
-twice. ``chart_...`` is the same where a colour chart was held before the cameras in one clean plate each.
+Compared are texels of the face that all three captures show, by CIEDE2000, for each pair of lights: head.glb's texture
+against texture/albedo.png. ``_level`` is the same after each image's overall colour is brought to the first one's (the
+median by channel, in linear light): what remains is shading and shadow. The heads are fitted anew for each light, so
+that both figures contain the differences of the fits and of the cameras' noise; ``floor`` is that part, from the same
+light shot twice. ``chart_...`` is the same with a colour chart in one clean plate of each camera.
 """
 
 from collections.abc import Mapping
@@ -78,14 +78,15 @@ def light(
     subjects: int = SUBJECTS,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of lights, and a row a subject.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of
+    lights, and a row for each subject.
 
     Args:
-        model: fitted, and drawn from.
+        model: fitted; heads are drawn from it, too.
         renderer: for the studio.
-        report: told the subject and the share done.
+        report: called with the subject and the share done.
         subjects: heads in the studio.
-        folder: keeps rows, so that a stopped run goes on, and a picture of every subject.
+        folder: keeps rows, so that a stopped run can continue, and a picture of every subject.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head", delight=True, texture_size=2048))
     code = (fitted_light, albedo, decision, chart_colours, colour_chart)
@@ -103,7 +104,7 @@ def light(
 
 
 def row_of(model: HeadModel, seed: int, renderer: Renderer, settings: Settings, picture: Path | None) -> Row:
-    """Returns one subject in every light, and in the first one twice; all of it again with a colour chart."""
+    """Runs one subject in every light, and in the first one twice; all of it again with a colour chart."""
     rig = default_layout()
     found = {name: lit_head(model, seed, rig, lamps, renderer, settings) for name, lamps in LIGHTS.items()}
     again = lit_head(model, seed, rig, LAMPS, renderer, settings, shot=1)
@@ -120,8 +121,8 @@ def row_of(model: HeadModel, seed: int, renderer: Renderer, settings: Settings, 
 
 
 def differences(model: HeadModel, found: Mapping[str, Reconstruction], again: Reconstruction) -> Row:
-    """Returns figures of textures and albedos, in the mean over the pairs of lights; ``again`` is the first light's
-    second shot."""
+    """Returns the figures of textures and albedos, as means over the pairs of lights. ``again`` is the second shot in
+    the first light."""
     every = [*found.values(), again]
     layout = albedo_of(every[0]).atlas.layout
     seen = (
@@ -156,7 +157,7 @@ def lit_head(
     *,
     shot: int = 0,
 ) -> Reconstruction:
-    """Returns the head of ``seed`` in a light. Its look and pose are the same in every light; the noise is not."""
+    """Reconstructs the head of ``seed`` in one light. Look and pose are the same in every light; the noise is not."""
     coefficients = IN_SPAN_SPREAD * np.random.default_rng((9, seed)).standard_normal(IN_SPAN_MODES)
     level = model.levels["full"]
     head = Mesh(model.vertices(coefficients), level.faces)
@@ -171,7 +172,7 @@ def lit_head(
 
 
 def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], rng: np.random.Generator) -> Capture:
-    """Returns one more clean plate of every camera that a chart, held up for the front camera, is turned to."""
+    """Adds a clean plate with a colour chart, held towards the front camera, for every camera that can see it."""
     front, middle = scene.rig.front_camera(), scene.world_from_head.translation
     towards = {camera.name: camera.centre_world - middle for camera in scene.rig}
     facing = {
@@ -187,7 +188,8 @@ def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], r
 
 
 def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, "s s"]:
-    """Returns texels of the compared size whose triangle has such corners, and all about them, too."""
+    """Tells which texels of the compared size belong to the face: all corners of the texel's triangle are ``seen``, and
+    so around it."""
     texels, ones = GRID * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, GRID, GRID)
     whole = np.asarray(seen[layout.source[layout.faces]].all(axis=1))
@@ -196,13 +198,13 @@ def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray
 
 
 def texels(image: Image, where: Bool[np.ndarray, "g g"]) -> UInt8[np.ndarray, "n 3"]:
-    """Returns colours of an image, brought to the compared size."""
+    """Returns the colours of an image at the texels ``where``, after it is resized to the compared size."""
     small = cv2.resize(np.ascontiguousarray(image), (GRID, GRID), interpolation=cv2.INTER_AREA)
     return np.asarray(small)[where]
 
 
 def levelled(codes: UInt8[np.ndarray, "n 3"], to: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:
-    """Returns ``codes`` with the median of the other in each channel, in linear light."""
+    """Returns ``codes`` scaled so that the median of each channel is that of ``to``, in linear light."""
     ours, theirs = linear_from_srgb(codes / 255.0), linear_from_srgb(to / 255.0)
     ratio = np.median(theirs, axis=0) / np.maximum(np.median(ours, axis=0), 1e-4)
     return np.rint(255 * srgb_from_linear(ours * ratio)).astype(np.uint8)
@@ -223,14 +225,14 @@ def _texture(head: Reconstruction) -> Image:
 
 
 def albedo_of(head: Reconstruction) -> Albedo:
-    """Raises EigenheadError where there is none."""
+    """Returns the albedo image of a head. Raises EigenheadError if it has none."""
     if head.texturing.albedo is None:
         raise EigenheadError("a capture of the studio has no albedo: " + "; ".join(w.text for w in head.warnings))
     return head.texturing.albedo
 
 
 def sheet(found: Mapping[str, Reconstruction], rig: Rig) -> Image:
-    """Returns a column a light: the texture above, the albedo below, as the front camera sees them unlit."""
+    """Draws a column for each light: the texture above, the albedo below, as the front camera would see them unlit."""
     camera = rig[rig.front_camera()]
     columns = []
     for name, head in found.items():

@@ -1,10 +1,10 @@
-"""Which relief of the skin is the skin's? A figure without a truth: what two halves of the views do not both show is
+"""Measures how much of the skin's relief is real, without a truth: what two halves of the views do not both show is
 noise.
 
-Every capture is reconstructed three times by the default job: from all of its views, and from two halves that share
-none. Where the bust of all views is skin that both halves measured, the heights of the halves' busts are compared;
-relief is what a height departs from its own mean within 3 mm. Each half has half of the evidence and its own pairs of
-views, so that the figure is above that of the whole capture.
+Every capture is reconstructed three times by the default job: from all its views, and from two halves without a common
+view. Where the bust of all views is skin that both halves measured, the heights of the halves' busts are compared.
+Relief is the deviation of a height from its own mean within 3 mm. Each half has half of the evidence and its own pairs
+of views, so that its noise is larger than that of the whole capture.
 """
 
 from collections.abc import Mapping
@@ -46,14 +46,14 @@ MIN_AROUND = 6  # places within SMOOTH_MM, for a mean
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relief:
-    """Holds two surfaces' relief (mm) at the same places."""
+    """Holds the relief (mm) of two surfaces at the same points."""
 
     first_mm: Float[np.ndarray, " n"]
     second_mm: Float[np.ndarray, " n"]
 
     def figures(self) -> dict[str, float]:
-        """Compares the shots; ``unrepeated_rms_mm`` is one surface's share of the difference, the root of half of its
-        mean square; ``unrepeated_median_mm`` its median; ``repeated_rms_mm`` of what both show."""
+        """Compares both surfaces. ``unrepeated_rms_mm`` is one surface's part of the difference, the root of half of
+        its mean square; ``unrepeated_median_mm`` its median; ``repeated_rms_mm`` the relief that both show."""
         off = np.abs(self.first_mm - self.second_mm) / np.sqrt(2.0)
         return {
             "unrepeated_rms_mm": float(np.sqrt(np.mean(off**2))),
@@ -72,17 +72,17 @@ def relief(
     report: Progress,
     folder: Path | None = None,
 ) -> Outcome:
-    """Compares the halves of every capture; a figure is ``<capture>_<quantity>``.
+    """Runs the experiment on every capture; a figure is ``<capture>_<quantity>``.
 
     Args:
-        model: to be fitted.
+        model: fitted.
         captures: folders, by name.
         renderer: for the jobs.
-        report: told the capture and the share done.
-        folder: keeps rows, so that a stopped run goes on.
+        report: called with the capture and the share done.
+        folder: keeps rows, so that a stopped run can continue.
 
     Raises:
-        EigenheadError: a half is no capture of a head any more, or has no skin in common with the other.
+        EigenheadError: a half has too few views for a head, or no skin in common with the other.
     """
     records = Records(folder, "relief", key_of(model.sha256, Settings(), *CONTOUR, composition))
     rows: list[Row] = []
@@ -117,15 +117,15 @@ def split_views(rig: Rig, world_from_head: Similarity) -> tuple[tuple[str, ...],
 def _reconstructed(
     capture: Capture, rig: Rig, names: tuple[str, ...], model: HeadModel, renderer: Renderer
 ) -> Reconstruction:
-    def kept(by_camera: Mapping) -> dict:
+    def selected(by_camera: Mapping) -> dict:
         return {name: value for name, value in by_camera.items() if name in names}
 
     seen = replace(
         capture,
-        images=kept(capture.images),
-        backgrounds=kept(capture.backgrounds),
-        masks=kept(capture.masks),
-        soft_masks=kept(capture.soft_masks),
+        images=selected(capture.images),
+        backgrounds=selected(capture.backgrounds),
+        masks=selected(capture.masks),
+        soft_masks=selected(capture.soft_masks),
         features=capture.features if names == rig.names else {},  # clicked in two views, of which a half has one
     )
     return reconstruct(ReconstructionContext(seen, rig.subset(names), model, Settings(), renderer))
@@ -149,7 +149,7 @@ def compare_relief(whole: BustSurface, first: BustSurface, second: BustSurface) 
 
 
 def sparse_mean(places: Float[np.ndarray, "n 3"]) -> sparse.csr_array:
-    """Returns the matrix that takes the mean of values over each place's surroundings, itself included."""
+    """Returns the sparse matrix that maps values at the points to their means around each point, itself included."""
     pairs = KDTree(places).query_pairs(SMOOTH_MM, output_type="ndarray")
     diagonal = np.arange(len(places))
     rows, columns = np.r_[pairs[:, 0], pairs[:, 1], diagonal], np.r_[pairs[:, 1], pairs[:, 0], diagonal]
@@ -160,7 +160,7 @@ def sparse_mean(places: Float[np.ndarray, "n 3"]) -> sparse.csr_array:
 def heights_mm(
     places: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], bust: BustSurface
 ) -> Float[np.ndarray, " n"]:
-    """Returns how far the measured surface lies above each place along its normal; NaN where it has none there."""
+    """Returns how far the measured surface lies above each point along its normal; NaN where there is none."""
     mesh: Mesh = bust.mesh_world
     faces = mesh.faces[bust.seen[mesh.faces].all(axis=1)]
     hit = SurfaceIndex(mesh.vertices, faces, 1.0).closest(places, facing=normals)

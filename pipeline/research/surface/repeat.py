@@ -1,14 +1,14 @@
-"""Does a shot repeat? One studio subject, the same skin, hair and set each time, shot ten times:
+"""Measures repeatability: one studio subject, with the same skin, hair and set each time, shot ten times.
 
-- ``noise``: it holds still; sensor noise and light drift are other ones;
-- ``reposed``: it sits down anew as a subject of the studio does, and lamps are moved and dimmed;
-- ``drift``: the same shots by cameras that have wandered from their calibration, farther with each shot;
-- ``clicked``: as ``noise``, with the feature points that an operator clicks anew in each shot. The others have none.
+- ``noise``: it holds still; only sensor noise and light drift differ;
+- ``reposed``: it sits down anew, and lamps are moved and dimmed;
+- ``drift``: the same with cameras that have moved from their calibration, farther with each shot;
+- ``clicked``: as ``noise``, with feature points that an operator clicks anew in each shot; the others have none.
 
 Each shot is reconstructed from its photographs; the heads are laid on each other rigidly over the face
-(``pipeline.verification.repeatability``). Beside the scatter: the deviation that the results state, and the error that
-every shot repeats, which is the distance of the mean head from the true surface. The aim is an RMS scatter of at most
-0.10 mm over the face, ``reposed_rms_mm`` and ``drift_rms_mm``.
+(``pipeline.verification.repeatability``). Figures are the scatter, the deviation that the results state, and the error
+that every shot repeats: the distance of the mean head from the true surface. The aim is an RMS scatter of at most 0.10
+mm over the face, ``reposed_rms_mm`` and ``drift_rms_mm``.
 """
 
 from collections.abc import Iterator
@@ -54,8 +54,7 @@ STILL = ("noise", "clicked")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """Holds a reconstructed head (world frame), what it states of itself (mm, along the normal), and the truth beside
-    it."""
+    """Holds a reconstructed head (world frame), the deviations that it states (mm, along the normal), and the truth."""
 
     vertices: Float[np.ndarray, "v 3"]
     stated_mm: Float[np.ndarray, " v"]
@@ -67,8 +66,8 @@ class Shot:
 def repeat(
     model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = SHOTS, folder: Path | None = None
 ) -> Outcome:
-    """Returns scatter, stated deviation and repeated error by condition. ``subjects`` is the number of shots, two or
-    more."""
+    """Runs this module's experiment. Returns scatter, stated deviation and repeated error by condition. ``subjects`` is
+    the number of shots, two or more."""
     records = Records(
         folder, "repeat", key_of(model.sha256, Settings(), subjects, *CONTOUR, composition, repeatability)
     )
@@ -110,10 +109,8 @@ def _row(model: HeadModel, condition: str, count: int, renderer: Renderer, repor
 def scenes(
     model: HeadModel, condition: str, count: int, renderer: Renderer
 ) -> Iterator[tuple[Scene, np.random.Generator]]:
-    """Yields the subject as each shot finds it with the rig as calibrated, and the shot's own noise.
-
-    Where cameras drift, the calibration is moved and the cameras stand: a shot cannot tell the one from the other.
-    """
+    """Yields the scene of each shot with the rig as calibrated, and a random generator for the shot's own noise. If
+    cameras drift, the calibration is moved instead of the cameras, which a shot cannot distinguish."""
     rng = np.random.default_rng(SEED)
     full, head = model.levels["full"], model.vertices(rng.standard_normal(len(model.modes)))
     marks = {name: head[row] for name, row in model.landmarks.items()}
@@ -133,7 +130,7 @@ def scenes(
 
 
 def moved(rng: np.random.Generator) -> tuple[Lamp, ...]:
-    """Returns the studio's lamps, each carried to another place and dimmed on its own."""
+    """Returns the studio's lamps, each moved and dimmed at random."""
     lamps = []
     for lamp in LAMPS:
         x, y, z = (np.array(lamp.towards) + rng.normal(0, LAMP_SHIFT, 3)).tolist()
@@ -143,6 +140,8 @@ def moved(rng: np.random.Generator) -> tuple[Lamp, ...]:
 
 
 def reconstructed(scene: Scene, capture: Capture, model: HeadModel, renderer: Renderer) -> Shot:
+    """Reconstructs a simulated capture, and returns the head with its stated deviations, the truth, and the
+    warnings."""
     settings = Settings(outputs=OutputSettings(surface="head"))
     done = reconstruct(ReconstructionContext(capture, scene.rig, model, settings, renderer))
     codes = frozenset(warning.code for warning in done.warnings)
@@ -150,8 +149,8 @@ def reconstructed(scene: Scene, capture: Capture, model: HeadModel, renderer: Re
 
 
 def judged(model: HeadModel, shots: list[Shot]) -> Row:
-    """Returns figures over the face, over its skin that cameras see in every shot (``seen_``), and what all shots
-    repeat."""
+    """Returns figures over the face, over the part of its skin that cameras see in every shot (``seen_``), and of the
+    error that all shots repeat."""
     full = model.levels["full"]
     face, areas = full.face_region, vertex_areas(shots[0].vertices, full.faces)
     seen = face & np.all([shot.photographed for shot in shots], axis=0)

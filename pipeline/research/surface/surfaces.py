@@ -1,13 +1,14 @@
-"""All that the cameras see, by us and by peers: the same photographs and masks, one scorer, CPU seconds.
+"""Compares the whole visible surface with other programs' results: the same photographs and masks, one scorer,
+processor seconds.
 
-- ``eigenhead``: bust.ply of the default job, head.ply made beside it.
+- ``eigenhead``: bust.ply of the default job, which also makes head.ply.
 - ``hull``: the visual hull of our silhouettes.
-- ``poisson``: screened Poisson (Kazhdan and Hoppe 2013, by Open3D) on the points and normals of our own depth maps;
-  its seconds are its own, those of the depth are ours.
-- ``openmvs``: densify, reconstruct, refine, where the folder of its programs is named; its seconds are its own.
+- ``poisson``: screened Poisson (Kazhdan and Hoppe 2013, by Open3D) on the points and normals of our depth maps; seconds
+  are without those of the depth maps.
+- ``openmvs``: densify, reconstruct, refine, if the folder of its programs is given; seconds are its own.
 
-The face is scored by the distances of the true face region to each surface. What a machine lacks is named among the
-rows as left out, and so is a peer that finds no surface.
+The face is scored by the distances of the true face region to each surface. A program that the machine lacks, or that
+finds no surface, is listed as left out.
 """
 
 # pyright: reportMissingImports=false
@@ -54,7 +55,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Holds a subject and what surfaces are made of; each is made when it is first asked for."""
+    """Holds a subject and what surfaces are made from; silhouettes and depth maps are computed when first used."""
 
     known: Known
     model: HeadModel
@@ -62,10 +63,12 @@ class Shown:
 
     @cached_property
     def silhouettes(self) -> dict[str, Silhouette]:
+        """Computes the silhouettes of the capture, by camera."""
         return segment(self.known.capture, self.known.rig, Settings().segmentation, report=discard_progress)
 
     @cached_property
     def depth_maps(self) -> tuple[DepthMap, ...]:
+        """Computes the depth maps of the capture, with the head fitted at the level ``photo``."""
         known = self.known
         head = every_level(known.capture, known.rig, self.model, ("photo",), self.renderer)["photo"].mesh()
         return estimate_depth(
@@ -82,17 +85,18 @@ def surfaces(
     openmvs: Path | None = None,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<capture>_<peer>_<quantity>``.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is
+    ``<capture>_<peer>_<quantity>``.
 
     Args:
         model: fitted.
         captures: folders with a truth beside them, by name.
         renderer: for the fit.
-        report: told the capture and the peer.
-        openmvs: the folder of its programs; without it that peer is left out.
-        folder: keeps rows, so that a stopped run goes on.
+        report: called with the capture and the program.
+        openmvs: folder of the programs of OpenMVS; None leaves it out.
+        folder: keeps rows, so that a stopped run can continue.
 
-    Raises InputError where ``openmvs`` lacks a program.
+    Raises InputError if ``openmvs`` lacks a program.
     """
     programs = None if openmvs is None else programs_in(openmvs)
     makers: dict[str, Callable[[Shown], tuple[Mesh, float]]] = {"eigenhead": ours, "hull": hull}
@@ -120,7 +124,7 @@ def surfaces(
 
 
 def peer_row(known: Known, make: Callable[[], tuple[Mesh, float]]) -> Row:
-    """Returns its scores, or why it has none."""
+    """Returns the scores of a surface, or why there is none."""
     try:
         mesh, seconds = make()
     except EigenheadError as failed:
@@ -131,6 +135,8 @@ def peer_row(known: Known, make: Callable[[], tuple[Mesh, float]]) -> Row:
 
 
 def ours(shown: Shown) -> tuple[Mesh, float]:
+    """Makes the bust of this project. Returns it with the processor seconds of the whole job. Raises PeerFailed without
+    a bust."""
     before, known = time.process_time(), shown.known
     found = reconstruct(ReconstructionContext(known.capture, known.rig, shown.model, Settings(), shown.renderer))
     if found.bust is None:
@@ -139,11 +145,14 @@ def ours(shown: Shown) -> tuple[Mesh, float]:
 
 
 def hull(shown: Shown) -> tuple[Mesh, float]:
+    """Makes the visual hull. Returns it with its processor seconds, silhouettes excluded."""
     silhouettes, before = shown.silhouettes, time.process_time()
     return visual_hull(silhouettes, shown.known.rig), time.process_time() - before
 
 
 def poisson(shown: Shown) -> tuple[Mesh, float]:
+    """Makes a surface from the depth maps by Open3D's screened Poisson reconstruction. Returns it with its processor
+    seconds, depth maps excluded."""
     import open3d
 
     maps, before = shown.depth_maps, time.process_time()
@@ -161,12 +170,15 @@ def poisson(shown: Shown) -> tuple[Mesh, float]:
 
 
 def by_openmvs(shown: Shown, *, programs: Mapping[str, Path]) -> tuple[Mesh, float]:
+    """Makes a surface from the photographs by OpenMVS, starting from the visual hull. Returns it with its processor
+    seconds."""
     with tempfile.TemporaryDirectory(prefix="openmvs-") as folder:
         body = visual_hull(shown.silhouettes, shown.known.rig)
         return surface_by_openmvs(shown.depth_maps, body, programs, Path(folder))
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
+    """Returns the numbers of all rows by name: capture, surface and column joined."""
     return {
         f"{row['name']}_{row['peer']}_{key}": value
         for row in rows
@@ -176,7 +188,7 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """Returns a row a surface; what is left out stands below with its reason."""
+    """Returns a Markdown table with a row for each surface; what is left out is listed below with its reason."""
     scored = [row for row in rows if "left_out" not in row]
     cells = [[row["name"], row["peer"], *(row.get(column) for column in COLUMNS)] for row in scored]
     header = ("capture", "surface", *(column.replace("_", " ") for column in COLUMNS))

@@ -1,11 +1,12 @@
-"""Round trips through a template: heads on a model's vertices, written in the order of a mesh that was registered to it
-as anybody's, beside where these vertices truly are.
+"""Measures round trips through a template: heads on a model's vertices are written in the order of a registered mesh,
+and compared with the true positions of these vertices.
 
-The mesh is ICT-FaceKit's head in a shuffled order, in centimetres, lying on its side, and the heads are draws of
-ICT-FaceKit, so that every vertex has a true place. With ICT-FaceKit imported as the model the head is the draw itself.
-With another model it is the draw on that model's vertices: each of them bound to the registered mesh and carried by the
-draw, an inverse that shares nothing with the template but the registration. What a round trip cannot show, whether the
-registration puts a place of the face where the model has it, the twelve landmarks that ICT-FaceKit names tell.
+The mesh is ICT-FaceKit's head in a shuffled order, in centimetres, lying on its side. The heads are random heads of
+ICT-FaceKit, so that every vertex has a true position. With ICT-FaceKit as the model, the head is the random head
+itself. With another model it is the random head on that model's vertices: each of them is bound to the registered mesh
+and carried by the random head, an inverse that has nothing in common with the template but the registration. A round
+trip cannot show whether the registration matches the face correctly; the twelve landmarks that ICT-FaceKit names show
+that.
 """
 
 import time
@@ -39,8 +40,9 @@ def templates(
     draws: int = 50,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns ``<model>_median_mm``, ``<model>_p95_mm`` over all vertices of all draws, and so on; ``facekit_drawn`` is
-    ICT-FaceKit with a mesh that has one draw's shape; ``_marked``: the registration was given the twelve landmarks."""
+    """Runs this module's experiment. Returns ``<model>_median_mm``, ``<model>_p95_mm`` and so on, over all vertices of
+    all random heads. ``facekit_drawn`` is ICT-FaceKit with a mesh that has the shape of one random head; ``_marked``
+    had the twelve landmarks for its registration."""
     modules = (carrying, likeness, placement, registration)
     key = key_of(facekit.sha256, *(model.sha256 for model in models.values()), draws, *modules)
     records = Records(folder, "templates", key)
@@ -59,7 +61,8 @@ def templates(
 def foreign(
     facekit: HeadModel, shape: Float[np.ndarray, "v 3"], seed: int
 ) -> tuple[PolygonMesh, Int[np.ndarray, " v"]]:
-    """Returns ICT-FaceKit's own triangles in another order, unit and axis convention; and which vertex each one is."""
+    """Returns ICT-FaceKit's own mesh in another order, unit and axis convention, and the original index of each
+    vertex."""
     order = np.random.default_rng((SEED, seed)).permutation(len(shape))
     place = np.argsort(order)
     faces = facekit.levels["full"].faces

@@ -1,11 +1,11 @@
-"""What a texture is worth: the head drawn into a photograph that was kept back from everything, the fit included.
+"""Measures textures: the head is drawn as a photograph that was not used for anything, the fit included.
 
 Compared are head.glb's texture, head.ply's vertex colours, and the paper's blend (section 4.5: the mean weighted by
-normal . viewing direction) in a texture of the same size. The kept-back camera's gain and offset are fitted by channel,
-and the blur of its lens, to each alike. Counted is the face, three pixels from where it hides itself. A photograph has
-noise that no texture can foresee: ``_db`` is PSNR with the photograph's noise power (Immerkaer, *Fast Noise Variance
-Estimation*, CVIU 1996, by the median) taken off, ``_raw_db`` without. ``_detail`` is over the tenth of the pixels with
-the steepest gradients: eyes, brows, lips.
+normal . viewing direction) in a texture of the same size. Gain and offset of the unused camera are fitted by channel,
+and the blur of its lens, for each alike. Only the face counts, three pixels from where it hides itself. A photograph
+has noise that no texture can predict: ``_db`` is PSNR with the photograph's noise power (Immerkaer, *Fast Noise
+Variance Estimation*, CVIU 1996, by the median) subtracted, ``_raw_db`` without. ``_detail`` is over the tenth of the
+pixels with the steepest gradients: eyes, brows, lips.
 """
 
 import time
@@ -65,16 +65,16 @@ def texture(
     subjects: int = SUBJECTS,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``, the mean over the group:
-    ``studio``, or a capture by its name.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``,
+    the mean over the group: ``studio``, or a capture by its name.
 
     Args:
-        model: fitted, and drawn from.
+        model: fitted; heads are drawn from it, too.
         captures: folders with a truth beside them, by name.
         renderer: for the studio.
-        report: told the subject and the share done.
+        report: called with the subject and the share done.
         subjects: heads in the studio.
-        folder: keeps rows, so that a stopped run goes on, and a picture of every subject at 200 %.
+        folder: keeps rows, so that a stopped run can continue, and a picture of every subject at 200 %.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head"))
     records = Records(folder, "texture", key_of(model.sha256, settings))
@@ -101,9 +101,10 @@ def row_of(
     number: int,
     picture: Path | None,
 ) -> Row:
-    """Returns one subject, the ``number``-th nearest camera to the front one (in turn) kept back."""
+    """Runs one subject without the ``number``-th nearest camera to the front one (counted in turn), and compares with
+    that camera."""
     known = read()
-    kept = kept_back(known.rig, number)
+    kept = held_out_camera(known.rig, number)
     rig = known.rig.subset(name for name in known.rig.names if name != kept.name)
     images = {name: image for name, image in known.capture.images.items() if name != kept.name}
     capture = replace(known.capture, images=images)
@@ -132,15 +133,15 @@ def row_of(
     return row
 
 
-def kept_back(rig: Rig, number: int) -> Camera:
-    """Returns one of the cameras that look at the face."""
+def held_out_camera(rig: Rig, number: int) -> Camera:
+    """Chooses the camera that is not used: one of those that see the face."""
     front = rig[rig.front_camera()]
     order = sorted(rig, key=lambda camera: -float(camera.axis_world @ front.axis_world))
     return order[1 + number % KEPT_BACK]
 
 
 def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig, settings: Settings) -> Row:
-    """Returns wall and processor seconds of vertex colours alone, and of all that the texture adds, its JPEG
+    """Returns wall-clock and processor seconds of vertex colours alone, and of what the texture adds, its JPEG
     included."""
     mesh, layout = found.mesh_world, model_layout(model)
     coloured_by = partial(
@@ -196,7 +197,8 @@ def _drawn(camera: Camera, vertices: np.ndarray, faces: np.ndarray, values: np.n
 
 
 def errors(drawn: Float32[np.ndarray, "h w 3"], photograph: Image, face: Bool[np.ndarray, "h w"]) -> dict[str, float]:
-    """Returns PSNR (dB) at the best of ``BLURS_PX``, as the module says."""
+    """Returns the PSNR (dB) of a drawn face against the photograph, at the best of ``BLURS_PX``, as the module
+    describes."""
     tries = [cv2.GaussianBlur(drawn, (0, 0), blur) if blur else drawn for blur in BLURS_PX]
     residuals = [_residual(image[face], photograph[face]) for image in tries]
     best = min(residuals, key=lambda residual: float((residual**2).mean()))

@@ -1,9 +1,10 @@
-"""All that the cameras see: studio heads under all the hair that the studio has, and captures with a truth beside them,
-by part: recall, precision, errors of the face and of the head's regions, what head.ply and bust.ply differ by, seconds;
-and each in clay beside the truth.
+"""Measures the whole visible surface: studio heads with every hair style of the studio, and captures with a truth
+beside them.
 
-``precision`` is of the whole closed surface, within 25 mm of what is seen. Its own guess at what nobody sees begins
-there, too, so that no closed surface reaches 1; ``precision_seen`` is of what the file itself calls seen.
+Figures are recall and precision by part, errors of the face and of the head's regions, the difference between head.ply
+and bust.ply, and seconds; each surface is drawn in clay beside the truth. ``precision`` is of the whole closed surface
+within 25 mm of what is seen. The surface's guess at what nobody sees begins there, too, so that no closed surface
+reaches 1. ``precision_seen`` is of what the file itself calls seen.
 """
 
 import time
@@ -66,16 +67,16 @@ def visible(
     subjects: int = len(STYLES),
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``, the mean over the group:
-    ``studio``, or a capture by its name.
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``,
+    the mean over the group: ``studio``, or a capture by its name.
 
     Args:
-        model: fitted, and drawn from.
+        model: fitted; heads are drawn from it, too.
         captures: folders with a truth beside them, by name.
         renderer: for the studio.
-        report: told the subject and the share done.
-        subjects: heads in the studio, one a style of ``STYLES`` in turn.
-        folder: keeps rows, so that a stopped run goes on, and a picture of every subject.
+        report: called with the subject and the share done.
+        subjects: heads in the studio, with the hair styles of ``STYLES`` in turn.
+        folder: keeps rows, so that a stopped run can continue, and a picture of every subject.
     """
     records = Records(folder, "visible", key_of(model.sha256, Settings()))
     jobs: list[tuple[str, str, Callable[[], Known]]] = []
@@ -96,7 +97,7 @@ def visible(
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
-    """Returns one subject by the default job."""
+    """Runs the default job on one subject, and returns its figures."""
     subject, before = known(), time.process_time()
     found = reconstruct(ReconstructionContext(subject.capture, subject.rig, model, Settings(), renderer))
     seconds = time.process_time() - before
@@ -125,7 +126,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
 
 def region_errors(known: Known, head_world: Mesh, regions: Mapping[str, Bool[np.ndarray, " v"]]) -> dict[str, float]:
     """Returns median, mean and 95th percentile (mm, by area) of the distance of true skin that two cameras see to the
-    head, by region of the head, carried to the truth by the nearest vertex."""
+    head, by region of the head, which is transferred to the truth by the nearest vertex."""
     skin = known.visible.points[known.visible.part == PARTS.index("head")].astype(float)
     seen = np.flatnonzero(KDTree(skin).query(known.mesh.vertices, distance_upper_bound=SEEN_MM)[0] < SEEN_MM)
     hit = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(known.mesh.vertices[seen])
@@ -145,19 +146,19 @@ def region_errors(known: Known, head_world: Mesh, regions: Mapping[str, Bool[np.
 
 
 def seen_of(bust: BustSurface) -> Mesh:
-    """Returns the triangles whose corners some photograph measures."""
+    """Returns the triangles all of whose corners a photograph shows."""
     return Mesh(bust.mesh_world.vertices, bust.mesh_world.faces[bust.seen[bust.mesh_world.faces].all(axis=1)])
 
 
 def head_to_bust(head_world: Mesh, bust: BustSurface) -> Float[np.ndarray, " n"]:
-    """Returns distances (mm) of the bust's seen skin to the head, where the head has any within 5 mm."""
+    """Returns the distances (mm) of the bust's visible skin to the head, where the head is within 5 mm."""
     skin = bust.mesh_world.vertices[bust.part == SKIN]
     far = SurfaceIndex(head_world.vertices, head_world.faces, 1.0).closest(skin).distances
     return far[far < 5.0]
 
 
 def splats(points: VisiblePoints) -> Mesh:
-    """Returns a square about each point, across its normal: what there is to see of a truth."""
+    """Returns a small square around each point, across its normal, to draw a truth that consists of points."""
     normals = points.normals.astype(float)
     aside = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     aside *= SPLAT_MM / np.linalg.norm(aside, axis=1, keepdims=True)
@@ -180,7 +181,7 @@ def _row(name: str, in_head: Mapping[str, Mesh]) -> np.ndarray:
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:
-    """Means over the subjects of each group, of what they have."""
+    """Returns means over the subjects of each group, of the figures that they have."""
     values: dict[str, list[float]] = {}
     for row in rows:
         for key, value in row.items():

@@ -1,8 +1,8 @@
-"""How much of all that the cameras see a surface has, and how right the rest of it is, by part.
+"""Scores a surface by how much of the visible truth it has, and how right it is, by part.
 
 Recall: distance of every point of the truth (``rig.studio.visible``) to the surface, where that faces the same way.
-Precision: distance of the surface's own points to the truth, as far as the truth says anything there. Distances are to
-tangent planes wherever a sample is close, so that the density of samples does not show.
+Precision: distance of the surface's own points to the truth, as far as the truth covers them. Distances are to tangent
+planes where a sample is close, so that the density of samples has no effect.
 """
 
 from dataclasses import dataclass
@@ -27,15 +27,15 @@ MIN_POINTS = 100  # of a part, for figures of its own
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisibleScore:
-    """Holds ``recall`` and ``precision`` by part: median, p95 (mm) and shares within 1, 2 and 5 mm; recall has "all",
-    too."""
+    """Holds ``recall`` and ``precision`` by part: median and 95th percentile (mm), and the shares within 1, 2 and 5 mm.
+    Recall has "all", too."""
 
     recall: dict[str, dict[str, float]]
     precision: dict[str, dict[str, float]]
     closed: bool
 
     def flat(self) -> dict[str, float]:
-        """Returns one number a key, for tables: ``recall_hair_within_2mm``."""
+        """Returns one number for each key, for tables: ``recall_hair_within_2mm``."""
         kinds = {"recall": self.recall, "precision": self.precision}
         named = ((f"{kind}_{part}_{key}", value) for kind, parts in kinds.items() for part, figures in parts.items()
                  for key, value in figures.items())  # fmt: skip
@@ -43,7 +43,7 @@ class VisibleScore:
 
 
 def read_visible(truth: Path) -> VisiblePoints:
-    """Returns ``visible.npz`` of a truth folder."""
+    """Reads ``visible.npz`` of a truth folder."""
     with np.load(truth / "visible.npz") as kept:
         return VisiblePoints(kept["points"], kept["normals"], kept["part"], kept["views"])
 

@@ -1,9 +1,9 @@
-"""Log odds of a pixel's colour: subject against background, by histograms and by the colours nearby.
+"""Computes log odds of subject against background from a pixel's colour, by histograms and by the colours nearby.
 
-A view's background is its own; the subject is the same in all views, in colours that the light may change, so that its
-density is half the views' common one and half the view's own. Where the two overlap (a grey coat before a grey wall),
-the colours nearby tell more than those of the whole image: a Gaussian of the mean and scatter in a window joins each
-histogram (Bai et al., *Video SnapCut*, SIGGRAPH 2009, use such local models).
+Each view has its own background. The subject is the same in all views, but the light may change its colours, so that
+its density is half that of all views together and half the view's own. Where both overlap (a grey coat before a grey
+wall), the colours nearby are more telling than those of the whole image: a Gaussian of the mean and scatter in a window
+is combined with each histogram (Bai et al., *Video SnapCut*, SIGGRAPH 2009, use such local models).
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Holds which pixels of a reduced image surely show the subject, and which surely show background."""
+    """Holds which pixels of a reduced image certainly show the subject, and which certainly show background."""
 
     subject: Mask
     background: Mask
@@ -50,9 +50,15 @@ def colour_odds(
     *,
     nearby: bool,
 ) -> Float32[np.ndarray, "h w"]:
-    """Returns the log odds of subject against background for every pixel, by its colour. ``common``: counts of the
-    subject's colours in all views; ``noise``: levels; ``nearby``: whether colours near the pixel count too, which needs
-    nearly complete samples."""
+    """Returns the log odds of subject against background for every pixel, from its colour.
+
+    Args:
+        image: reduced.
+        samples: pixels that are certain.
+        common: counts of the subject's colours in all views.
+        noise: grey levels.
+        nearby: whether colours near the pixel count too; they need nearly complete samples.
+    """
     subject = _log_density(image, (common, histogram(image[samples.subject])))
     background = _log_density(image, (histogram(image[samples.background]),))
     if nearby:

@@ -1,8 +1,8 @@
-"""Every view of a capture that has neither plates nor masks: a decision to be matted, or the edge as it was cut.
+"""Decides on every view of a capture that has neither plates nor masks: what the subject is, and how its edge is found.
 
-The matting needs to know the background behind the subject's border. Before a studio's backdrop it is guessed well from
-what is beside it; before clutter, or where the subject stands on something of its own colour, it is not, and the
-view is cut along its edges instead.
+Matting must know the background behind the subject's border. In front of a studio's backdrop it is guessed well from
+what is beside the subject. In front of clutter, or if the subject stands on something of its own colour, it is not, and
+the view is cut along its edges instead.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,7 +34,7 @@ ALPHA_BLUR_PX = 1.0  # of the image that was cut
 @dataclass(frozen=True, slots=True, eq=False)
 class WithoutPlates:
     """Holds the views in two groups, by how their outline is found: ``decisions`` go to the matting; ``shares`` are the
-    subject's share of each pixel (full size) in views that were cut."""
+    subject's share of each pixel (full size), for views that were cut along edges."""
 
     decisions: Mapping[str, Decision]
     shares: Mapping[str, Float32[np.ndarray, "_ _"]]
@@ -48,8 +48,8 @@ def decide_without_plates(
     head: HeadSeed | None = None,
     report: Callable[[float], None] = lambda share: None,
 ) -> WithoutPlates:
-    """Decides which pixels show the subject in every photograph, without plates. ``head`` is the head's position if a
-    face was found."""
+    """Decides which pixels of every photograph show the subject, without plates. ``head`` is the head's position; None
+    if no face was found."""
     small = {name: _reduced(images[name], settings.coarse_columns).astype(np.float32) for name in rig.names}
     sizes = {name: image.shape[:2] for name, image in small.items()}
     points = find_scene_points(images, rig, report=partial(_between, report, 0.0, POINTS_SHARE))

@@ -1,8 +1,8 @@
-"""From a coarse mask to what the matting asks for: the background behind the subject's border, guessed from beside it.
+"""Estimates what the matting needs: the background behind the subject's border, guessed from beside it.
 
 The plate is the photograph itself outside the mask and a margin, and inside the mean of what lies nearby. Its noise is
-measured where the truth is known, by the same guess on the other side of the border: a backdrop with texture is
-guessed badly, the matting then trusts the coarse mask more, and says so by its contrast.
+measured where the truth is known, by the same guess on the other side of the border. A backdrop with texture is guessed
+badly; the matting then trusts the coarse mask more, and its contrast shows that.
 """
 
 import cv2
@@ -30,8 +30,8 @@ def decision_without_plate(
     *,
     solid: bool = False,
 ) -> Decision:
-    """Returns a decision for the matting, with a background estimated from the pixels around the mask. ``solid``: the
-    subject is a head, and holes in the mask are filled as skin or hair of the wall's colour."""
+    """Returns a decision for the matting, with a background estimated from the pixels around the mask. If ``solid``,
+    the subject is a head, and holes in the mask are filled as skin or hair of the wall's colour."""
     mask, others = whole_subject(found.mask, found.odds < -1, settings)
     odds = found.odds
     if solid:

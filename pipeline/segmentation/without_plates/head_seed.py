@@ -1,4 +1,4 @@
-"""Where the head is, as its face tells: what a search for masks begins with where somebody looks into the cameras."""
+"""Finds where the head is by its face: the start of the search for masks, if somebody looks into the cameras."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -61,8 +61,8 @@ def head_core(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.
 
 
 def beside_head(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of a reduced image that surely do not show the subject: above the chin, and farther aside than
-    hair reaches. No pixel is marked if the camera sees the head from above or below."""
+    """Returns the pixels of a reduced image (``size``: height, width) that certainly do not show the subject: above the
+    chin, and farther to the side than hair reaches. None is marked if the camera sees the head from above or below."""
     centre_camera = camera.camera_from_world.apply(seed.centre_world)
     up = (camera.camera_from_world.rotation @ seed.up_world)[:2]
     if centre_camera[2] <= seed.skull_mm or np.linalg.norm(up) < UPRIGHT:

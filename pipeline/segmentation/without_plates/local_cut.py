@@ -1,8 +1,8 @@
-"""From a coarse mask, which may be a hand's breadth too wide where surroundings look alike, to the edge itself.
+"""Finds the edge itself from a coarse mask, which may be a hand's breadth too wide where the surroundings look similar.
 
-Windows along the outline are cut one by one (Rother et al., *GrabCut*, SIGGRAPH 2004, as OpenCV has it), so that
-colours are those of the place, and overlapping windows are averaged (Bai et al., *Video SnapCut*, 2009). Then the views
-are asked again: what is left of the surroundings in one, another view's edge denies.
+Windows along the outline are cut one by one (Rother et al., *GrabCut*, SIGGRAPH 2004, in OpenCV), so that colours are
+local, and overlapping windows are averaged (Bai et al., *Video SnapCut*, 2009). Then the views are compared again: what
+is left of the surroundings in one is rejected by another view's edge.
 """
 
 from collections.abc import Callable, Mapping

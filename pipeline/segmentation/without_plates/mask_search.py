@@ -1,9 +1,10 @@
-"""Coarse masks of all views together: colours say what is like the subject, the views what is there in all of them.
+"""Finds coarse masks of all views together: colours say what looks like the subject, the views what exists in all of
+them.
 
-The start is what geometry alone knows: a disc around the place that all cameras look at is the subject, and the image's
-border is not, but where the body goes down through it. From there colours and space are asked in turn. A view learns
-its background first from that border alone, then from what its mask leaves and the other views deny: a coat that it has
-not found yet must not become its background.
+The start is what geometry alone tells: a disc around the point that all cameras are directed at is the subject, and the
+border of the image is not, except where the body leaves it at the bottom. From there colours and space are used in
+turn. A view first learns its background from that border alone, then from what its mask leaves and the other views
+reject: a coat that it has not found yet must not become background.
 """
 
 from collections.abc import Callable, Mapping
@@ -48,7 +49,7 @@ Mask = Bool[np.ndarray, "h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seeds:
-    """Holds what is known of a view from geometry alone: pixels that surely show the subject, that surely show
+    """Holds what geometry alone tells of a view: pixels that certainly show the subject, that certainly show
     background, and that can show the subject at all."""
 
     core: Mask

@@ -1,7 +1,9 @@
-"""What the subject stands on, or before: a plane that many scene points lie on and that none of the subject is beyond.
+"""Finds what the subject stands on, or in front of: a plane with many scene points beyond which no part of the subject
+lies.
 
-A table of the subject's own colour is as much in front of all cameras as the subject, but it is a plane, and wide.
-Found by random samples (Fischler & Bolles 1981) from a fixed seed. A person on a chair has none, and none is taken.
+A table of the subject's own colour is in front of all cameras like the subject, but it is flat and wide. It is found by
+random samples (RANSAC, Fischler & Bolles 1981) from a fixed seed. A person on a chair has no such plane, and none is
+found.
 """
 
 import numpy as np
@@ -48,8 +50,8 @@ def ball_above(
     centre_world: Float[np.ndarray, " 3"],
     radius_mm: float,
 ) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns the centre (world) and radius (mm) of a ball about the scene points above the plane, with some room for
-    parts without points."""
+    """Returns the centre (world) and radius (mm) of a ball around the scene points above the plane, with some margin
+    for parts without points."""
     height = points_world @ plane_world[:3] + plane_world[3]
     inside = np.linalg.norm(points_world - centre_world, axis=1) < radius_mm
     standing = points_world[inside & (height > 2 * NEAR * radius_mm)]

@@ -1,9 +1,9 @@
-"""The space that the cameras look at, in voxels, and what the other views say of a pixel of one.
+"""Divides the space that the cameras see into voxels, and combines what the other views say of a pixel's ray.
 
-Enters: a rig and the sizes of its reduced images. Leaves: for every voxel its pixel in every view. A voxel is the
-subject's only where no view that sees it denies it, as in the visual hull (figure 1); views vote by log odds instead
-of masks (Franco & Boyer, *Fusion of multi-view silhouette cues using a space occupancy grid*, ICCV 2005), so that one
-that is in doubt neither carves nor keeps.
+Enters: a rig and the sizes of its reduced images. Leaves: for every voxel its pixel in every view. A voxel belongs to
+the subject only if no view that sees it rejects it, as in the visual hull (figure 1). Views vote by log odds instead of
+masks (Franco & Boyer, *Fusion of multi-view silhouette cues using a space occupancy grid*, ICCV 2005), so that a view
+in doubt has no effect.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ SOLID_ODDS = 0.5  # log odds that all pixels around a voxel must have in a view 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewingVolume:
-    """Holds the voxels of a ball around the place that all cameras look at, and their pixel in each view."""
+    """Holds the voxels of a ball around the point that all cameras are directed at, and their pixel in each view."""
 
     centre_world: Float[np.ndarray, " 3"]
     radius_mm: float
@@ -36,9 +36,9 @@ class ViewingVolume:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherViews:
-    """Holds, for each pixel of one view, what all other views say of its ray: ``support``, the greatest sum of their
-    log odds at a voxel on it (negative if they rule the subject out), and ``solid``, whether it meets a voxel that none
-    of them doubts."""
+    """Holds, for each pixel of one view, what all other views say of its ray: ``support``, the largest sum of their log
+    odds at a voxel on it (negative if they exclude the subject), and ``solid``, whether it meets a voxel that none of
+    them doubts."""
 
     support: Float32[np.ndarray, "h w"]
     solid: Bool[np.ndarray, "h w"]
@@ -47,8 +47,8 @@ class OtherViews:
 def viewing_ball(
     rig: Rig, centre_world: Float[np.ndarray, " 3"] | None = None
 ) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Returns centre (world) and radius (mm) of a ball that reaches as far as the corners of the median image.
-    ``centre_world``: a better centre than the place where the cameras look."""
+    """Returns centre (world) and radius (mm) of a ball that reaches to the corners of the median image.
+    ``centre_world`` is a better centre than the point that the cameras are directed at; None takes that point."""
     centre = rig.centre_world() if centre_world is None else centre_world
     radius = float(
         np.median(
@@ -70,9 +70,8 @@ def viewing_volume(
     plane_world: Float[np.ndarray, " 4"] | None = None,
 ) -> ViewingVolume:
     """Builds the volume from a ``ball``, centre and radius (mm), for reduced images of ``sizes`` (height, width).
-
-    ``plane_world``: what the subject stands on; only the side on which ``plane . (x, 1)`` is positive is kept.
-    """
+    ``plane_world`` is the plane that the subject stands on: only the side on which ``plane . (x, 1)`` is positive is
+    kept."""
     centre, radius = ball
     line = ((np.arange(CELLS) + 0.5) / CELLS * 2 - 1) * radius
     offsets = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,1 +1,2 @@
-"""Unfolds a mesh: where each triangle lies in a texture, in full and reduced, and the normals that these lose."""
+"""Lays a mesh flat for its texture: where each triangle lies, on the full and on a reduced mesh, and the normals that
+reduction loses."""

@@ -1,4 +1,4 @@
-"""Images in a head's layout: beside it they continue, for a texel's neighbours are looked at, too."""
+"""Continues images in a texture layout beyond its borders, since renderers also read neighbouring texels."""
 
 import cv2
 import numpy as np

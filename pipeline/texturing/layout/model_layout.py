@@ -1,4 +1,5 @@
-"""The layout that belongs to a head model: made once, kept by its content, and mapped by every later process."""
+"""Provides the texture layout of a head model: computed once, cached by the model's content, and memory-mapped by later
+processes."""
 
 from dataclasses import dataclass
 
@@ -20,8 +21,8 @@ class ModelLayout:
 
 
 def model_layout(model: HeadModel) -> ModelLayout:
-    """Returns the texture layout of a model, made from its mean head, so that texels of any two subjects correspond.
-    Raises NoLayout for a surface that is not one piece with one open border."""
+    """Returns the texture layout of a model. It is made from the model's mean head, so that texels of any two subjects
+    correspond. Raises NoLayout for a surface that is not one piece with one open border."""
     faces = model.levels["full"].faces
     mean = model.vertices(np.zeros(0))
 

@@ -1,12 +1,12 @@
-"""What a reduced mesh lost of a head's shape, as an image that turns its normals.
+"""Computes the normal map of a reduced mesh: an image that turns its normals to those of the full mesh.
 
-Enters: the head, its layout, the layout reduced. Leaves: the reduced mesh with normals and tangents, and its normal
-map as glTF wants it: x along the tangent, +Y up in the image, z along the normal. Tangents are those of MikkTSpace
-(Mikkelsen, *Simulation of Wrinkled Surfaces Revisited*, 2008), which glTF prescribes and viewers interpolate: of each
-corner the direction in which u grows, laid onto the vertex' tangent plane, by the corner's angle.
-https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes-overview
+Enters: the head, its layout, the layout reduced. Leaves: the reduced mesh with normals and tangents, and its normal map
+as glTF defines it: x along the tangent, +Y up in the image, z along the normal. Tangents are those of MikkTSpace
+(Mikkelsen, *Simulation of Wrinkled Surfaces Revisited*, 2008), which glTF prescribes and viewers interpolate: the mean
+over a vertex's corners of the direction in which u grows, in the vertex's tangent plane, weighted by the corner's
+angle. https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#meshes-overview
 
-A texel shows the same place of the head that the texture shows there, so that shape and colour stay together.
+A texel shows the same point of the head in the normal map and in the texture, so that shape and colour agree.
 """
 
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ SIZE_PX = 1024  # 4.5 texels from a vertex of the full level to the next; the bu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalMapped:
-    """Holds a reduced mesh (mm) with texture coordinates, normals, tangents and its normal map. Its vertices are those
-    numbered ``rows`` of the full mesh."""
+    """Holds a reduced mesh (mm) with texture coordinates, normals, tangents and its normal map. ``rows`` are the
+    indices of its vertices in the full mesh."""
 
     mesh: Mesh
     rows: Int[np.ndarray, " n"]
@@ -46,8 +46,8 @@ def normal_mapped(
     reduced: ReducedLayout,
     size: int = SIZE_PX,
 ) -> NormalMapped:
-    """Reduces the head's full mesh (mm, unit normals) and returns the reduced mesh with a normal map that keeps the
-    full mesh's detail."""
+    """Reduces the full mesh of a head (mm, unit normals), and returns the reduced mesh with a normal map of the lost
+    detail."""
     rows = layout.source[reduced.rows]
     places, reduced_normals, uv = vertices[rows], normals[rows], layout.uv[reduced.rows]
     tangents = vertex_tangents(places, reduced_normals, uv, reduced.faces)
@@ -74,8 +74,8 @@ def vertex_tangents(
     uv: Float[np.ndarray, "n 2"],
     faces: Int[np.ndarray, "f 3"],
 ) -> Float[np.ndarray, "n 4"]:
-    """Computes MikkTSpace's tangents at the vertices; the fourth number is the sign of the bitangent. All triangles
-    must turn the same way in the layout, whose v points downwards."""
+    """Computes the tangents of MikkTSpace at the vertices; the fourth number is the sign of the bitangent. All
+    triangles must have the same orientation in the layout, whose v points downwards."""
     corners, flat = vertices[faces], uv[faces]
     edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     (s, t), (p, q) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
@@ -128,5 +128,5 @@ def _in_frame(
 
 
 def png(image: UInt8[np.ndarray, "s s 3"]) -> bytes:
-    """Returns the normal map as the bytes of a PNG file. Lossy compression would be seen in highlights."""
+    """Returns the normal map as the bytes of a PNG file. Lossy compression would show in highlights."""
     return cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()

@@ -1,7 +1,7 @@
-"""A head's texture layout on fewer triangles: what a normal map gives its detail back to.
+"""Reduces a head's texture layout to fewer triangles, whose lost detail a normal map restores.
 
-The layout's mesh is decimated with its border held: both sides of the cut keep the same vertices, so that no gap opens,
-and the texture stays where it is. Made from a model's mean head once and kept, as the layout is.
+The mesh of the layout is decimated with its border fixed: both sides of the cut keep the same vertices, so that no gap
+opens, and the texture stays where it is. It is computed once from a model's mean head, and cached.
 """
 
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ FACE_WEIGHT = 8.0  # of an error in the face region
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedLayout:
-    """Holds a texture layout reduced to fewer triangles. ``rows``: which vertices of the full layout remain; ``faces``:
-    triangles as indices into ``rows``."""
+    """Holds a texture layout reduced to fewer triangles. ``rows`` are the vertices of the full layout that remain,
+    ``faces`` the triangles as indices into ``rows``."""
 
     rows: Int[np.ndarray, " n"]
     faces: Int[np.ndarray, "f 3"]
 
 
 def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
-    """Returns the reduced texture layout of a model's full level, made from its mean head once and kept."""
+    """Returns the reduced texture layout of a model's full level, computed once from its mean head and cached."""
     mean, region = model.vertices(np.zeros(0)), model.levels["full"].face_region
 
     def make() -> dict[str, np.ndarray]:
@@ -44,8 +44,8 @@ def reduced_layout(model: HeadModel, layout: Layout) -> ReducedLayout:
 def reduce(
     layout: Layout, vertices: Float[np.ndarray, "v 3"], importance: Float[np.ndarray, " v"], count: int = FACES
 ) -> ReducedLayout:
-    """Reduces the texture layout of a mesh to ``count`` triangles or a few more, its border unchanged. ``importance``
-    multiplies the error of a vertex: where it is high the layout stays denser."""
+    """Reduces the texture layout of a mesh to ``count`` triangles or a few more; its border stays unchanged.
+    ``importance`` multiplies the error of each vertex: the layout stays denser where it is high."""
     source = layout.source
     ((rows, faces),) = decimate(
         vertices[source],

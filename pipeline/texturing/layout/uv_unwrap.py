@@ -1,13 +1,13 @@
-"""A head laid out flat, for a texture with more detail than one colour a vertex has.
+"""Lays a head flat, for a texture with more detail than one colour for each vertex.
 
-The surface is cut from the nape over the back of the head to the crown and spread on a square, the neck at the bottom
-and the face in the middle. Every inner vertex is a mean of its neighbours with mean-value weights (Floater, *Mean value
-coordinates*, CAGD 2003), which by Tutte's theorem leaves no two triangles over each other; the square's sides bulge a
-little, so that it is strictly convex. What that map shrinks, the nose and above all the ears, is widened by rounds of
-reweighting (Yoshizawa, Belyaev and Seidel, *A fast and simple stretch-minimizing mesh parameterization*, SMI 2004),
-which keep the weights positive.
+The surface is cut from the nape over the back of the head to the crown, and spread on a square with the neck at the
+bottom and the face in the middle. Every inner vertex is a mean of its neighbours with mean-value weights (Floater,
+*Mean value coordinates*, CAGD 2003), so that by Tutte's theorem no two triangles overlap; the square's sides bulge a
+little, to make it strictly convex. Parts that this map makes too small, the nose and above all the ears, are enlarged
+by rounds of reweighting (Yoshizawa, Belyaev and Seidel, *A fast and simple stretch-minimizing mesh parameterization*,
+SMI 2004), which keep the weights positive.
 
-Laid out from a model's mean head, texels of any two subjects correspond.
+The layout is made from a model's mean head, so that texels of any two subjects correspond.
 """
 
 from dataclasses import dataclass
@@ -29,14 +29,16 @@ SIDE_SHARE = 2 / 3  # of the cut that is one of the square's sides; the rest is 
 
 
 class NoLayout(EigenheadError):
+    """Reports a mesh that cannot be laid flat: it is not one piece with one open border."""
+
     def __init__(self) -> None:
         super().__init__(compose("model-without-layout"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Holds a mesh cut open and laid flat. ``source``: the mesh's vertex that each vertex of the layout comes from;
-    ``uv``: where it lies in the unit square, v downwards as in glTF."""
+    """Holds a mesh cut open and laid flat. ``source`` is the mesh's vertex that each vertex of the layout comes from;
+    ``uv`` is its position in the unit square, v downwards as in glTF."""
 
     uv: Float[np.ndarray, "n 2"]
     faces: Int[np.ndarray, "f 3"]
@@ -52,7 +54,7 @@ class Atlas:
 
 
 def unwrap(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Layout:
-    """Cuts a head open from the nape to the crown and lays it flat in the unit square. Raises NoLayout unless the mesh
+    """Cuts a head open from the nape to the crown, and lays it flat in the unit square. Raises NoLayout unless the mesh
     is one piece with one open border, at the neck."""
     border = _border(faces)
     back = int(border[np.argmin(vertices[border, 2] + np.abs(vertices[border, 0]))])

@@ -1,1 +1,1 @@
-"""The studio as devices: camera streams, a trigger box on a serial line, files in a folder."""
+"""Presents the simulated studio as devices: camera streams, a trigger box on a serial line, and files in a folder."""

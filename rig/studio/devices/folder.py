@@ -1,4 +1,5 @@
-"""A simulated capture on disk: the folder that docs/capture-format.md fixes, and its truth beside it."""
+"""Writes a simulated capture to disk: the folder that docs/capture-format.md describes, and its ground truth beside
+it."""
 
 import io
 import json
@@ -19,13 +20,13 @@ from rig.studio.sensor.realism import REALISM, made_real
 def simulate_to_folder(
     out: Path, simulated: SimulatedCapture, *, seed: int | None = None, features: bool = True
 ) -> Path:
-    """Writes a simulated capture as the folder ``out`` and its truth as the folder ``<out>.truth``. Returns the truth's
-    folder.
+    """Writes a simulated capture as the folder ``out`` and its ground truth as the folder ``<out>.truth``. Returns the
+    latter.
 
-    The truth holds head.ply (world frame, mm, colours as lit), face_mask.npy and colour_mask.npy (a boolean a vertex),
-    silhouettes/ (subject with hair and clothes, coverage of at least a half), head_silhouettes/ (bare head), coverage/
-    (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz (points of head,
-    hair and clothes that two or more cameras see), cameras.json (where the cameras were) and meta.json.
+    The truth holds head.ply (world frame, mm, colours as lit), face_mask.npy and colour_mask.npy (a boolean for each
+    vertex), silhouettes/ (subject with hair and clothes, where coverage is at least a half), head_silhouettes/ (bare
+    head), coverage/ (0 to 255), parts/ (0 background, 1 skin, 2 hair or beard, 3 clothes, cap or glasses), visible.npz
+    (points of head, hair and clothes that two or more cameras see), cameras.json (the true cameras) and meta.json.
     """
     capture = simulated.capture
     if not features:
@@ -37,7 +38,7 @@ def simulate_to_folder(
 
 
 def write_truth(folder: Path, simulated: SimulatedCapture, *, seed: int | None = None) -> None:
-    """Writes the truth of a simulated capture, without the capture, into ``folder``."""
+    """Writes the ground truth of a simulated capture, without the capture, into ``folder``."""
     scene = simulated.scene
     count = len(scene.head.vertices)
     face = np.ones(count, bool) if scene.face_region is None else np.asarray(scene.face_region)

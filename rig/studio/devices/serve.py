@@ -1,8 +1,9 @@
-"""The simulated studio as a set of real devices: motion-JPEG streams on loopback and a trigger box on a pty.
+"""Serves the simulated studio as a set of real devices: motion-JPEG streams on loopback and a trigger box on a
+pseudo-terminal.
 
-The opencv driver and the serial client run unchanged against it. What the cameras see is the caller's: an
-``ImageSource`` for the empty studio and one with the subject seated; this module adds lamps, cables, triggers and
-what can go wrong with them.
+The opencv driver and the serial client run against it unchanged. The caller provides what the cameras see: an
+``ImageSource`` for the empty studio and one with the subject seated. This module adds lamps, cables, triggers, and
+their faults.
 """
 
 import json
@@ -53,7 +54,8 @@ _JPEG = [
 
 @dataclass(frozen=True, slots=True)
 class DeviceFault:
-    """Holds a fault of ``KINDS``: its camera (None: the whole rig) and its amount (None: the usual one)."""
+    """Holds a fault of one of ``KINDS``: its camera (None: the whole rig) and its amount (None: the usual amount of its
+    kind)."""
 
     kind: str
     camera: str | None = None
@@ -61,13 +63,13 @@ class DeviceFault:
 
     @property
     def strength(self) -> float:
-        """Returns the amount of the fault, or the usual amount of its kind where none was set."""
+        """Returns the fault's amount, or the usual amount of its kind if none was set."""
         return self.amount if self.amount is not None else DEFAULT_AMOUNT.get(self.kind, 0.0)
 
 
 def device_fault_from_text(text: str) -> DeviceFault:
     """Reads a fault from ``kind[:camera][=amount]``. Raises InputError for text of another form or an unknown kind;
-    ``StudioDevices.inject`` checks the camera."""
+    whether the camera exists is checked by ``StudioDevices.inject``."""
     kind, camera, amount = fault_parts(text)
     if kind not in KINDS:
         raise InputError("fault", [compose("none-of", value=f"{kind!r}", known=KINDS)])
@@ -88,8 +90,8 @@ class StudioDevices:
     """Runs the cameras of the simulated studio as streams, and its trigger box, while a block runs. ``folder`` receives
     rig.toml and the link to the box's port.
 
-    ``takes`` is the number of pictures of the empty studio, each with noise of its own, that the live view shows in
-    turn; more clean plates than that would repeat themselves. ``close`` leaves no thread, port or link.
+    ``takes`` is the number of pictures of the empty studio, each with its own noise, that the live view shows in turn;
+    more clean plates than that would repeat themselves. ``close`` leaves no thread, port or link behind.
     """
 
     def __init__(
@@ -150,7 +152,7 @@ class StudioDevices:
             self._refresh()
 
     def inject(self, fault: DeviceFault) -> None:
-        """Adds a fault that holds from now on. Raises InputError for an unknown kind or camera."""
+        """Adds a fault that lasts until ``clear``. Raises InputError for an unknown kind or camera."""
         faults = []
         if fault.kind not in KINDS:
             strange = compose("none-of", value=f"{fault.kind!r}", known=KINDS)
@@ -309,7 +311,7 @@ class StudioDevices:
 def serve_scene(
     folder: Path, scene: Scene, *, fps: float = 4.0, host: str = "127.0.0.1", port: int = 0
 ) -> StudioDevices:
-    """Starts the devices of a drawn scene, its seat empty, and returns them. ``folder`` receives rig.toml and
+    """Starts the devices of a rendered scene, its seat empty, and returns them. ``folder`` receives rig.toml and
     cameras.json."""
     folder.mkdir(parents=True, exist_ok=True)
     write_rig(scene.rig, folder / "cameras.json")

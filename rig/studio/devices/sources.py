@@ -1,4 +1,4 @@
-"""Pictures of a studio scene one by one, for cameras that a program opens: ``ImageSource`` of a ``Scene``."""
+"""Takes pictures of a studio scene one by one, for simulated cameras: an ``ImageSource`` of a ``Scene``."""
 
 import itertools
 import threading
@@ -21,13 +21,15 @@ from rig.studio.sensor.sensor import drift, expose
 
 @runtime_checkable
 class ImageSource(Protocol):
-    """Returns what a camera sees at a moment (``time_s``: seconds since the studio began), sensor noise included."""
+    """Describes a function that takes the picture of a simulated camera, sensor noise included."""
 
-    def __call__(self, camera: str, time_s: float) -> ImageRgb: ...
+    def __call__(self, camera: str, time_s: float) -> ImageRgb:
+        """Returns what the named camera sees at ``time_s``, in seconds since the studio began."""
+        ...
 
 
 class SceneImages:
-    """Takes pictures of a still scene, with the subject seated or without. Every picture has noise of its own.
+    """Takes pictures of a still scene, with the subject seated or without. Every picture has its own noise.
     Thread-safe.
 
     With the subject seated, the light differs from that of the empty studio by the drift that the scene's preset has
@@ -43,6 +45,7 @@ class SceneImages:
         self._busy = threading.Lock()
 
     def __call__(self, camera: str, time_s: float) -> ImageRgb:
+        """Takes one picture with the named camera. The scene is still, so that ``time_s`` has no effect."""
         with self._busy:
             rng = np.random.default_rng((self._seed, next(self._takes)))
             light = self._light.get(camera)

@@ -1,11 +1,11 @@
-"""Cameras of the simulated studio as motion-JPEG streams on one HTTP port (loopback unless told otherwise).
+"""Serves the cameras of the simulated studio as motion-JPEG streams on one HTTP port (on loopback by default).
 
-A stream behaves like a network camera with a trigger input: a live view at ``fps``, which it holds back while the box
-is armed, and one frame at once when its input is raised, from where the live view goes on. What a camera sees is a
-``Film``: takes that differ in their noise, shown in turn, and others for releases, so that no released frame is one
-that the live view has shown before.
+A stream behaves like a network camera with a trigger input. It has a live view at ``fps``, which pauses while the box
+is armed. When its input is raised it sends one frame at once, and then continues the live view. What a camera sees is a
+``Film``: pictures that differ in their noise, shown in turn, and others for releases, so that no released frame was
+shown in the live view before.
 
-The loop of the server owns all state; other threads hand it work (``call_soon_threadsafe``).
+The server's event loop owns all state; other threads hand work to it (``call_soon_threadsafe``).
 """
 
 import asyncio
@@ -28,7 +28,7 @@ Control = Callable[[str, str, Mapping[str, str]], tuple[int, str]]
 
 @dataclass(frozen=True, slots=True)
 class Film:
-    """Holds JPEG files of one scene as a camera sees it: some for the live view, others for releases."""
+    """Holds JPEG files of one scene as a camera sees it: some for the live view, others for triggered frames."""
 
     live: tuple[bytes, ...]
     released: tuple[bytes, ...]
@@ -51,8 +51,8 @@ class _Camera:
 
 
 class StreamServer:
-    """Serves the address ``/<camera>.mjpeg`` of every camera while a block runs. ``close`` leaves
-    no thread and no port."""
+    """Serves the address ``/<camera>.mjpeg`` for every camera while a block runs. ``close`` leaves no thread and no
+    port behind."""
 
     def __init__(
         self, names: Sequence[str], control: Control, *, fps: float = 5.0, host: str = "127.0.0.1", port: int = 0
@@ -104,7 +104,7 @@ class StreamServer:
         self._do(lambda: setattr(self._cameras[name], "film", film))
 
     def arm(self, armed: bool) -> None:
-        """Holds all live views back, or lets them go on."""
+        """Pauses all live views, or lets them continue."""
 
         def hold() -> None:
             for camera in self._cameras.values():
@@ -114,7 +114,7 @@ class StreamServer:
 
     def release(self, at_s: Mapping[str, float]) -> None:
         """Raises the trigger inputs of the cameras in ``at_s``, each at its time (time.monotonic, s). The live views of
-        the other cameras go on."""
+        the other cameras continue."""
 
         def plan() -> None:
             for name, camera in self._cameras.items():
@@ -126,7 +126,7 @@ class StreamServer:
         self._do(plan)
 
     def freeze(self, name: str, frozen: bool = True) -> None:
-        """Makes a camera send its last picture over and over, or ends that."""
+        """Makes a camera repeat its last picture, or ends that."""
         self._do(lambda: setattr(self._cameras[name], "frozen", frozen))
 
     def hang(self, name: str, hung: bool = True) -> None:
@@ -138,7 +138,7 @@ class StreamServer:
         self._do(lambda: setattr(self._cameras[name], "drop_next", drop))
 
     def connect(self, views: Mapping[str, str]) -> None:
-        """Sets which camera's pictures each address shows, as the cables of a rig do."""
+        """Sets which camera's pictures each address shows, as exchanged cables of a rig would."""
         self._do(lambda: self._views.update(views))
 
     def _do(self, work: Callable[[], Any]) -> None:

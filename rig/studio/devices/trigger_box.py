@@ -1,7 +1,8 @@
-"""The simulated trigger box: the protocol of rig.acquisition.trigger spoken on a pseudo-terminal, for the real client.
+"""Simulates the trigger box: it speaks the protocol of rig.acquisition.trigger on a pseudo-terminal, to the real
+client.
 
-``BoxLogic`` is the state machine (no time, no files of its own); ``SimulatedTriggerBox`` puts it on a pty with a thread
-and tells the studio what the box's outputs do.
+``BoxLogic`` is the state machine, without clock or files. ``SimulatedTriggerBox`` runs it in a thread on a
+pseudo-terminal, and passes changes of the box's outputs on to the studio.
 """
 
 import os
@@ -31,7 +32,8 @@ LIGHTS = 4
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """Holds the outputs that one FIRE raises: for each channel how long (s) after ``time_s`` (time.monotonic)."""
+    """Holds the outputs that one FIRE request raises: for each channel the delay (s) after ``time_s``
+    (time.monotonic)."""
 
     time_s: float
     delays_s: dict[int, float]
@@ -56,8 +58,8 @@ class BoxLogic:
     _last_reply: str = ""
 
     def handle(self, sequence: int, body: str, now_s: float) -> str:
-        """Returns the reply to a request. A request that comes again under the same sequence number is answered without
-        acting again."""
+        """Returns the reply to a request. A request that is repeated under the same sequence number gets the same reply
+        and has no further effect."""
         if self._last == (sequence, body):
             return self._last_reply
         self.expire(now_s)
@@ -71,7 +73,7 @@ class BoxLogic:
         return reply
 
     def expire(self, now_s: float) -> None:
-        """Disarms the box if its window has passed."""
+        """Disarms the box if the time for which it was armed is over."""
         if self.armed_until_s is not None and now_s > self.armed_until_s:
             self._disarm()
 

@@ -1,1 +1,2 @@
-"""What stands before the cameras: subject, hair, clothes, lights, backdrop, and the shot of it with its truth."""
+"""Models what stands before the cameras (subject, hair, clothes, lights, backdrop), and takes a shot of it with ground
+truth."""

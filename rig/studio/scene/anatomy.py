@@ -1,4 +1,4 @@
-"""The few places on a head that hair, paint and clothes are laid out from."""
+"""Finds the few points of a head from which hair, paint and clothes are laid out."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ PAINTED = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Anatomy:
-    """Holds the few places on a head that hair, paint and clothes are laid out from (head frame, mm). ``unit`` is the
-    head's size relative to the one that the layouts were drawn on."""
+    """Holds the few points of a head from which hair, paint and clothes are laid out (head frame, mm). ``unit`` is the
+    head's size relative to the one for which the layouts were designed."""
 
     ears: Float[np.ndarray, " 3"]  # middle between the ears' openings
     half_breadth: float
@@ -27,7 +27,7 @@ class Anatomy:
 
 
 def anatomy(vertices: Float[np.ndarray, "v 3"], landmarks: Landmarks) -> Anatomy:
-    """Finds the anatomy of a head from its landmarks. Where they are unknown, it is taken from the extent of the mesh,
+    """Finds the anatomy of a head from its landmarks. If they are unknown, it is estimated from the extent of the mesh,
     as for a head of 225 mm from chin to crown."""
     if {"tragion_right", "tragion_left", "gnathion", "glabella"} <= set(landmarks):
         right, left = landmarks["tragion_right"], landmarks["tragion_left"]

@@ -1,4 +1,5 @@
-"""What stands behind the subject in each camera's image: a cloth with folds and panels, lit unevenly, out of focus."""
+"""Draws what stands behind the subject in each camera's image: a cloth with folds and panels, lit unevenly, out of
+focus."""
 
 import cv2
 import numpy as np
@@ -17,8 +18,8 @@ def backdrop(
     unevenness: float,
     colour: tuple[float, float, float] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Draws the backdrop of one camera's picture (linear radiance, float32). ``colour`` replaces the colour that
-    ``rng`` would draw."""
+    """Draws the backdrop of one camera's picture (linear radiance, float32). ``colour`` is linear RGB; None draws one
+    at random."""
     height, width = intrinsics.height, intrinsics.width
     base = np.array(COLOURS[rng.integers(len(COLOURS))] if colour is None else colour, np.float32)
     image = np.broadcast_to(base, (height, width, 3)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A full beard: the lower face again, thicker, curled, and with strands."""
+"""Makes a full beard: a copy of the lower face, thicker, curled, and with strands."""
 
 import numpy as np
 from jaxtyping import Float

@@ -1,6 +1,7 @@
-"""A colour chart held where the subject will sit: a clean plate that says what colours are.
+"""Photographs a colour chart where the subject will sit, as a clean plate from which true colours are found.
 
-A flat ColorChecker Classic (279 x 190 mm) in the place of the head, turned to one camera, in the studio's own light.
+It is a flat ColorChecker Classic (279 x 190 mm) at the position of the head, turned to one camera, in the studio's
+light.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Shoulders in a shirt, below a head whose mesh ends at the neck."""
+"""Makes shoulders in a shirt, for a head whose mesh ends at the neck."""
 
 import cv2
 import numpy as np

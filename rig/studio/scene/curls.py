@@ -1,4 +1,4 @@
-"""Curls: ridges that wind over a surface of hair, with dark valleys between them."""
+"""Makes curls: ridges that wind over a surface of hair, with dark valleys between them."""
 
 import numpy as np
 from jaxtyping import Float
@@ -16,15 +16,15 @@ def curled(
     amount: Float[np.ndarray, " v"],
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
-    """Returns the vertices of a surface of hair raised to curls (mm), and a shade for each. A ridge winds along where a
-    random field is near zero.
+    """Raises curls on a surface of hair. Returns the new vertices, and a shade for each, relative to the hair's tone. A
+    ridge winds along where a random field is near zero.
 
     Args:
-        vertices: Of the smooth surface (mm), a few to each curl.
-        normals: Unit, outward.
-        curl_mm: From curl to curl.
-        amount: 0 (none) to 1, per vertex.
-        rng: Draws the ridges.
+        vertices: of the smooth surface (mm), a few to each curl.
+        normals: unit, outward.
+        curl_mm: distance from curl to curl.
+        amount: 0 (none) to 1, for each vertex.
+        rng: draws the ridges.
     """
     swirl = waves(rng, vertices, 1.6 * curl_mm, 2.6 * curl_mm)
     ridge = np.exp(-((swirl / 0.5) ** 2))

@@ -1,12 +1,12 @@
-"""Grids of vertices, counted row by row: their triangles, and finer ones."""
+"""Makes grids of vertices that are numbered row by row: their triangles, and finer grids."""
 
 import numpy as np
 from jaxtyping import Float, Int
 
 
 def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarray, "f 3"]:
-    """Returns the triangles of a grid of vertices that are counted row by row. ``closed``: the last column is joined to
-    the first."""
+    """Returns the triangles of a grid of vertices numbered row by row. If ``closed``, the last column is joined to the
+    first."""
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - (not closed)), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = a + columns, b + columns
@@ -14,8 +14,8 @@ def grid_faces(rows: int, columns: int, *, closed: bool = True) -> Int[np.ndarra
 
 
 def finer_grid(field: Float[np.ndarray, "r c *_"], times: int) -> Float[np.ndarray, "_ _ *_"]:
-    """Returns a field on a grid ``times`` as fine, interpolated linearly in both directions. The grid is closed from
-    its last column to the first."""
+    """Interpolates a field linearly to a grid ``times`` as fine in both directions. The grid is closed: its first
+    column follows its last."""
     if times == 1:
         return field
     rows, columns = field.shape[:2]

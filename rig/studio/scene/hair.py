@@ -1,7 +1,7 @@
-"""Hair as geometry: a lumpy shell over the scalp, and strands that roughen its outline.
+"""Makes hair as geometry: a lumpy shell over the scalp, and strands that roughen its outline.
 
-The shell is a grid of directions from the middle of the skull; its radius is the head's own, however that is meshed,
-plus the hair's thickness, which sinks below the skin past the hairline.
+The shell is a grid of directions from the middle of the skull. Its radius is that of the head plus the thickness of the
+hair, which decreases to below the skin beyond the hairline.
 """
 
 from dataclasses import dataclass
@@ -30,8 +30,8 @@ HAIRLINE_OVER_EARS = np.array([(-200, -55), (-40, -52), (-10, -38), (22, -34), (
 
 @dataclass(frozen=True, slots=True)
 class HairStyle:
-    """Describes a hair style. ``fringe_mm`` brings the hairline down over the forehead; curls, hanging hair and bun are
-    0 for none."""
+    """Describes a hair style. ``fringe_mm`` is how far the hairline comes down over the forehead. Curls, hanging hair
+    and bun are 0 for none."""
 
     thickness_mm: float = 14.0
     over_ears: bool = False
@@ -50,8 +50,8 @@ class HairStyle:
 class Hair:
     """Holds one surface of hair, the shell, and the strands on it (head frame, mm).
 
-    ``shade``: tone of each vertex relative to the style's; ``roots``: the vertex of the shell that each vertex of a
-    strand is lit like; ``one_sided``: nobody sees the inside of the shell.
+    ``shade`` is the tone of each vertex relative to the style's; ``roots`` is, for each vertex of a strand, the vertex
+    of the shell whose light it gets; ``one_sided`` says that the inside of the shell is never seen.
     """
 
     shell: Float[np.ndarray, "v 3"]
@@ -100,8 +100,8 @@ def grow(vertices: Float[np.ndarray, "v 3"], body: Anatomy, style: HairStyle, rn
 
 
 def outer_radius(points: Float[np.ndarray, "v 3"], *, open_ears: bool) -> Float[np.ndarray, "r c"]:
-    """Returns the outermost radius (mm) of points about the origin in each direction of the grid, smoothed. With
-    ``open_ears`` what is as narrow as an ear is left out."""
+    """Returns the largest distance (mm) of points from the origin in each direction of the grid, smoothed. With
+    ``open_ears``, parts as narrow as an ear are ignored."""
     length = np.linalg.norm(points, axis=1)
     elevation = np.degrees(np.arcsin(points[:, 1] / length))
     row = (90.0 - elevation) / (90.0 - LOWEST_DEG) * (ROWS - 1)
@@ -141,7 +141,7 @@ def grow_strands(
     style: HairStyle,
     rng: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "s 3"], Int[np.ndarray, "g 3"], Float[np.ndarray, "s 3"], Int[np.ndarray, " s"]]:
-    """Grows strands of hair as ribbons that leave the shell mostly in the directions ``along`` (some 3 mm long).
+    """Grows strands of hair: ribbons that leave the shell mostly in the directions ``along`` (about 3 mm long).
     ``weight`` sets how densely they grow at each vertex. Returns their vertices, triangles, texture coordinates and
     roots, as ``Hair`` holds them."""
     count = style.strands

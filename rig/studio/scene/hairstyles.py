@@ -1,4 +1,5 @@
-"""Looks by name, so that a capture can be asked for with this hair or that: long, curly, a fringe, a beard, a cap."""
+"""Names hair styles, so that a simulated subject can be requested with long or curly hair, a fringe, a beard, or a
+cap."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -48,7 +49,7 @@ without panes: the pipeline asks studios for that."""
 
 
 def restyled(look: Look, names: Sequence[str]) -> Look:
-    """Returns the look with the named changes of ``HAIRSTYLES`` made one after the other. Raises InputError for an
+    """Returns the look with the named changes of ``HAIRSTYLES`` applied one after the other. Raises InputError for an
     unknown name."""
     if unknown := [name for name in names if name not in HAIRSTYLES]:
         raise InputError("hair", [compose("none-of", value=name, known=[*HAIRSTYLES]) for name in unknown])

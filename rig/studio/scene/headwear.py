@@ -1,4 +1,5 @@
-"""What is worn on the head: a cap with a visor, and glasses. Glasses are rims without panes: a studio asks for that."""
+"""Makes what is worn on the head: a cap with a visor, and glasses. Glasses have rims and no panes, as studios
+request."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,7 +24,7 @@ SIDES = 10  # of a tube
 
 
 def cap(head: Float[np.ndarray, "n 3"], hair: Float[np.ndarray, "m 3"] | None, body: Anatomy) -> Surface:
-    """Makes a cap that fits over a head and its hair, if any (head frame, mm)."""
+    """Makes a cap that fits over a head and its hair, if it has any (head frame, mm)."""
     centre = body.ears + np.array([0.0, 28.0, -6.0]) * body.unit
     radius = outer_radius(head - centre, open_ears=True)
     if hair is not None:

@@ -1,4 +1,4 @@
-"""Where cameras stand: the default rig, the four arrangements of section 5.3, and rows, circles and mountings of other
+"""Places cameras: the default rig, the four arrangements of section 5.3, and rows, circles and mountings of other
 studios.
 
 Azimuth is counted from the front towards the subject's left, elevation upwards. The world's origin is in the middle of
@@ -40,8 +40,8 @@ ARRANGEMENTS_DEG = {
 
 
 def default_layout() -> Rig:
-    """Returns the default rig: eleven cameras in front of and beside the head, 1.2 m away. cam00 looks at the face from
-    the front."""
+    """Returns the default rig: eleven cameras in front of and beside the head, 1.2 m away. cam00 sees the face from the
+    front."""
     return rig_from_directions(DEFAULT_DIRECTIONS_DEG)
 
 
@@ -52,7 +52,7 @@ def arrangement(name: str) -> Rig:
 
 
 def row_directions(count: int, spacing_mm: float, distance_mm: float) -> tuple[tuple[float, float], ...]:
-    """Computes the directions (azimuth, elevation in degrees) of a level row of cameras before the face, from the
+    """Computes the directions (azimuth, elevation in degrees) of a level row of cameras in front of the face, from the
     subject's right to its left."""
     offsets = spacing_mm * (np.arange(count) - (count - 1) / 2)
     return tuple((float(np.degrees(np.arctan2(offset, distance_mm))), 0.0) for offset in offsets)
@@ -60,7 +60,7 @@ def row_directions(count: int, spacing_mm: float, distance_mm: float) -> tuple[t
 
 def circle_directions(count: int, elevations_deg: Sequence[float] = (0.0,)) -> tuple[tuple[float, float], ...]:
     """Computes the directions (azimuth, elevation in degrees) of cameras on a full circle, cam00 at the front.
-    Neighbouring cameras take the elevations in turn."""
+    Successive cameras take the elevations in turn."""
     azimuths = (np.arange(count) * 360.0 / count + 180.0) % 360.0 - 180.0
     return tuple((float(azimuth), elevations_deg[i % len(elevations_deg)]) for i, azimuth in enumerate(azimuths))
 
@@ -72,14 +72,15 @@ def rig_from_directions(
     distance_mm: float = DISTANCE_MM,
     rolls_deg: Sequence[float] = (0.0,),
 ) -> Rig:
-    """Returns a rig with a camera in each direction (azimuth and elevation in degrees). Lenses and mountings differ a
-    little from camera to camera.
+    """Returns a rig with a camera in each direction (azimuth and elevation in degrees). Lenses and mountings differ
+    slightly from camera to camera.
 
     Args:
         directions_deg: one for each camera.
         seed: of lenses and mountings.
         distance_mm: from the middle of the head; the focal length keeps the head's size in the picture.
-        rolls_deg: how far each camera is turned about its axis, clockwise seen from behind it; they take turns.
+        rolls_deg: rotation of each camera about its optical axis, clockwise seen from behind it; cameras take them in
+            turn.
     """
     rng = np.random.default_rng(seed)
     return Rig(

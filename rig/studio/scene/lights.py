@@ -1,7 +1,7 @@
-"""Soft light on the subject, with the shadows that it throws on itself.
+"""Lights the subject softly, with the shadows that it casts on itself.
 
-The lamps are soft boxes over a dome; the dome is sampled in ``DIRECTIONS`` directions, each with a depth map that says
-which vertices it reaches. Their number makes the shadows soft; irradiance is per vertex.
+The lamps are soft boxes on a dome. The dome is sampled in ``DIRECTIONS`` directions, each with a depth map that says
+which vertices its light reaches; their number makes the shadows soft. Irradiance is computed for each vertex.
 """
 
 from collections.abc import Sequence
@@ -23,8 +23,8 @@ BIAS_MM = 3.0  # a surface does not shade itself for the coarseness of the map, 
 
 @dataclass(frozen=True, slots=True)
 class Lamp:
-    """Holds a soft box. ``towards``: direction from the subject to the lamp (world frame, y up, z to the front);
-    ``colour``: linear RGB."""
+    """Holds a soft box. ``towards`` is the direction from the subject to the lamp (world frame, y up, z to the front),
+    ``colour`` is linear RGB, and ``sharpness`` is larger for a smaller box."""
 
     towards: tuple[float, float, float]
     colour: tuple[float, float, float]
@@ -40,12 +40,13 @@ AMBIENT = (0.34, 0.34, 0.35)
 
 
 def lamp_directions(lamps: Sequence[Lamp] = LAMPS) -> Float[np.ndarray, "l 3"]:
+    """Returns the unit directions from the subject to the lamps, world frame."""
     towards = np.array([lamp.towards for lamp in lamps])
     return towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
 def dome(lamps: Sequence[Lamp] = LAMPS) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d 3"]]:
-    """Returns directions spread evenly over the sphere above -45 degrees, and the linear RGB of the light that comes
+    """Returns directions spread evenly over the part of the sphere above -45 degrees, and the linear RGB of the light
     from each."""
     index = np.arange(DIRECTIONS) + 0.5
     y = 1.0 - index / DIRECTIONS * 1.7
@@ -66,7 +67,7 @@ def irradiance(
     lamps: Sequence[Lamp] = LAMPS,
 ) -> list[Float[np.ndarray, "_ 3"]]:
     """Computes the linear RGB of the light at the vertices of each receiver (vertices and unit normals, world frame),
-    shaded by the triangles of ``casters``."""
+    shadowed by the triangles of ``casters``."""
     directions, sent = dome(lamps)
     vertices, faces = casters
     centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2

@@ -1,4 +1,4 @@
-"""Hair beyond the scalp's shell: a sheet that hangs down around the neck, and a knot on the crown."""
+"""Makes hair beyond the shell over the scalp: a sheet that hangs down around the neck, and a bun on the crown."""
 
 import cv2
 import numpy as np
@@ -26,11 +26,11 @@ def hang(
     """Makes the sheet of hair that hangs down from the shell to ``style.hanging_mm`` below the openings of the ears.
 
     Args:
-        shell: The hair over the scalp.
-        below: Vertices that the sheet must stay outside of: head, neck and shirt (head frame, mm).
-        body: Where the ears are.
-        style: Its thickness and length.
-        rng: Draws locks and ends.
+        shell: the hair over the scalp.
+        below: vertices that the sheet must stay outside of: head, neck and shirt (head frame, mm).
+        body: has the position of the ears.
+        style: thickness and length.
+        rng: draws locks and ends.
     """
     axis = body.ears - np.array([0.0, 0.0, 12.0]) * body.unit
     angle = np.radians(np.linspace(-FRONT_EDGE_DEG, FRONT_EDGE_DEG, COLUMNS))
@@ -96,7 +96,7 @@ def _envelope(points: Float[np.ndarray, "n 3"], unit: float, length_mm: float) -
 
 
 def knot(shell: Hair, body: Anatomy, style: HairStyle, rng: np.random.Generator) -> Hair:
-    """Makes a bun of twisted hair on the crown, ``style.bun_mm`` in radius."""
+    """Makes a bun of twisted hair on the crown, with the radius ``style.bun_mm``."""
     elevation = np.radians(BUN_ELEVATION_DEG)
     outward = np.array([0.0, np.sin(elevation), -np.cos(elevation)])
     arms = shell.shell - body.ears

@@ -1,4 +1,4 @@
-"""Light that spreads in skin: diffuse shading, blurred over millimetres, red farthest (Jensen et al. 2001)."""
+"""Spreads light within skin: diffuse shading, blurred over millimetres, red the most (Jensen et al. 2001)."""
 
 import numpy as np
 import scipy.sparse as sparse

@@ -1,7 +1,7 @@
-"""A capture of the simulated studio, with its truth.
+"""Simulates a capture of the studio, with ground truth.
 
-``build_scene`` draws and lights everything once; ``shoot`` takes the pictures, with the faults asked for. A device that
-serves pictures one by one keeps the scene and calls ``view_light`` and ``sensor.expose``.
+``build_scene`` renders and lights everything once; ``shoot`` takes the pictures, with the requested faults. A device
+that takes pictures one by one keeps the scene and calls ``view_light`` and ``sensor.expose``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ THREADS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Holds what one camera looks at. ``subject``: linear light times coverage, and coverage; ``backdrop``: the light
+    """Holds what one camera sees. ``subject`` is linear light times coverage, and coverage; ``backdrop`` the light
     behind the subject."""
 
     subject: Float[np.ndarray, "h w 4"]
@@ -47,13 +47,14 @@ class View:
 
     @property
     def mask(self) -> Bool[np.ndarray, "h w"]:
+        """Returns the true silhouette: where the subject covers at least half of a pixel."""
         return self.subject[:, :, 3] >= 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Holds a lit studio with a subject in it. ``rig``: the cameras as calibrated; ``true_rig``:
-    where the cameras are."""
+    """Holds a lit studio with a subject in it. ``rig`` are the cameras as calibrated, ``true_rig`` the cameras as they
+    stand."""
 
     rig: Rig
     true_rig: Rig
@@ -73,7 +74,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedCapture:
-    """Holds a simulated capture, the rig as calibrated, and the scene with the truth."""
+    """Holds a simulated capture, the rig as calibrated, and the scene with the ground truth."""
 
     capture: Capture
     rig: Rig
@@ -97,7 +98,7 @@ def simulate(
     world_from_head: Similarity | None = None,
     faults: Sequence[Fault] = (),
 ) -> SimulatedCapture:
-    """Takes one capture of ``subject`` with ``rig``. Look and pose are drawn at random where they are None."""
+    """Takes one capture of ``subject`` with ``rig``. Look and pose are drawn at random if they are None."""
     scene_rng, shot_rng = rng.spawn(2)
     faults = tuple(_settled(fault, rig, shot_rng) for fault in faults)
     scene = build_scene(
@@ -118,8 +119,8 @@ def build_scene(
     faults: Sequence[Fault] = (),
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Scene:
-    """Dresses, lights and renders the subject, and draws the backdrops. The same ``rng`` gives the same skin, hair and
-    backdrops for another pose or other ``lamps``."""
+    """Dresses, lights and renders the subject, and draws the backdrops. The same state of ``rng`` gives the same skin,
+    hair and backdrops also for another pose or other ``lamps``."""
     look_rng, pose_rng, dress_rng, set_rng = rng.spawn(4)
     look = _worn(look or random_look(look_rng), preset, faults)
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
@@ -164,8 +165,8 @@ def view_light(view: View, *, subject: bool = True, gain: float = 1.0) -> Float[
 
 
 def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) -> Capture:
-    """Takes the clean plates of a scene, then the shot. ``faults`` must name their cameras (``simulate`` draws a camera
-    for those that do not)."""
+    """Takes the clean plates of a scene, then the shot. Every one of ``faults`` that needs a camera must name it;
+    ``simulate`` chooses one for those that do not."""
     names = scene.rig.names
     click_rng, *rngs = rng.spawn(1 + len(names))
 

@@ -1,4 +1,4 @@
-"""Skin colour per vertex: an even tone, blotches, and the features that are laid out from landmarks."""
+"""Computes skin colour at each vertex: an even tone, blotches, and features that are placed by landmarks."""
 
 from collections.abc import Mapping
 
@@ -21,8 +21,8 @@ def skin_paint(
     *,
     closed: Mapping[str, float] | None = None,
 ) -> Float[np.ndarray, "v 4"]:
-    """Computes the linear albedo of the skin at each vertex (head frame, mm) and, fourth, the strength of its grain.
-    ``closed``: how far the lids of each side are closed, 0 to 1."""
+    """Computes the linear albedo of the skin at each vertex (head frame, mm) and, as a fourth number, the strength of
+    its fine structure. ``closed`` says how far the lids of each side are closed, 0 to 1."""
     paint = np.ones((len(vertices), 4))
     paint[:, :3] = np.array(tone) * (1 + _blotches(vertices, rng) * (0.5, 1.0, 1.0))
     if body.landmarks:
@@ -37,7 +37,7 @@ def skin_paint(
 
 def oily_zones(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
     """Returns how oily the skin is at each vertex, 0 to 1: most on forehead, nose, cheeks and chin; the same everywhere
-    where landmarks are unknown."""
+    if landmarks are unknown."""
     marks = body.landmarks
     if not marks:
         return np.full(len(vertices), DRY)

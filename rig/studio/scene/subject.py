@@ -1,4 +1,4 @@
-"""Who sits in the studio: a head that the caller brings, and the looks drawn for it."""
+"""Describes who sits in the studio: a head that the caller provides, and how it looks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -55,7 +55,8 @@ NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """Holds a head (head frame, mm). Without landmarks its skin has neither brows nor lips."""
+    """Holds a head (head frame, mm). Without landmarks, its skin has neither brows nor lips. ``closed`` says how far
+    the lids of each side are closed, 0 to 1."""
 
     mesh: Mesh
     landmarks: Landmarks = field(default_factory=dict)
@@ -84,7 +85,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """Holds a part of the subject before it is placed and lit (head frame, mm). ``shows``: head, hair or clothes."""
+    """Holds a part of the subject before it is placed and lit (head frame, mm). ``shows`` is head, hair or clothes."""
 
     shows: str
     vertices: Float[np.ndarray, "v 3"]
@@ -98,11 +99,11 @@ class Piece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dressed:
-    """Holds the lit subject in the world frame (mm): the bare head and what it wears, hair first because that hides
-    most of the rest.
+    """Holds the lit subject in the world frame (mm): the bare head and what it wears, hair first, since that hides most
+    of the rest.
 
-    ``solid``: vertices and triangles of everything but strands of hair, to compute what hides what; ``surfaces``: the
-    same by name: head, hair, clothes.
+    ``solid`` are vertices and triangles of everything but strands of hair, which decide what hides what. ``surfaces``
+    are the same by name: head, hair, clothes.
     """
 
     head: Part
@@ -132,7 +133,8 @@ def random_look(rng: np.random.Generator) -> Look:
 def random_pose(
     centre_world: Float[np.ndarray, " 3"], spread_deg: float, spread_mm: float, rng: np.random.Generator
 ) -> Similarity:
-    """Draws the pose (world_from_head) of a subject who sits where the cameras look, a little turned and displaced."""
+    """Draws the pose (world_from_head) of a subject at the point that the cameras see, slightly turned and
+    displaced."""
     rotation = rotation_from_vector(np.radians(rng.normal(0, spread_deg, 3)))
     return Similarity(1.0, rotation, centre_world + rng.normal(0, spread_mm, 3))
 

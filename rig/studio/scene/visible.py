@@ -1,7 +1,7 @@
-"""What the cameras see of a subject, as points on its true surface: head, hair and clothes.
+"""Finds what the cameras see of a subject, as points on its true surface: head, hair and clothes.
 
-A reconstruction of the whole visible surface is scored against these. Strands of hair are left out: they are thinner
-than a pixel, and the surface that they stand on is what a mesh can have.
+A reconstruction of the whole visible surface is compared with these. Strands of hair are left out: they are thinner
+than a pixel, and a mesh can only have the surface that they grow from.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ class VisiblePoints:
 def visible_points(
     rig: Rig, surfaces: Mapping[str, Mesh], *, renderer: Renderer, rng: np.random.Generator
 ) -> VisiblePoints:
-    """Draws points evenly over the surfaces (by part, world frame, mm) and returns those that at least ``VIEWS_LEAST``
+    """Draws points evenly over the surfaces (by part, world frame, mm), and returns those that at least ``VIEWS_LEAST``
     cameras see."""
     drawn = [sample_surface(mesh, AREA_MM2, rng) for mesh in surfaces.values()]
     points, normals = (np.concatenate(arrays) for arrays in zip(*drawn, strict=True))
@@ -66,7 +66,7 @@ def part_masks(
     """Returns what every pixel shows, by camera, in the codes of bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the
     ``masks``.
 
-    Pixels within a mask that no surface covers show strands of hair.
+    Pixels inside a mask that no surface covers show strands of hair.
     """
     depth = {name: renderer.depth(rig, mesh.vertices, mesh.faces) for name, mesh in surfaces.items()}
     codes = np.array([1 + PARTS.index(name) for name in surfaces], np.uint8)
@@ -82,7 +82,7 @@ def part_masks(
 def sample_surface(
     mesh: Mesh, area_mm2: float, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Draws one point for each ``area_mm2`` of the surface, at random. Returns the points and the unit normals of their
+    """Draws points on a surface at random, one for each ``area_mm2``. Returns the points and the unit normals of their
     triangles."""
     normals = face_normals(mesh.vertices, mesh.faces)
     double = np.linalg.norm(normals, axis=1)
@@ -102,7 +102,7 @@ def sees(
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
 ) -> np.ndarray:
-    """Returns which points of a surface a camera sees. ``depth`` is the surface's depth map in the camera (z, mm; inf
+    """Tells which points of a surface a camera sees. ``depth`` is the surface's depth map in the camera (z, mm; inf
     where there is nothing).
 
     The map is read at the centre of the nearest pixel and compared with the point's tangent plane there.

@@ -1,1 +1,1 @@
-"""What a camera makes of the scene: lens and sensor noise, planted faults, presets."""
+"""Turns the light of a scene into pictures: lens and sensor noise, planted faults, presets."""

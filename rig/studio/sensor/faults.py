@@ -1,4 +1,4 @@
-"""What can go wrong in a shot, on demand."""
+"""Describes faults that can be planted in a simulated shot."""
 
 from dataclasses import dataclass
 
@@ -23,8 +23,8 @@ DEFAULT_AMOUNT = {"dark": 0.02, "lights-off": 0.02, "bumped": 0.6, "exposure": 0
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Holds a fault of ``KINDS``. ``camera`` None: the whole rig or, where only one camera can have the fault, one that
-    the studio draws."""
+    """Holds a fault of one of ``KINDS``. If ``camera`` is None the fault is of the whole rig or, for a kind that only
+    one camera can have, of one that is drawn at random."""
 
     kind: str
     camera: str | None = None
@@ -36,11 +36,12 @@ class Fault:
 
     @property
     def strength(self) -> float:
+        """Returns the fault's amount, or the usual amount of its kind if none was set."""
         return DEFAULT_AMOUNT.get(self.kind, 1.0) if self.amount is None else self.amount
 
 
 def fault_from_text(text: str) -> Fault:
-    """Reads a fault from ``kind[:camera][=amount]`` as on the command line: ``exposure=0.2``, ``dark:cam03``. Raises
+    """Reads a fault from ``kind[:camera][=amount]``, as on the command line: ``exposure=0.2``, ``dark:cam03``. Raises
     InputError."""
     return Fault(*fault_parts(text))
 

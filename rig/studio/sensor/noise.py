@@ -1,4 +1,4 @@
-"""Smooth random fields."""
+"""Draws smooth random fields."""
 
 import cv2
 import numpy as np
@@ -25,8 +25,8 @@ def smooth(
 def around(
     rng: np.random.Generator, rows: int, columns: int, cells_high: int, cells_wide: int
 ) -> Float[np.ndarray, "h w"]:
-    """Draws a smooth random field (float64) like ``smooth``, but of one channel and closed from its last column to the
-    first."""
+    """Draws a smooth random field (float64) like ``smooth``, but of one channel and periodic: its first column follows
+    its last."""
     grid = rng.standard_normal((cells_high + 2, cells_wide)).astype(np.float32)
     grid = np.concatenate([grid[:, -3:], grid, grid[:, :3]], axis=1)
     step = columns / cells_wide
@@ -39,7 +39,7 @@ def waves(
     rng: np.random.Generator, points: Float[np.ndarray, "n 3"], shortest_mm: float, longest_mm: float
 ) -> Float[np.ndarray, " n"]:
     """Draws a random field in space with standard deviation 1, and returns its values at ``points`` (mm). It is a sum
-    of waves of random direction and of lengths between the two."""
+    of waves of random directions, with lengths from ``shortest_mm`` to ``longest_mm``."""
     count = 32
     directions = rng.normal(0, 1, (count, 3))
     lengths = rng.uniform(shortest_mm, longest_mm, (count, 1))

@@ -1,12 +1,12 @@
-"""How imperfect the simulated studio is. ``PRESET`` is what every benchmark uses."""
+"""Sets how imperfect the simulated studio is. ``PRESET`` is what every benchmark uses."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Holds how imperfect the simulated studio is. Shares are of full scale or of the light; lengths in the picture are
-    pixels."""
+    """Holds how imperfect the simulated studio is. Numbers without a unit in their name are shares of full scale or of
+    the light; lengths in the picture are in pixels."""
 
     noise: float = (
         0.015  # sensor noise at mid grey, standard deviation; grows with the light's square root (shot noise)

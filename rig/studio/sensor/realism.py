@@ -1,5 +1,5 @@
-"""What real photographs of skin do that the studio's plain ones do not, each by a name: smooth and oily skin, light
-that spreads in it, a colour filter before the sensor, JPEG."""
+"""Adds, by name, what real photographs of skin have and the plain studio's lack: smooth and oily skin, light that
+spreads in it, a colour filter before the sensor, JPEG."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -38,5 +38,5 @@ def made_real(preset: Preset, names: Sequence[str]) -> Preset:
 
 
 def realism_names(text: str | None) -> tuple[str, ...]:
-    """Returns the names in ``NAME[,NAME]``: all of ``REALISM`` for ``all``, none for None."""
+    """Reads the names in ``NAME[,NAME]``; ``all`` stands for all of ``REALISM``, None for none."""
     return tuple(REALISM) if text == "all" else tuple(text.split(",")) if text else ()

@@ -1,4 +1,4 @@
-"""From linear light to an 8-bit photograph: lens blur, vignetting, gains, shot noise, the sRGB curve."""
+"""Turns linear light into an 8-bit photograph: lens blur, vignetting, gains, shot noise, the sRGB curve."""
 
 from dataclasses import dataclass
 
@@ -46,8 +46,8 @@ def focus(linear: Float[np.ndarray, "h w 3"], sensor: Sensor) -> Float[np.ndarra
 
 
 def rolled(subject: Float[np.ndarray, "h w 4"], shift_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "h w 4"]:
-    """Returns the subject as a rolling shutter shows it while it moves by ``shift_px`` from the readout of the first
-    row to that of the last. The middle row shows it where it is."""
+    """Returns the subject as a rolling shutter shows it while it moves by ``shift_px`` between the readouts of the
+    first and the last row. The middle row shows it at its position."""
     height, width = subject.shape[:2]
     across, down = shift_px / (height - 1)
     source = np.array([[1.0, -across, shift_px[0] / 2], [0.0, 1.0 - down, shift_px[1] / 2]])
@@ -71,8 +71,8 @@ def expose(light: Float[np.ndarray, "h w 3"], sensor: Sensor, rng: np.random.Gen
 
 
 def through_mosaic(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Returns the light (float32) as a Bayer sensor records it, with red at the first pixel: one channel a pixel, the
-    others interpolated along edges by OpenCV."""
+    """Returns the light (float32) as a Bayer sensor records it, with red at the first pixel: one channel for each
+    pixel, the others interpolated along edges by OpenCV."""
     codes = np.rint(65535.0 * np.clip(light, 0.0, 1.0)).astype(np.uint16)
     bayer = codes[:, :, 1].copy()
     bayer[::2, ::2], bayer[1::2, 1::2] = codes[::2, ::2, 0], codes[1::2, 1::2, 2]
@@ -90,8 +90,8 @@ def compressed(picture: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.nd
 
 
 def drift(shape: tuple[int, int], amount: float, rng: np.random.Generator) -> Float[np.ndarray, "h w 1"]:
-    """Draws the gain of the light between clean plate and shot, for a picture of this shape: a common factor and a
-    slope over the picture, both of standard deviation about ``amount``."""
+    """Draws how the light changes between clean plate and shot, as a gain for each pixel of a picture of this shape: a
+    common factor and a slope over the picture, both with a standard deviation of about ``amount``."""
     level, across, down = amount * rng.standard_normal(3)
     y, x = np.ogrid[-1.0 : 1.0 : shape[0] * 1j, -1.0 : 1.0 : shape[1] * 1j]
     return (1.0 + level + 0.5 * (across * x + down * y)).astype(np.float32)[:, :, None]

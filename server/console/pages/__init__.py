@@ -1,1 +1,1 @@
-"""One module and one Vue component a page."""
+"""The pages: for each a module here and a Vue component of the same name."""

@@ -1,4 +1,5 @@
-"""Batches: many captures as one thing, how far it is, what failed; the ways to its jobs, table and sheet."""
+"""The page Batches: many captures as one thing, how much of it is done, what failed, and links to its jobs, table and
+sheet."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -12,7 +13,7 @@ from server.batch.table_files import has_parquet
 from server.console.page import Action, Chosen, Page, shared, show
 from server.console.pages.jobs import listed_jobs
 from server.services.batches import BatchRequest, Selection
-from server.services.jobs import STATUSES
+from server.services.job_rows import STATUSES
 from server.services.records import Batch
 from server.services.service import Service
 from server.services.work import ReconstructionRequest
@@ -25,7 +26,7 @@ ASKED = ("find", "state", "after")
 
 
 class BatchLine(TypedDict):
-    """Holds a batch as the page shows it."""
+    """Holds a batch as an entry of the page's list. The fields are those of ``server.services.records.Batch``."""
 
     id: str
     label: str
@@ -43,7 +44,7 @@ class BatchLine(TypedDict):
 
 
 class FailedJob(TypedDict):
-    """Holds a job that failed, with the label of its capture and why: every fault, or the one reason."""
+    """Holds a failed job with the label of its capture. ``why`` lists every fault, or the one reason."""
 
     id: str
     capture: str
@@ -51,13 +52,16 @@ class FailedJob(TypedDict):
 
 
 class BatchesState(TypedDict):
+    """Holds one page of the list of batches. ``total`` counts those on all pages."""
+
     batches: list[BatchLine]
     next: str | None
     total: int
 
 
 class BatchesShown(BatchesState):
-    """Holds what the page shows. ``batch``: the batch that is looked at, which may lie on another page."""
+    """Holds what the page shows. ``batch``: the selected batch, which may be on another page of the list; ``failed``:
+    its newest failed jobs; ``parquet``: whether Parquet tables can be made."""
 
     batch: BatchLine | None
     failed: list[FailedJob]
@@ -65,13 +69,19 @@ class BatchesShown(BatchesState):
 
 
 class BatchForm(TypedDict):
+    """Holds the form of a new batch: what the captures' labels begin with, the batch's label, and the level of detail
+    (empty: the default)."""
+
     prefix: str
     label: str
     detail: str
 
 
 class BatchesPage(Page, component="batches.js"):
+    """Shows the list of batches, and the selected one with its progress and failed jobs."""
+
     def look(self) -> BatchesShown:
+        """Returns the state of the page: a page of the list, and the selected batch with its failed jobs."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: BatchesState = shared.get(
             ("batches", *requested.values()), 0.5, lambda: batches_state(self.service, requested)
@@ -87,19 +97,20 @@ class BatchesPage(Page, component="batches.js"):
 
 
 def batches_state(service: Service, requested: Mapping[str, str | None]) -> BatchesState:
-    """Returns one page of batches, newest first."""
+    """Returns one page of the list of batches, newest first."""
     state = cast(BatchState, requested["state"]) if requested["state"] in get_args(BatchState) else None
     page = service.batches.page(requested["find"] or "", state, SHOWN, requested["after"])
     return {"batches": [batch_line(batch) for batch in page.items], "next": page.next, "total": page.total}
 
 
 def batch_line(batch: Batch) -> BatchLine:
+    """Converts a batch to an entry of the page's list."""
     line = asdict(batch) | {"notice": None if batch.notice is None else batch.notice.document()}
     return cast(BatchLine, line)
 
 
 def failed_jobs(service: Service, batch: str) -> list[FailedJob]:
-    """Returns the newest failed jobs of a batch."""
+    """Returns the newest ``FAILED_SHOWN`` failed jobs of a batch."""
 
     def make() -> list[FailedJob]:
         found = service.jobs.page(JobQuery("", STATUSES["failed"], batch=batch), FAILED_SHOWN).items
@@ -114,6 +125,7 @@ def failed_jobs(service: Service, batch: str) -> list[FailedJob]:
 
 
 def begin(page: Page, event: BatchForm) -> Message:
+    """Begins the batch of a form and selects it. Raises what ``Batches.submit`` raises."""
     settings = {"detail": event["detail"]} if event["detail"] else {}
     wanted = BatchRequest(Selection(prefix=event["prefix"]), ReconstructionRequest(None, settings), event["label"])
     batch = page.service.batches.submit(wanted, key=page.caller.key)
@@ -123,7 +135,8 @@ def begin(page: Page, event: BatchForm) -> Message:
 
 
 def changes(change: Callable[[Service, str], object]) -> Callable[[Page, Chosen], None]:
-    """Returns the function of an action that changes a batch."""
+    """Makes the function of an action that changes a batch and refreshes the lists. ``change`` gets the service and the
+    batch's id."""
 
     def act(page: Page, event: Chosen) -> None:
         change(page.service, event["id"])
@@ -144,4 +157,5 @@ BatchesPage.actions = {
 
 @ui.page("/batches")
 async def batches_page(batch: str = "", find: str = "", state: str = "") -> RedirectResponse | None:
+    """Serves the page Batches. ``batch`` selects a batch; ``find`` and ``state`` restrict the list."""
     return await show("batches", BatchesPage, batch=batch, find=find, state=state)

@@ -1,4 +1,4 @@
-"""Calibration: board shots with live coverage, the report, switching, history."""
+"""The page Calibration: shots of the board with live coverage, reports, the calibration in use, and earlier ones."""
 
 import threading
 from collections.abc import Mapping
@@ -25,7 +25,8 @@ NO_BOARD = compose("studio-without-board")
 
 
 class Shots:
-    """Collects shots of the board for a calibration. There is one collection in a service, which all pages show."""
+    """Collects shots of the board for a calibration. There is one collection in a service process, which all pages
+    show; a restart empties it. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -33,22 +34,25 @@ class Shots:
         self.taken: list[tuple[str, Corners]] = []
 
     def add(self, board: Mapping[str, object], capture: str, found: Corners) -> None:
+        """Adds a shot: the id of its capture, and the corners found in each camera's picture."""
         with self._lock:
             self.board, self.taken = board, [*self.taken, (capture, found)]
 
     def check(self, board: Mapping[str, object]) -> None:
-        """Raises Conflict where the shots collected so far show another board."""
+        """Raises Conflict if the shots collected so far show a different board."""
         with self._lock:
             if self.taken and board != self.board:
                 detail = compose("shots-of-other-board", count=len(self.taken))
                 raise Conflict("other-board", detail)
 
     def drop_last(self) -> None:
+        """Removes the last shot from the collection; its capture stays."""
         with self._lock:
             self.taken = self.taken[:-1]
             self.board = self.board if self.taken else {}
 
     def clear(self) -> None:
+        """Empties the collection; the captures stay."""
         with self._lock:
             self.board, self.taken = {}, []
 
@@ -65,6 +69,9 @@ class RigLine(TypedDict):
 
 
 class CalibrationState(TypedDict):
+    """Holds what the page shows: calibrations, the rig, and the coverage of the board's shots with advice for the next
+    one."""
+
     calibrations: list[Mapping[str, object]]
     rig: RigLine
     board: Mapping[str, object]
@@ -74,30 +81,39 @@ class CalibrationState(TypedDict):
 
 
 class BoardForm(TypedDict):
+    """Holds the form that describes the calibration board, with the keys of ``board.toml``."""
+
     board: NotRequired[Mapping[str, object] | None]
 
 
 class CalibrateForm(TypedDict):
+    """Holds the label of a new calibration."""
+
     label: NotRequired[str | None]
 
 
 class UseForm(Chosen):
-    """Holds the request to use a calibration. ``poor``: the operator has read what it lacks."""
+    """Holds the request to use a calibration. ``poor``: the operator has read what it lacks and uses it
+    nevertheless."""
 
     poor: NotRequired[bool]
 
 
 class CalibrationPage(Page, component="calibration.js"):
+    """Shows the shots of the board so far, and the list of calibrations with their reports."""
+
     def look(self) -> CalibrationState:
+        """Returns the state of the page, which is the same for all callers."""
         return shared.get("calibration page", 0.4, lambda: calibration_state(self.service))
 
 
 def known_calibrations(service: Service, age_s: float) -> list[Calibration]:
-    """Returns all calibrations, newest first, shared by the pages and at most ``age_s`` seconds old."""
+    """Returns all calibrations, newest first. The list is shared by the pages and at most ``age_s`` seconds old."""
     return shared.get("calibrations", age_s, service.calibrations.find)
 
 
 def calibration_state(service: Service) -> CalibrationState:
+    """Returns what the page shows: calibrations, rig, and the shots of the board so far."""
     rig = service.rig.describe()
     names = [camera.name for camera in rig.cameras]
     lines = summary(names, [found for _, found in shots.taken])
@@ -116,7 +132,7 @@ def calibration_state(service: Service) -> CalibrationState:
 
 
 def calibration_line(found: Calibration) -> Mapping[str, object]:
-    """Returns a calibration as plain values, ``missing`` and ``warnings`` as messages."""
+    """Returns a calibration as plain values; ``missing``, ``warnings`` and ``error`` hold messages."""
     messages = {"missing": documents_of(found.missing), "warnings": documents_of(found.warnings)}
     return {
         **asdict(replace(found, missing=(), warnings=(), error=None)),
@@ -126,7 +142,8 @@ def calibration_line(found: Calibration) -> Mapping[str, object]:
 
 
 def board_of(event: BoardForm) -> Mapping[str, object]:
-    """Returns the board that a form describes, as a document. Raises InputError."""
+    """Reads the board that a form describes, as the content of a ``board.toml``. Raises InputError naming missing
+    keys."""
     form = event.get("board") or {}
     needed = ("kind", "columns", "rows", "square_mm")
     other = ("measured_width_mm", "inverted") + (("marker_ratio", "dictionary") * (form.get("kind") == "charuco"))
@@ -137,6 +154,11 @@ def board_of(event: BoardForm) -> Mapping[str, object]:
 
 
 def shoot(page: Page, event: BoardForm) -> Message:
+    """Takes a shot of the board and adds it to the collection. A shot in which no camera sees the board is removed.
+
+    Raises InputError for an impossible board, Conflict if the collection shows a different one, InvalidInput if no
+    camera sees it, and what ``Captures.take`` raises.
+    """
     from calibration.board.board import board_from_document
 
     board, service = board_of(event), page.service
@@ -157,16 +179,20 @@ def shoot(page: Page, event: BoardForm) -> Message:
 
 
 def take_back(page: Page, event: object) -> None:
+    """Removes the last shot of the board from the collection."""
     shots.drop_last()
     shared.forget("calibration page")
 
 
 def start_over(page: Page, event: object) -> None:
+    """Empties the collection of board shots; the captures stay."""
     shots.clear()
     shared.forget("calibration page")
 
 
 def calibrate(page: Page, event: CalibrateForm) -> Message:
+    """Queues a calibration from the collected shots and empties the collection. Raises InvalidInput for fewer than
+    ``SHOTS_LEAST`` shots."""
     if len(shots.taken) < SHOTS_LEAST:
         detail = compose("board-shots-too-few", count=len(shots.taken), needed=SHOTS_LEAST)
         raise InvalidInput("too-few-shots", detail)
@@ -178,12 +204,14 @@ def calibrate(page: Page, event: CalibrateForm) -> Message:
 
 
 def use(page: Page, event: UseForm) -> Message:
+    """Uses a calibration for every later capture. Raises NotFound, and Conflict as ``Service.use_calibration`` does."""
     page.service.use_calibration(event["id"], poor=event.get("poor", False))
     _forget()
     return compose("calibration-taken-into-use")
 
 
 def remove(page: Page, event: Chosen) -> None:
+    """Removes a calibration after the time to undo that has passed. Raises NotFound."""
     service, identity = page.service, event["id"]
     found = service.calibrations.get(identity)
     title = compose("calibration-named", name=found.label or identity[-6:])
@@ -207,4 +235,5 @@ CalibrationPage.actions = {
 
 @ui.page("/calibration")
 async def calibration_page(calibration: str = "") -> RedirectResponse | None:
+    """Serves the page Calibration. ``calibration`` selects one."""
     return await show("calibration", CalibrationPage, calibration=calibration)

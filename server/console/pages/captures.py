@@ -1,86 +1,37 @@
-"""Captures: what there is, uploads, silhouettes over the images, jobs to start, removal with undo."""
+"""The page Captures: the list, uploads, outlines over the images, jobs to start, and removal with undo."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict
+from collections.abc import Mapping
 from typing import NotRequired, TypedDict, cast, get_args
 
 from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.head_model.model_names import list_models
-from rig.acquisition.shot import CameraSyncDocument, FaultDocument, SyncDocument
-from rig.messages.message import Message, MessageDocument, compose, documents_of
+from rig.messages.message import Message, compose
+from server.console.capture_lines import (
+    CaptureLine,
+    SessionLine,
+    capture_line,
+    jobs_of,
+    sessions_list,
+)
 from server.console.identity import permit
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.removal import removals
 from server.console.work_form import PresetLine, TemplateLine, WorkForm, chosen_work, preset_lines, template_lines
-from server.errors import InvalidInput, NotFound
+from server.errors import InvalidInput
 from server.services.bulk import each
-from server.services.records import Session
 from server.services.service import Service
 from server.services.tags import typed_tags
 from server.storage.library import CaptureOrder, CaptureQuery
-from server.storage.records import CaptureRecord
-from server.tasks.simulate import SimulatedCertificate, SimulatedSync
 
 SHOWN = 50  # captures of a page
 ASKED = ("find", "session", "verdict", "tag", "sort", "after", "capture")
-SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
-
-
-class JobOfCapture(TypedDict):
-    """Holds a job of a capture. ``progress`` (0 to 1) is None unless the job runs."""
-
-    id: str
-    state: str
-    progress: float | None
-
-
-class SyncLine(TypedDict):
-    """Holds a sentence on how far the pictures of a shot are of one moment."""
-
-    message: MessageDocument
-    good: bool
-
-
-class CaptureLine(TypedDict):
-    """Holds a capture as the list shows it. ``size``: of the first camera's pictures (px); ``jobs``: all its jobs,
-    newest first."""
-
-    id: str
-    created: str
-    source: str
-    label: str
-    expression: str
-    front: str
-    features: bool
-    cameras: list[str]
-    bytes: int
-    session: str | None
-    jobs: list[JobOfCapture]
-    board: bool
-    size: dict[str, str | int]
-    sizes: dict[str, tuple[int, int]]
-    verdict: str | None
-    faults: list[FaultDocument]
-    warnings: list[MessageDocument]
-    sync: SyncLine | None
-    tags: list[str]
-
-
-class SessionLine(TypedDict):
-    """Holds a session as the list shows it. ``captures``: their number."""
-
-    id: str
-    created: str
-    label: str
-    consent: str
-    captures: int
 
 
 class CapturesState(TypedDict):
-    """Holds one page of captures. ``chosen``: the capture that is looked at, which may lie on another page."""
+    """Holds one page of the list of captures. ``chosen``: the selected capture, which may be on another page of the
+    list."""
 
     captures: list[CaptureLine]
     chosen: CaptureLine | None
@@ -94,7 +45,7 @@ class CapturesState(TypedDict):
 
 
 class EditForm(Chosen):
-    """Holds changes to a capture. ``tags``: separated by commas."""
+    """Holds changes to a capture. Fields that are left out stay; ``tags`` are separated by commas."""
 
     label: NotRequired[str]
     expression: NotRequired[str]
@@ -103,16 +54,19 @@ class EditForm(Chosen):
 
 
 class SessionForm(TypedDict):
+    """Holds the label and the consent note of a session."""
+
     label: NotRequired[str]
     consent: NotRequired[str]
 
 
 class SessionEditForm(Chosen, SessionForm):
-    pass
+    """Holds changes to a session. Fields that are left out stay."""
 
 
 class BulkForm(WorkForm):
-    """Holds an action on all ``ids``. ``id``: the session to move to, empty for none; ``tags``: separated by commas."""
+    """Holds one action on all captures ``ids``. ``id``: the session to move them to, empty for none; ``tags``:
+    separated by commas."""
 
     ids: list[str]
     action: str
@@ -120,6 +74,8 @@ class BulkForm(WorkForm):
 
 
 class CapturesPage(Page, component="captures.js"):
+    """Shows the list of captures, and the selected one with its pictures, outlines and jobs."""
+
     def look(self) -> CapturesState:
         """Returns the state of the page. The selected capture stays selected when others arrive, so that nobody removes
         a capture other than the one shown."""
@@ -133,7 +89,8 @@ class CapturesPage(Page, component="captures.js"):
 
 
 def captures_state(service: Service, requested: Mapping[str, str | None]) -> CapturesState:
-    """Returns one page of the captures that match what is requested, each with its jobs."""
+    """Returns one page of the captures that match what is requested, each with its jobs. Captures that are being
+    removed are left out."""
     order = cast(CaptureOrder, requested["sort"] if requested["sort"] in get_args(CaptureOrder) else "-created")
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
@@ -156,95 +113,15 @@ def captures_state(service: Service, requested: Mapping[str, str | None]) -> Cap
     }
 
 
-def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCapture]]:
-    """Returns the jobs of each capture, newest first, with the progress of those that run."""
-    found = service.jobs.of_captures(captures)
-    running = [job for jobs in found.values() for job, state in jobs if state == "running"]
-    progress = {job.id: job.progress for job in service.jobs.of(running)}
-    return {
-        capture: [
-            {"id": job, "state": state, "progress": progress.get(job)} for job, state in jobs if job not in removals
-        ]
-        for capture, jobs in found.items()
-    }
-
-
-def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine:
-    return {
-        "id": record.id,
-        "created": record.created,
-        "source": record.source,
-        "label": record.label,
-        "expression": record.expression,
-        "front": record.front,
-        "features": record.features,
-        "cameras": [camera.name for camera in record.cameras],
-        "bytes": record.bytes,
-        "session": record.session,
-        "jobs": jobs,
-        "board": record.board,
-        "size": asdict(record.cameras[0]),
-        "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
-        "verdict": record.verdict,
-        "faults": [fault.document() for fault in record.faults],
-        "warnings": documents_of(record.warnings),
-        "sync": None if record.shot is None else sync_line(record.shot),
-        "tags": [*record.tags],
-    }
-
-
-def sync_line(shot: Mapping[str, object]) -> SyncLine:
-    """Returns a sentence on how far the pictures of a shot are of one moment."""
-    lines = sync_of(shot)
-    late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
-    if late:
-        return {"message": compose("not-in-sync", cameras=late).document(), "good": False}
-    spread_ms = cast(SyncDocument, shot["sync"])["spread_ms"] if "sync" in shot else None
-    if spread_ms is None:
-        return {"message": compose("cameras-in-sync", count=len(lines)).document(), "good": True}
-    return {
-        "message": compose("cameras-in-sync-within", count=len(lines), spread_ms=spread_ms).document(),
-        "good": True,
-    }
-
-
-def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
-    """Returns status and skew of each camera from the certificate of a shot, of a real rig or of
-    the simulated studio."""
-    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
-    return certificate.get("cameras", {})
-
-
-def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLine]:
-    """Returns the newest sessions, newest first, and the ``chosen`` one where it is older."""
-
-    def make() -> list[Session]:
-        return [*service.sessions.page(limit=SESSIONS_SHOWN).items]
-
-    sessions = shared.get("sessions", 0.5, make)
-    if chosen and all(session.id != chosen for session in sessions):
-        with suppress(NotFound):
-            sessions = [*sessions, service.sessions.get(chosen)]
-    return [session_line(session) for session in sessions]
-
-
-def session_line(session: Session) -> SessionLine:
-    return {
-        "id": session.id,
-        "created": session.created,
-        "label": session.label,
-        "consent": session.consent,
-        "captures": sum(capture not in removals for capture in session.captures),
-    }
-
-
 def reconstruct(page: Page, event: WorkForm) -> Message:
+    """Queues a job for a capture; its head opens when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.started(job.id, opens=True)
     return compose("job-queued-watch", job=job.id[-6:])
 
 
 def reconstruct_session(page: Page, event: WorkForm) -> Message:
+    """Queues a job for every capture of a session that shows a head. Raises what ``Jobs.submit_session`` raises."""
     work = chosen_work(event)
     jobs = page.service.jobs.submit_session(event["id"], work, key=page.caller.key, priority=100)
     page.started(*(job.id for job in jobs))
@@ -252,7 +129,7 @@ def reconstruct_session(page: Page, event: WorkForm) -> Message:
 
 
 def sample(page: Page, event: object) -> Message:
-    """Takes a capture of the simulated studio, for those who have no pictures yet."""
+    """Takes a capture of the simulated studio and selects it, for people who have no pictures yet."""
     record = page.service.captures.sample()
     page.choice["capture"] = record.id
     forget_captures()
@@ -260,6 +137,7 @@ def sample(page: Page, event: object) -> Message:
 
 
 def edit(page: Page, event: EditForm) -> None:
+    """Changes label, expression, session or tags of a capture. Raises NotFound and InputError."""
     changes: dict[str, str | None] = {k: event.get(k) for k in ("label", "expression", "session") if k in event}
     tags = typed_tags(event["tags"]) if "tags" in event else None
     page.service.captures.edit(event["id"], changes, tags=tags)
@@ -267,30 +145,36 @@ def edit(page: Page, event: EditForm) -> None:
 
 
 def new_session(page: Page, event: SessionForm) -> Message:
+    """Makes a session. Raises InputError for invalid texts."""
     made = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
     forget_captures()
     return compose("session-begun", name=made.label or made.id[-6:])
 
 
 def edit_consent(page: Page, event: SessionEditForm) -> None:
+    """Changes the label or the consent note of a session. Raises NotFound and InputError."""
     changes = {name: str(event.get(name) or "") for name in ("label", "consent") if name in event}
     page.service.sessions.edit(event["id"], label=changes.get("label"), consent=changes.get("consent"))
     forget_captures()
 
 
 def erase(page: Page, event: Chosen) -> Message:
+    """Erases a session for good, without undo, as ``Sessions.erase`` does. Raises NotFound and Unavailable."""
     page.service.sessions.erase(event["id"])
     shared.clear()  # reports of its heads among them
     return compose("session-erased")
 
 
 def erase_capture(page: Page, event: Chosen) -> Message:
+    """Erases a capture for good, without undo, as ``Captures.erase`` does. Raises NotFound and Unavailable."""
     page.service.captures.erase(event["id"])
     shared.clear()
     return compose("capture-erased")
 
 
 def discard(page: Page, event: Chosen) -> None:
+    """Removes a capture after the time to undo that has passed; the message says how many heads stay. Raises NotFound,
+    and Conflict while a queued or running job needs it."""
     service, identity = page.service, event["id"]
     record = service.captures.check_unused(identity)
     heads = len(service.captures.holdings(identity).heads)
@@ -301,8 +185,8 @@ def discard(page: Page, event: Chosen) -> None:
 
 
 def bulk(page: Page, event: BulkForm) -> Message | None:
-    """Does one action to all captures that are ticked. Raises InvalidInput with the reasons where it is refused for
-    some."""
+    """Does one action to all ticked captures. Where it is refused for some, the others are done, and InvalidInput is
+    raised with the reasons."""
     service, ids, action = page.service, event["ids"], event["action"]
     if action == "reconstruct":
         permit(page.caller, "submit")
@@ -336,7 +220,7 @@ def bulk(page: Page, event: BulkForm) -> Message | None:
 
 
 def said_of(action: str, count: int) -> Message:
-    """Returns the message of what was done to ``count`` captures."""
+    """Returns the message that says what was done to ``count`` captures."""
     said = {
         "reconstruct": compose("captures-queued", count=count),
         "move": compose("captures-moved", count=count),
@@ -348,6 +232,7 @@ def said_of(action: str, count: int) -> Message:
 
 
 def forget_captures() -> None:
+    """Drops the cached lists that show captures, sessions, tags or subjects."""
     shared.forget("captures", "sessions", "tags", "subjects")
 
 
@@ -369,5 +254,6 @@ CapturesPage.actions = {
 async def captures_page(
     capture: str = "", find: str = "", session: str = "", verdict: str = "", tag: str = "", sort: str = ""
 ) -> RedirectResponse | None:
+    """Serves the page Captures. ``capture`` selects one; the other parameters restrict or order the list."""
     requested = {"capture": capture, "find": find, "session": session, "verdict": verdict, "tag": tag, "sort": sort}
     return await show("captures", CapturesPage, **requested)

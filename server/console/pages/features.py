@@ -1,5 +1,7 @@
-"""Features: the seven points of section 4.2, and others, picked in three or four views. Skipping this page is fine:
-without points the pipeline finds the alignment by itself."""
+"""The page Features: the seven points of the paper's section 4.2, and others, picked in three or four views.
+
+It may be skipped: without points the pipeline finds the alignment by itself.
+"""
 
 import threading
 from collections import OrderedDict
@@ -33,6 +35,8 @@ CHOICES = 100  # captures to choose from; the page Captures leads to all
 
 
 class CaptureChoice(TypedDict):
+    """Holds a capture in the list to choose from. ``features``: it has points already."""
+
     id: str
     label: str
     created: str
@@ -40,16 +44,19 @@ class CaptureChoice(TypedDict):
 
 
 class Size(TypedDict):
+    """Holds the name of a camera and the size of its pictures in pixels."""
+
     name: str
     width: int
     height: int
 
 
 class Picking(Helps):
-    """Holds the points of one capture and what helps to pick them.
+    """Holds the points of one capture and the aids for picking more; pixels are those of the picture files.
 
-    ``names``: the first seven are those of section 4.2; ``suggested``: suggestions that nobody accepted yet;
-    ``is_contradictory``: contradictions must be confirmed before the points are saved.
+    ``names``: all points, of which the first seven are those of section 4.2; ``suggested``: suggestions that nobody has
+    accepted yet; ``dirty``: there are points that are not saved; ``is_contradictory``: contradictions must be confirmed
+    before the points are saved.
     """
 
     id: str
@@ -63,13 +70,15 @@ class Picking(Helps):
 
 
 class FeaturesShown(TypedDict):
+    """Holds what the page shows: the captures to choose from, and the points of the chosen one."""
+
     captures: list[CaptureChoice]
     capture: Picking | None
     requested: NotRequired[str | None]
 
 
 class Place(TypedDict):
-    """Holds where a point is put in one view. ``at``: pixels; None removes the point there."""
+    """Holds where a point is set in one view. ``at``: its pixel; None removes the point there."""
 
     point: str
     camera: str
@@ -77,6 +86,8 @@ class Place(TypedDict):
 
 
 class Sure(TypedDict):
+    """Holds whether the operator has confirmed points that contradict each other."""
+
     sure: NotRequired[bool]
 
 
@@ -91,8 +102,8 @@ class SuggestedPlaces(TypedDict):
 class Picked:
     """Holds the points of a capture as they are on the page, and as they were saved.
 
-    ``suggested``: pixels of points that are not set there, from a face that was found; they count only once somebody
-    accepts them. ``unconfirmed``: the points that were to be saved although they contradict each other.
+    ``suggested``: pixels, from a detected face, for points that are not set there; they count once somebody accepts
+    them. ``unconfirmed``: the points whose contradictions the operator was asked to confirm.
     """
 
     capture: str
@@ -104,13 +115,15 @@ class Picked:
 
 
 class Drafts:
-    """Holds the feature points that an operator has picked and not saved yet, a set for each operator, so that a reload
-    of the page shows them again."""
+    """Keeps the points that operators have picked and not saved, for each operator and capture, so that a reload of the
+    page shows them again. They do not outlive the process."""
 
     def __init__(self, most: int = 200) -> None:
         self._most, self._kept = most, OrderedDict[tuple[str, str], Points]()
 
     def keep(self, caller: str, picked: Picked) -> None:
+        """Keeps the points of a page for a caller, or drops the draft if all are saved. Beyond the limit the oldest
+        drafts go."""
         self._kept.pop((caller, picked.capture), None)
         if picked.points != picked.saved:
             self._kept[caller, picked.capture] = picked.points
@@ -118,6 +131,7 @@ class Drafts:
                 self._kept.popitem(last=False)
 
     def of(self, caller: str, capture: str) -> Points | None:
+        """Returns the draft of a caller for a capture; None if there is none."""
         return self._kept.get((caller, capture))
 
 
@@ -125,11 +139,13 @@ drafts = Drafts()
 
 
 class FeaturesPage(Page, component="features.js"):
-    """Shows the page on which points are picked. They belong to this page until they are saved."""
+    """Shows the views of one capture, in which feature points are picked. Points belong to one open page until they are
+    saved."""
 
     picked: Picked | None = None
 
     def look(self) -> FeaturesShown:
+        """Returns the captures to choose from, and the points of the chosen one with the aids for picking more."""
         captures: list[CaptureChoice] = shared.get("choices", 2.0, lambda: captures_to_pick(self.service))
         chosen = self.choice.get("capture") or (captures[0]["id"] if captures else None)
         known = any(capture["id"] == chosen for capture in captures)
@@ -168,37 +184,41 @@ class FeaturesPage(Page, component="features.js"):
         }
 
     def of_capture(self) -> Picked:
-        """Returns the points that are being picked. Raises Conflict before the page has shown a capture."""
+        """Returns the points that are being picked. Raises Conflict if the page has not shown a capture yet."""
         if self.picked is None:
             raise Conflict("no-capture", compose("no-capture-shown"))
         return self.picked
 
 
 def captures_to_pick(service: Service) -> list[CaptureChoice]:
-    """Returns the newest captures that show a head."""
+    """Returns the newest ``CHOICES`` captures that show a head."""
     found = service.captures.page(CaptureQuery(board=False), CHOICES)
     return [choice_of(record) for record in found.items if record.id not in removals]
 
 
 def choice_of(record: CaptureRecord) -> CaptureChoice:
+    """Converts a capture's record to an entry of the list to choose from."""
     return {"id": record.id, "label": record.label, "created": record.created, "features": record.features}
 
 
 def rig_of(service: Service, capture_id: str) -> Rig:
+    """Reads the rig from the files of a capture. Raises NotFound for a text that is no id, and InputError for a damaged
+    file."""
     path = find_rig_file(service.store.folder("captures", capture_id) / "files")
     assert path is not None  # it was accepted with one
     return read_rig_file(Path(path))
 
 
 class Landmarks:
-    """Holds the landmarks of the default model's mean head (head frame, mm). They are loaded once, in a thread, since
-    that takes a second or more; until then there are none."""
+    """Holds the landmarks of the default model's mean head (head frame, mm). They are loaded in a thread, which takes a
+    second or more; until then there are none."""
 
     def __init__(self) -> None:
         self._asked = threading.Lock()
         self.found: dict[str, np.ndarray] = {}
 
     def of(self, service: Service) -> dict[str, np.ndarray]:
+        """Returns the landmarks loaded so far, and starts to load them at the first call."""
         if not self.found and self._asked.acquire(blocking=False):
             threading.Thread(target=self._load, args=(service,), daemon=True).start()
         return self.found
@@ -216,7 +236,7 @@ landmarks = Landmarks()
 
 
 def place(page: FeaturesPage, event: Place) -> None:
-    """Sets one point in one view, or removes it there where ``at`` is None."""
+    """Sets one point in one view, or removes it there if ``at`` is None. Nothing is saved yet."""
     picked = page.of_capture()
     points = {name: dict(views) for name, views in picked.points.items()}
     views = points.setdefault(event["point"], {})
@@ -230,8 +250,8 @@ def place(page: FeaturesPage, event: Place) -> None:
 
 
 def suggest(page: FeaturesPage, event: object) -> Message:
-    """Suggests all seven points in every view that shows the face. Suggestions are neither stored nor used before
-    somebody accepts them."""
+    """Suggests all seven points in every view that shows the face. Suggestions are neither saved nor used before
+    somebody accepts them. Raises InvalidInput if no face is certain, and what ``found_faces`` raises."""
     picked = page.of_capture()
     found = found_faces(page.service, picked.capture)["suggested"]
     if not found:
@@ -241,7 +261,7 @@ def suggest(page: FeaturesPage, event: object) -> Message:
 
 
 def accept(page: FeaturesPage, event: SuggestedPlaces) -> None:
-    """Turns suggestions into points, which are saved like all others."""
+    """Turns the selected suggestions into points, which are saved like all others."""
     picked = page.of_capture()
     picked.points = take_suggestions(picked.points, picked.suggested, event.get("point"), event.get("camera"))
     picked.suggested = open_suggestions(picked.suggested, picked.points)
@@ -249,13 +269,14 @@ def accept(page: FeaturesPage, event: SuggestedPlaces) -> None:
 
 
 def reject(page: FeaturesPage, event: SuggestedPlaces) -> None:
+    """Drops the selected suggestions without setting points."""
     picked = page.of_capture()
     picked.suggested = drop_suggestions(picked.suggested, event.get("point"), event.get("camera"))
 
 
 def save(page: FeaturesPage, event: Sure) -> Message | None:
-    """Stores the points. Where views contradict each other, nothing is stored until the event comes
-    again with ``sure``."""
+    """Stores the points of the page. If views contradict each other, nothing is stored and None is returned until the
+    event comes again with ``sure``. Raises what ``Captures.put_features`` raises."""
     picked = page.of_capture()
     points = picked.points
     if not event.get("sure") and contradictions(page):
@@ -268,12 +289,15 @@ def save(page: FeaturesPage, event: Sure) -> Message | None:
 
 
 def contradictions(page: FeaturesPage) -> Mapping[str, MessageDocument]:
+    """Returns, by point, what a job would leave out because views contradict each other."""
     picked = page.of_capture()
     pixels = {p: {c: np.array(at, float) for c, at in views.items()} for p, views in picked.points.items()}
     return picked.guides.helps(pixels, {}, [])["contradictions"]
 
 
 def reconstruct(page: FeaturesPage, event: Sure) -> Message | None:
+    """Saves the points if needed, and queues a job for the capture. Returns None without a job if contradictions must
+    be confirmed first."""
     picked = page.of_capture()
     if picked.points != picked.saved and save(page, event) is None:
         return None
@@ -295,4 +319,5 @@ FeaturesPage.actions = {
 @ui.page("/features")
 @ui.page("/features/{capture}")
 async def features_page(capture: str = "") -> RedirectResponse | None:
+    """Serves the page Features. ``capture`` selects one."""
     return await show("features", FeaturesPage, capture=capture or None)

@@ -1,4 +1,4 @@
-"""Jobs: the queue, stage and progress, log, cancel, restart with other settings; what a finished one says of itself."""
+"""The page Jobs: the queue, progress, log, cancel, restart with other settings, and the figures of a finished job."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping
@@ -19,7 +19,7 @@ from server.console.shown_messages import shown_failure
 from server.errors import Conflict, InvalidInput
 from server.services.bulk import each
 from server.services.documents import JobLine
-from server.services.jobs import FINISHED, STATUSES
+from server.services.job_rows import FINISHED, STATUSES
 from server.services.records import Job
 from server.services.retention import ENDED
 from server.services.service import Service
@@ -42,7 +42,8 @@ class LogLine(TypedDict):
 
 
 class CameraLine(TypedDict):
-    """Holds what report.json says of a camera; None where it says nothing."""
+    """Holds what report.json says of a camera; None where it has no value. ``view``: whether the picture was usable;
+    ``excluded_share``: share of the rim that hair or clothes hide."""
 
     name: str
     view: bool | None
@@ -55,7 +56,7 @@ class CameraLine(TypedDict):
 
 
 class JobDetail(TypedDict):
-    """Holds the log of a job and, of a finished one, the cameras' residuals, the warnings and whether there are
+    """Holds the log of a job and, once it has finished, the cameras' residuals, the warnings, and whether there are
     pictures."""
 
     id: str
@@ -76,7 +77,8 @@ class ShownJob(JobLine):
 
 
 class JobsState(TypedDict):
-    """Holds one page of jobs; the first page begins with those that run and wait. ``waiting``: how many more wait."""
+    """Holds one page of the list of jobs. The first page begins with those that run and wait. ``waiting``: how many
+    more wait."""
 
     jobs: list[ShownJob]
     counts: dict[str, int]
@@ -87,14 +89,14 @@ class JobsState(TypedDict):
 
 
 class JobsShown(JobsState):
-    """Holds what the page shows. ``job``: the job that is looked at, which may lie on another page."""
+    """Holds what the page shows. ``job``: the selected job, which may be on another page of the list."""
 
     job: ShownJob | None
     detail: JobDetail | None
 
 
 class SettingsForm(TypedDict, total=False):
-    """Holds the settings of a form. ``more``: further settings as JSON."""
+    """Holds the settings of a form. ``more``: further settings as a JSON object."""
 
     method: str
     detail: str
@@ -103,11 +105,15 @@ class SettingsForm(TypedDict, total=False):
 
 
 class BulkForm(TypedDict):
+    """Holds one action (cancel, restart, remove) on all jobs ``ids``."""
+
     ids: list[str]
     action: str
 
 
 class RestartForm(Chosen, SettingsForm):
+    """Holds the job to restart, and the settings and model of the new one."""
+
     model: NotRequired[str | None]
 
 
@@ -122,7 +128,11 @@ class ListedJob:
 
 
 class JobsPage(Page, component="jobs.js"):
+    """Shows the list of jobs, and the selected one with its log and, once it has finished, its figures."""
+
     def look(self) -> JobsShown:
+        """Returns one page of the list, and the selected job with its details. Without a selection that is a running
+        job."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         state: JobsState = shared.get(("jobs", *requested.values()), 0.3, lambda: jobs_state(self.service, requested))
         first = next((job for job in state["jobs"] if job["state"] == "running"), next(iter(state["jobs"]), None))
@@ -137,8 +147,8 @@ class JobsPage(Page, component="jobs.js"):
 
 
 def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsState:
-    """Returns one page of jobs: first those that run, then the queue in its order, then those that
-    ended, newest first."""
+    """Returns one page of the jobs that match what is requested: those that run, then the queue in its order, then
+    those that have ended, newest first."""
     sought, after = requested["find"] or "", requested["after"]
     order = cast(JobOrder, requested["sort"] if requested["sort"] in get_args(JobOrder) else "-created")
     state = requested["state"] if requested["state"] in STATUSES else None
@@ -160,7 +170,8 @@ def jobs_state(service: Service, requested: Mapping[str, str | None]) -> JobsSta
 
 
 def active_jobs(service: Service, sought: str, batch: str | None, *, running: bool = True) -> tuple[list[Job], int]:
-    """Returns the jobs that run and those that are taken next, and how many more wait."""
+    """Returns the jobs that run and those that begin next, ``SHOWN`` at most, and how many more wait. ``running``:
+    include those that run."""
     query = JobQuery(sought, ACTIVE if running else STATUSES["queued"], batch=batch)
     found = service.jobs.page(query, SOUGHT_MOST)
     jobs = sorted(found.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
@@ -168,7 +179,7 @@ def active_jobs(service: Service, sought: str, batch: str | None, *, running: bo
 
 
 def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
-    """Returns the jobs with label, time and session of their captures."""
+    """Adds to each job the label, time and session of its capture, as far as the capture exists."""
     found = []
     for job in jobs:
         capture = next(iter(service.captures.of([job.capture_id or ""])), None)
@@ -180,6 +191,7 @@ def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
 
 
 def job_line(listed: ListedJob) -> ShownJob:
+    """Converts a job to an entry of the page's list."""
     job, notice = listed.job, listed.job.notice
     line = asdict(replace(job, error=None, notice=None, files={}))
     line |= {"error": shown_failure(job.error), "notice": None if notice is None else notice.text}
@@ -189,6 +201,7 @@ def job_line(listed: ListedJob) -> ShownJob:
 
 
 def job_detail(service: Service, job_id: str) -> JobDetail:
+    """Returns the details of a job. They are cached, for an hour once it has finished. Raises NotFound."""
     finished = service.jobs.state(job_id) in FINISHED
 
     def make() -> JobDetail:
@@ -210,6 +223,7 @@ def job_detail(service: Service, job_id: str) -> JobDetail:
 
 
 def camera_line(name: str, camera: CameraReport) -> CameraLine:
+    """Reads the figures of one camera from its part of report.json."""
     view = camera.get("view")
     return {
         "name": name,
@@ -234,6 +248,7 @@ def log_lines(events: list[JobEvent]) -> list[LogLine]:
 
 
 def restart(page: Page, event: RestartForm) -> Message:
+    """Queues a new job for the capture of an earlier one, and selects it. Raises what ``Jobs.restart`` raises."""
     wanted = ReconstructionRequest(event.get("model") or None, chosen_settings(event))
     job = page.service.jobs.restart(event["id"], wanted, key=page.caller.key)
     page.choice["job"] = job.id
@@ -242,7 +257,8 @@ def restart(page: Page, event: RestartForm) -> Message:
 
 
 def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
-    """Returns the settings of a form: method, detail, front, and further ones from JSON. Raises InputError."""
+    """Reads the settings of a form: method, detail, front, and further ones from a JSON text. Raises InputError if that
+    text is no JSON object."""
     try:
         settings = json.loads(event.get("more") or "{}")
     except ValueError as error:
@@ -253,18 +269,20 @@ def chosen_settings(event: SettingsForm) -> Mapping[str, object]:
 
 
 def cancel(page: Page, event: Chosen) -> None:
+    """Cancels a job. A finished one stays as it is. Raises NotFound."""
     page.service.cancel(event["id"])
 
 
 def delete(page: Page, event: Chosen) -> None:
+    """Removes a job with its result after the time to undo that has passed. Raises NotFound."""
     service, identity = page.service, event["id"]
     service.jobs.get(identity)
     remove_later(identity, lambda: service.jobs.delete(identity), compose("job-named", job=identity[-6:]), "submit")
 
 
 def bulk(page: Page, event: BulkForm) -> Message:
-    """Does one action to all jobs that are ticked. Raises InvalidInput with the reasons where it is
-    refused for some."""
+    """Does one action to all ticked jobs. Where it is refused for some, the others are done, and InvalidInput is raised
+    with the reasons. Raises Conflict if none of those to be removed has ended."""
     service, action = page.service, event["action"]
     if action == "remove":
         ended = [job.id for job in service.jobs.of(event["ids"]) if job.state in FINISHED]
@@ -300,4 +318,5 @@ JobsPage.actions = {
 async def jobs_page(
     job: str = "", find: str = "", state: str = "", sort: str = "", batch: str = ""
 ) -> RedirectResponse | None:
+    """Serves the page Jobs. ``job`` selects one; the other parameters restrict or order the list."""
     return await show("jobs", JobsPage, job=job, find=find, state=state, sort=sort, batch=batch)

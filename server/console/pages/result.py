@@ -1,4 +1,4 @@
-"""The head: turned, coloured, measured, compared, fetched."""
+"""The page Result: a head in 3D, coloured, measured, compared with others, and its files."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -16,7 +16,7 @@ from server.console.pages.jobs import ListedJob, listed_jobs
 from server.console.pages.rig import read_report
 from server.console.removal import removals
 from server.errors import NotFound
-from server.services.jobs import STATUSES
+from server.services.job_rows import STATUSES
 from server.services.records import Job
 from server.services.service import Service
 from server.storage.job_index import JobQuery
@@ -28,8 +28,8 @@ SUBJECTS_HEADS = 100
 
 
 class ResultLine(TypedDict):
-    """Holds a job with a result. ``capture`` and ``captured``: label and time of its capture; ``subject``: name of the
-    subject."""
+    """Holds a job that has a result. ``capture`` and ``captured``: label and time of its capture; ``subject``: name of
+    the subject."""
 
     id: str
     capture: str
@@ -44,8 +44,8 @@ class ResultLine(TypedDict):
 
 
 class Head(ResultLine):
-    """Holds what is shown beside the head: measurements, warnings, the size of each file (bytes), and whether the truth
-    is known."""
+    """Holds what is shown beside the head. ``clear_views``: how many views see most of the rim, ``contour_px``: their
+    mean residual (px); ``truth``: whether the true head is known; ``files``: size of each file (bytes)."""
 
     measurements: dict[str, Measured]
     quality: dict[str, float | None]
@@ -62,7 +62,7 @@ class Head(ResultLine):
 
 class ResultShown(TypedDict):
     """Holds what the page shows. ``results``: the newest heads that match the search, those of the shown head's
-    subject, and the shown head; ``total``: number of heads that match."""
+    subject, and the shown head; ``total``: how many match."""
 
     results: list[ResultLine]
     total: int
@@ -71,7 +71,11 @@ class ResultShown(TypedDict):
 
 
 class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS)}):
+    """Shows one head in 3D with its figures, and the heads to choose from."""
+
     def look(self) -> ResultShown:
+        """Returns the shown head and the heads to choose from. A head that arrives meanwhile does not replace the shown
+        one."""
         sought, chosen = self.choice.get("find") or "", self.choice.get("job")
         results, total = shared.get(("results", sought), 1.0, lambda: newest_heads(self.service, sought))
         if chosen is None:
@@ -95,6 +99,7 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
         return {"results": shown, "total": total, "job": head, "requested": self.choice.get("job")}
 
     def preloads(self) -> Iterable[tuple[str, str]]:
+        """Returns the first view and the mesh of the shown head, so that the browser fetches them early."""
         job = self.props["state"].get("job")
         if job and "head.glb" in job["files"]:
             yield "image", f"/console/jobs/{job['id']}/first-view.jpg"
@@ -102,13 +107,14 @@ class ResultPage(Page, component="result.js", esm={"nicegui-scene": str(THREE_JS
 
 
 def newest_heads(service: Service, sought: str) -> tuple[list[ResultLine], int]:
-    """Returns the newest finished jobs that match a search, and the number of all that do."""
+    """Returns the newest ``SHOWN`` succeeded jobs that match a search, and how many match in all."""
     page = service.jobs.page(JobQuery(sought, STATUSES["succeeded"]), SHOWN)
     return result_lines(service, [job for job in page.items if job.id not in removals]), page.total
 
 
 def heads_of_subject(service: Service, head: ResultLine) -> list[ResultLine]:
-    """Returns the heads of the same capture and of all sessions with the same name."""
+    """Returns the heads of the same capture and of all sessions with the same label, newest first, ``SUBJECTS_HEADS``
+    at most."""
     captures = {head["capture_id"] or ""} | set(service.sessions.captures_of_subject(head["session"]))
     jobs = service.jobs.of_captures(captures)
     done = sorted((job for some in jobs.values() for job, state in some if state == "succeeded"), reverse=True)
@@ -116,6 +122,7 @@ def heads_of_subject(service: Service, head: ResultLine) -> list[ResultLine]:
 
 
 def result_lines(service: Service, jobs: Iterable[Job]) -> list[ResultLine]:
+    """Converts jobs that have a result to entries of the page's list, with the capture and the subject of each."""
     found = []
     for listed in listed_jobs(service, jobs):
         subject = ""
@@ -127,6 +134,7 @@ def result_lines(service: Service, jobs: Iterable[Job]) -> list[ResultLine]:
 
 
 def result_line(listed: ListedJob, subject: str) -> ResultLine:
+    """Converts a job that has a result to an entry of the page's list."""
     job = listed.job
     return {
         "id": job.id,
@@ -143,6 +151,8 @@ def result_line(listed: ListedJob, subject: str) -> ResultLine:
 
 
 def head_of(service: Service, job: ResultLine) -> Head:
+    """Returns what is shown beside a head, from its report.json. Values are empty or None if that is missing. Raises
+    NotFound."""
     report = read_report(service, job["id"])
     truth = service.store.folder("captures", job["capture_id"] or "") / "truth" / "head.ply"
     residuals = [] if report is None else clear_residuals(report)
@@ -164,8 +174,8 @@ def head_of(service: Service, job: ResultLine) -> Head:
 
 
 def clear_residuals(report: Report) -> list[float]:
-    """Returns the contour residuals (px) of the cameras that see most of the rim. Those of other cameras are caused by
-    hair and clothes."""
+    """Returns the contour residuals (px) of the cameras that see most of the rim. Residuals of other cameras are caused
+    by hair and clothes."""
     cameras = [camera for camera in report.get("cameras", {}).values() if camera.get("used")]
     clear = [camera for camera in cameras if (camera.get("excluded_share") or 0.0) < MOSTLY]
     residuals = [camera.get("contour_rms_px") for camera in clear]
@@ -175,4 +185,5 @@ def clear_residuals(report: Report) -> list[float]:
 @ui.page("/result")
 @ui.page("/result/{job}")
 async def result_page(job: str = "", find: str = "") -> RedirectResponse | None:
+    """Serves the page Result. ``job`` selects a head, ``find`` searches for others."""
     return await show("result", ResultPage, job=job or None, find=find)

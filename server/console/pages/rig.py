@@ -1,4 +1,5 @@
-"""The rig: eleven live tiles with exposure, sharpness, sync and calibration, clean plates, the trigger."""
+"""The page of the rig: a live picture of each camera with exposure, sharpness, sync and calibration; clean plates; the
+trigger."""
 
 import json
 from collections.abc import Mapping
@@ -12,20 +13,10 @@ from pipeline.results.report_types import Report
 from rig.acquisition.plates import PlatesVersion
 from rig.acquisition.shot import CameraSyncDocument
 from rig.messages.message import Message, MessageDocument, compose, documents_of
+from server.console.capture_lines import CaptureLine, SessionLine, capture_line, sessions_list, sync_of
 from server.console.media import live_view
 from server.console.page import Action, Chosen, Page, shared, show
-from server.console.pages.captures import (
-    CaptureLine,
-    SessionEditForm,
-    SessionForm,
-    SessionLine,
-    capture_line,
-    discard,
-    edit_consent,
-    new_session,
-    sessions_list,
-    sync_of,
-)
+from server.console.pages.captures import SessionEditForm, SessionForm, discard, edit_consent, new_session
 from server.console.removal import removals
 from server.console.shown_messages import shown_detail
 from server.console.work_form import WorkForm, chosen_work
@@ -37,7 +28,7 @@ from server.tasks.simulate import SimulatedSync
 
 
 class Tile(TypedDict):
-    """Holds one camera: the state of its driver, its line in the last shot's certificate, and whether it has moved."""
+    """Holds one camera: the state of its driver, its sync in the last shot's certificate, and whether it has moved."""
 
     name: str
     driver: str
@@ -47,7 +38,7 @@ class Tile(TypedDict):
 
 
 class InUse(TypedDict):
-    """Holds the calibration that every capture gets."""
+    """Holds the calibration that every capture gets. ``rms_px``: its RMS reprojection error (px)."""
 
     label: str
     created: str
@@ -55,19 +46,23 @@ class InUse(TypedDict):
 
 
 class LastCapture(TypedDict):
+    """Holds the id, time and source of the newest capture."""
+
     id: str
     created: str
     source: str
 
 
 class PlatesLine(TypedDict):
+    """Holds a version of the clean plates and why it was refused, if it was."""
+
     id: str
     taken: str
     faults: list[MessageDocument]
 
 
 class PlatesShown(TypedDict):
-    """Holds the clean plates in use, those before them, and newer ones that were refused."""
+    """Holds when the clean plates in use were taken, the version before them, and a newer one that was refused."""
 
     taken: str
     before: PlatesLine | None
@@ -75,6 +70,9 @@ class PlatesShown(TypedDict):
 
 
 class RigShown(TypedDict):
+    """Holds what the page shows of the rig, the same to all callers. ``ask_consent``: captures need a session with a
+    note of consent."""
+
     kind: str
     ready: bool
     cameras: list[Tile]
@@ -88,7 +86,7 @@ class RigShown(TypedDict):
 
 
 class JobStrip(TypedDict):
-    """Holds what the page shows of a job that was started on it."""
+    """Holds what the page shows of a job that was started on it. ``detail``: why it failed or cannot begin."""
 
     id: str
     state: str
@@ -99,21 +97,25 @@ class JobStrip(TypedDict):
 
 
 class RigPageShown(RigShown):
-    """Holds what the page shows. ``shot``: the capture that was taken here and awaits the operator's decision; ``job``:
-    the job that was started here last."""
+    """Holds what the page shows. ``shot``: the capture taken here on which the operator has not decided; ``job``: the
+    job started here last."""
 
     shot: CaptureLine | None
     job: JobStrip | None
 
 
 class RigPage(Page, component="rig.js"):
+    """Shows the rig: live pictures, state, calibration and clean plates, and the shot that was just taken."""
+
     def look(self) -> RigPageShown:
+        """Returns the state of the rig, and the shot and job that were started on this page."""
         state: RigShown = shared.get("rig", 0.4, lambda: rig_state(self.service))
         job = job_strip(self.service, self.choice.get("job"))
         return {**state, "shot": shot_taken(self.service, self.choice.get("shot")), "job": job}
 
 
 def job_strip(service: Service, identity: str | None) -> JobStrip | None:
+    """Returns what the page shows of a job; None if there is none or it is being removed."""
     found = service.jobs.of([identity]) if identity is not None and identity not in removals else []
     if not found:
         return None
@@ -130,7 +132,8 @@ def job_strip(service: Service, identity: str | None) -> JobStrip | None:
 
 
 def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
-    """Returns the capture that awaits the operator's decision. Returns None where there is none, or it was removed."""
+    """Returns the capture about which the operator has not decided yet whether to keep it; None if there is none or it
+    was removed."""
     if identity is None or identity in removals:
         return None
     with suppress(NotFound):
@@ -139,7 +142,7 @@ def shot_taken(service: Service, identity: str | None) -> CaptureLine | None:
 
 
 def rig_state(service: Service) -> RigShown:
-    """Returns what the page shows beside the live pictures: drivers, the last shot's certificate, calibration and clean
+    """Returns what the page shows beside the live pictures: drivers, the last shot's sync, calibration and clean
     plates."""
     rig = service.rig.describe()
     last = service.captures.newest()
@@ -170,8 +173,8 @@ def rig_state(service: Service) -> RigShown:
 
 
 def plates_shown(kept: list[PlatesVersion]) -> PlatesShown | None:
-    """Returns what the page shows of the clean plates. Returns None where there are none, or the rig takes them with
-    every shot."""
+    """Returns what the page shows of the clean plates, from their versions, newest first. Returns None if no version is
+    in use, as in the simulated studio."""
     in_use = next((version for version in kept if version.in_use), None)
     if in_use is None:
         return None
@@ -187,8 +190,8 @@ def _plates_line(version: PlatesVersion | None) -> PlatesLine | None:
 
 
 def calibration_in_use(service: Service) -> InUse | None:
-    """Returns label, time and residual of the calibration that every capture gets. Returns None where no calibration
-    made by this service is in use."""
+    """Returns label, time and residual of the calibration that every capture gets; None if this service did not make
+    it."""
     if service.calibrations.in_use() is None:
         return None
     known: list[Calibration] = shared.get("calibrations", 2.0, service.calibrations.find)
@@ -203,7 +206,7 @@ def calibration_in_use(service: Service) -> InUse | None:
 
 
 def moved_cameras(service: Service) -> set[str]:
-    """Returns the cameras that have moved according to the newest result."""
+    """Returns the cameras that have moved according to the warnings of the newest result."""
     done = service.jobs.find(state="succeeded", limit=1)
     if not done:
         return set()
@@ -215,7 +218,7 @@ def moved_cameras(service: Service) -> set[str]:
 
 
 def read_report(service: Service, job_id: str) -> Report | None:
-    """Reads report.json of a finished job, once, since results do not change. Returns None where there is none."""
+    """Reads report.json of a finished job; None if there is none. It is cached, since results do not change."""
     path = service.store.folder("jobs", job_id) / "result" / "report.json"
 
     def read() -> Report | None:
@@ -225,6 +228,7 @@ def read_report(service: Service, job_id: str) -> Report | None:
 
 
 def capture(page: Page, event: Mapping[str, str | None]) -> Message:
+    """Takes a shot and shows it for a decision. Raises what ``Captures.take`` raises."""
     record = page.service.captures.take(CaptureMetadata.of(event))
     page.choice["shot"] = record.id
     shared.forget("rig")
@@ -235,16 +239,19 @@ def capture(page: Page, event: Mapping[str, str | None]) -> Message:
 
 
 def keep(page: Page, event: object) -> None:
+    """Keeps the shot that was just taken, and stops showing it for a decision."""
     page.choice["shot"] = None
 
 
 def retake(page: Page, event: Chosen) -> None:
-    """Discards a shot that is not worth keeping. The page then counts down to the next one."""
+    """Removes the shot that was shown for a decision, after the time to undo that. The page then counts down to the
+    next one."""
     discard(page, event)
     page.choice["shot"] = None
 
 
 def reconstruct_shot(page: Page, event: WorkForm) -> Message:
+    """Keeps the shot and queues a job for it, whose head opens when it is ready. Raises what ``Jobs.submit`` raises."""
     job = page.service.jobs.submit(event["id"], chosen_work(event), key=page.caller.key)
     page.choice |= {"shot": None, "job": job.id}
     page.started(job.id, opens=True)
@@ -252,6 +259,8 @@ def reconstruct_shot(page: Page, event: WorkForm) -> Message:
 
 
 def plates(page: Page, event: object) -> Message | None:
+    """Takes clean plates of the empty studio. Returns None if they show a person; the page then asks whether to use
+    them. Raises DiskFull and Unavailable."""
     page.service.store.reserve(0, page.service.settings.free_bytes)
     try:
         taken = page.service.rig.take_background()
@@ -265,18 +274,21 @@ def plates(page: Page, event: object) -> Message | None:
 
 
 def use_plates(page: Page, event: Chosen) -> Message:
+    """Puts a version of the clean plates to use. Raises NotFound and Unavailable."""
     page.service.rig.use_plates(event["id"])
     shared.forget("rig")
     return compose("plates-taken-into-use")
 
 
 def begin_session(page: Page, event: SessionForm) -> Message:
+    """Makes a session, which the page selects. Raises InputError for invalid texts."""
     notice = new_session(page, event)
     shared.forget("rig")
     return notice
 
 
 def note_consent(page: Page, event: SessionEditForm) -> None:
+    """Changes the label or the consent note of a session. Raises NotFound and InputError."""
     edit_consent(page, event)
     shared.forget("rig")
 
@@ -295,4 +307,5 @@ RigPage.actions = {
 
 @ui.page("/")
 async def rig_page(job: str = "", shot: str = "") -> RedirectResponse | None:
+    """Serves the page of the rig. ``job`` and ``shot`` are shown as if they had been started here."""
     return await show("rig", RigPage, job=job or None, shot=shot or None)

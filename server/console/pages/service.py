@@ -1,4 +1,4 @@
-"""The service itself: API keys, what is kept how long and goes next, and what lies on the disk."""
+"""The page about the service itself: API keys, what is kept and removed next, and what lies on the disk."""
 
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -36,6 +36,8 @@ MEANINGS = {
 
 
 class KeyLine(TypedDict):
+    """Holds an API key without its secret. ``is_yours``: the caller uses it."""
+
     id: str
     name: str
     scopes: list[str]
@@ -44,7 +46,7 @@ class KeyLine(TypedDict):
 
 
 class SettingLine(TypedDict):
-    """Holds one setting of retention: its variable, its value in words, and its meaning."""
+    """Holds one setting of retention: its environment variable, its value in words, and its meaning."""
 
     name: str
     variable: str
@@ -66,14 +68,20 @@ class ServiceShown(TypedDict):
 
 
 class KeyForm(TypedDict):
+    """Holds the name and the scopes of a new API key."""
+
     label: str
     scopes: list[str]
 
 
 class ServicePage(Page, component="service.js"):
+    """Shows API keys, retention and the use of the disk. The secret of a new key is sent over the page's socket once
+    and is never part of the page's state."""
+
     secret: str | None = None  # of a key that was made a moment ago, until the page has it
 
     def look(self) -> ServiceShown:
+        """Returns the state of the page. Only callers with the scope admin see the keys."""
         admin, service = self.caller.may("admin"), self.service
         return {
             "keys": [*key_lines(service, self.caller)] if admin else None,
@@ -94,6 +102,7 @@ class ServicePage(Page, component="service.js"):
 
 
 def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
+    """Converts all API keys to entries of the page's list, oldest first. ``caller`` decides which key is yours."""
     return [
         {
             "id": key.id,
@@ -107,6 +116,7 @@ def key_lines(service: Service, caller: Caller) -> list[KeyLine]:
 
 
 def setting_lines(s: ServiceSettings) -> list[SettingLine]:
+    """Converts the settings of retention to entries of the page's list, with their values in words."""
     values = {
         "keep_captures_days": _days(s.keep_captures_days),
         "keep_results_days": _days(s.keep_results_days),
@@ -132,8 +142,8 @@ def _days(days: float | None) -> Message:
 
 
 def add_key(page: ServicePage, event: KeyForm) -> Message:
-    """Makes an API key. The first one closes an open service and must therefore have the scope admin; the page goes on
-    with it."""
+    """Makes an API key. The first key closes an open service, so it must have the scope admin; the page continues with
+    it. Raises InputError naming every fault of the form."""
     name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
     faults = []
     if not name or len(name) > NAME_MOST:
@@ -154,6 +164,7 @@ def add_key(page: ServicePage, event: KeyForm) -> Message:
 
 
 def revoke(page: ServicePage, event: Chosen) -> Message:
+    """Removes an API key. Raises NotFound, and Conflict for the key that the caller uses."""
     if event["id"] == page.caller.key:
         raise Conflict("own-key", compose("own-key"))
     page.service.keys.remove(event["id"])
@@ -161,12 +172,15 @@ def revoke(page: ServicePage, event: Chosen) -> Message:
 
 
 def clear(page: ServicePage, event: object) -> Message:
+    """Removes the caches of all captures that no job needs."""
     gone = clear_caches(page.service)
     forget_storage(page.service)
     return compose("caches-cleared", count=gone)
 
 
 def remove_failed(page: ServicePage, event: object) -> Message:
+    """Removes the failed and cancelled jobs, at most ``REMOVED_AT_ONCE``, after the time to undo that has passed.
+    Raises Conflict if there are none."""
     jobs = page.service.jobs
     ids = [job.id for job in jobs.page(JobQuery("", FAILED), REMOVED_AT_ONCE).items]
     if not ids:
@@ -177,6 +191,7 @@ def remove_failed(page: ServicePage, event: object) -> Message:
 
 
 def sweep_now(page: ServicePage, event: object) -> Message:
+    """Removes now what retention would remove at its next turn. The message says how much that was."""
     gone = {kind: count for kind, count in sweep(page.service).items() if count}
     forget_storage(page.service)
     removed = [compose("gone-of-kind", count=count, kind=kind) for kind, count in gone.items()]
@@ -184,10 +199,12 @@ def sweep_now(page: ServicePage, event: object) -> Message:
 
 
 def count_again(page: ServicePage, event: object) -> None:
+    """Starts to count the bytes in the data folder anew."""
     forget_storage(page.service)
 
 
 def forget_storage(service: Service) -> None:
+    """Drops the cached figures of the disk and of what retention removes next, so that they are computed anew."""
     service.storage.forget()
     shared.forget("storage", "upcoming")
 
@@ -204,4 +221,5 @@ ServicePage.actions = {
 
 @ui.page("/service")
 async def service_page() -> RedirectResponse | None:
+    """Serves the page about the service itself."""
     return await show("service", ServicePage)

@@ -1,4 +1,4 @@
-"""Subjects: people as cards, each with a picture of the newest head, the shots and the heads."""
+"""The page Subjects: people as cards, each with a picture of the newest head and links to shots and heads."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -18,7 +18,7 @@ ASKED = ("find", "tag", "sort", "after")
 
 
 class SubjectsState(TypedDict):
-    """Holds one page of subjects. ``tags``: the tags of all captures, to choose from."""
+    """Holds one page of the list of subjects. ``tags``: the tags of all captures, to choose from."""
 
     subjects: list[Mapping[str, object]]
     tags: list[str]
@@ -27,12 +27,16 @@ class SubjectsState(TypedDict):
 
 
 class SubjectsPage(Page, component="subjects.js"):
+    """Shows the people of the library, each with a picture of the newest head."""
+
     def look(self) -> SubjectsState:
+        """Returns one page of the list of subjects."""
         requested = {name: self.choice.get(name) or None for name in ASKED}
         return shared.get(("subjects", *requested.values()), 1.0, lambda: subjects_state(self.service, requested))
 
 
 def subjects_state(service: Service, requested: Mapping[str, str | None]) -> SubjectsState:
+    """Returns one page of the subjects that match a search and a tag, in the requested order."""
     order = cast(SubjectOrder, requested["sort"] if requested["sort"] in get_args(SubjectOrder) else "-created")
     found = service.sessions.subjects(requested["find"] or "", order, SHOWN, requested["after"], tag=requested["tag"])
     return {
@@ -44,6 +48,7 @@ def subjects_state(service: Service, requested: Mapping[str, str | None]) -> Sub
 
 
 def begin(page: Page, event: SessionForm) -> Message:
+    """Makes a session of a subject. Raises InputError for invalid texts."""
     notice = new_session(page, event)
     shared.forget("subjects")
     return notice
@@ -54,4 +59,5 @@ SubjectsPage.actions = {"new_session": Action("capture", begin)}
 
 @ui.page("/subjects")
 async def subjects_page(find: str = "", tag: str = "", sort: str = "") -> RedirectResponse | None:
+    """Serves the page Subjects. ``find`` and ``tag`` restrict the list, ``sort`` orders it."""
     return await show("subjects", SubjectsPage, find=find, tag=tag, sort=sort)

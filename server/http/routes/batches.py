@@ -1,4 +1,5 @@
-"""Batches: many captures begun, watched, paused, tried again; and the table and the sheet of their heads."""
+"""Declares the routes of batches: begin, watch, pause and retry them, and fetch the table and the sheet of their
+heads."""
 
 from typing import Annotated
 
@@ -50,7 +51,7 @@ class NewBatch(Received):
 
 
 class BatchCounts(Answer):
-    """Captures by state."""
+    """Counts the captures of a batch by state."""
 
     waiting: int = Field(description="without a job yet")
     queued: int
@@ -62,6 +63,8 @@ class BatchCounts(Answer):
 
 
 class BatchOut(Answer):
+    """Describes a batch: its request, its state, and how many of its captures are in which state."""
+
     id: str
     label: str
     state: BatchState = Field(description="finished: nothing is left to do; a cancelled one stays cancelled")
@@ -79,6 +82,8 @@ class BatchOut(Answer):
 
 
 class BatchList(Listed):
+    """Holds one page of batches."""
+
     batches: list[BatchOut]
 
 
@@ -119,19 +124,20 @@ def list_batches(
 
 @router.get("/batches/{batch_id}", responses=documented(404))
 def get_batch(service: ServiceOf, caller: Reader, batch_id: str) -> BatchOut:
-    """Returns a batch: its state, its captures by state, remaining seconds. ``GET /v1/jobs?batch=`` lists its jobs."""
+    """Returns a batch: its state, its captures by state, and the estimated remaining seconds. ``GET /v1/jobs?batch=``
+    lists its jobs."""
     return BatchOut.model_validate(service.batches.get(batch_id))
 
 
 @router.post("/batches/{batch_id}/pause", responses=documented(404, 409))
 def pause_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """Stops the batch from beginning further jobs; running ones go on. Queued jobs are withdrawn within a second."""
+    """Pauses a batch: no further job begins, running jobs continue. Queued jobs are withdrawn within a second."""
     return BatchOut.model_validate(service.batches.pause(batch_id))
 
 
 @router.post("/batches/{batch_id}/resume", responses=documented(404, 409))
 def resume_batch(service: ServiceOf, caller: Submitter, batch_id: str) -> BatchOut:
-    """Continues a paused batch."""
+    """Resumes a paused batch: its captures get jobs again."""
     return BatchOut.model_validate(service.batches.resume(batch_id))
 
 

@@ -39,9 +39,11 @@ TAGS = "with commas between"
 
 @router.post("/captures", status_code=201, responses=documented(400, 404, 413, 415, 507))
 def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response: Response) -> CaptureOut:
-    """Triggers the rig at once. Answers 201 when every camera has delivered, or 503 when the fault is known.
+    """Takes a shot with the rig at once. Answers 201 when every camera has delivered, and 503 naming what is missing if
+    one has not.
 
-    ``board``: takes pictures of the calibration board for ``POST /v1/calibrations``, from the cameras that deliver."""
+    ``board``: takes pictures of the calibration board for ``POST /v1/calibrations``, from those cameras that deliver.
+    """
     about = CaptureMetadata(wanted.session, wanted.label, wanted.expression, checked_tags(wanted.tags))
     return _created(service.captures.take(about, seed=wanted.seed, board=wanted.board), response)
 
@@ -60,8 +62,8 @@ async def upload_capture(service: ServiceOf, caller: Taker, request: Request, re
 
 @router.post("/captures/imports", status_code=201, responses=documented(400, 404, 413, 415, 507))
 async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, response: Response) -> CaptureOut:
-    """Downloads a capture folder as an archive from a server that the operator allowed (``EIGENHEAD_IMPORT_ORIGINS``;
-    403 if there is none). 422 names every fault in the archive."""
+    """Downloads an archive of a capture folder from a server that the operator allowed (``EIGENHEAD_IMPORT_ORIGINS``;
+    403 if none is). 422 names every fault in the archive."""
     if not service.settings.import_origins:
         detail = compose("imports-not-allowed")
         raise Forbidden("imports-off", detail)
@@ -156,7 +158,7 @@ def get_image(service: ServiceOf, caller: Reader, request: Request, capture_id: 
 @router.head("/captures/{capture_id}/backgrounds/{camera}", include_in_schema=False)
 @router.get("/captures/{capture_id}/backgrounds/{camera}", responses=IMAGE_RESPONSES, response_class=FileResponse)
 def get_background(service: ServiceOf, caller: Reader, request: Request, capture_id: str, camera: str) -> Response:
-    """Returns the first clean plate of a camera."""
+    """Returns a clean plate of a camera, the first one if there are several."""
     return send_file(request, service.captures.image(capture_id, "background", camera))
 
 
@@ -168,7 +170,7 @@ def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: N
 
 @router.get("/captures/{capture_id}/features", responses=documented(404))
 def get_features(service: ServiceOf, caller: Reader, capture_id: str) -> NewFeatures:
-    """Returns the stored feature points."""
+    """Returns the stored feature points, in pixels, by point and camera."""
     return NewFeatures(points=service.captures.features(capture_id))
 
 
@@ -185,8 +187,11 @@ def delete_capture(
     capture_id: str,
     erase: Annotated[bool, Query(description="its jobs and heads, too, for good")] = False,
 ) -> None:
-    """Removes a capture with its images. Its jobs and their results, which show the face, stay. 409 while a job needs
-    the capture. With ``erase`` its jobs are cancelled and removed with their results, too."""
+    """Removes a capture with its images. Its jobs and their results, which show the face, stay. 409 while a queued or
+    running job needs it.
+
+    With ``erase`` its jobs are cancelled and removed with their results, too.
+    """
     if erase:
         service.captures.erase(capture_id)
     else:

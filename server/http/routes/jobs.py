@@ -14,7 +14,7 @@ from server.http.auth import ServiceOf, require
 from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Key, Limit, Sought
 from server.http.schemas import Idempotency, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
 from server.services.bulk import each
-from server.services.jobs import FINISHED, STATUSES
+from server.services.job_rows import FINISHED, STATUSES
 from server.services.keys import Caller
 from server.services.records import Job
 from server.services.work import ReconstructionRequest
@@ -46,7 +46,7 @@ def submit_job(
 
 @router.post("/sessions/{session_id}/jobs", status_code=202, responses=documented(400, 404, 413, 415, 507))
 def submit_session(service: ServiceOf, caller: Submitter, session_id: str, wanted: NewSessionJobs) -> JobBatch:
-    """Queues a reconstruction of every capture of a session."""
+    """Queues a reconstruction of every capture of a session that shows a head."""
     work = ReconstructionRequest(wanted.model, wanted.settings)
     jobs = service.jobs.submit_session(session_id, work, key=caller.key, priority=wanted.priority)
     return JobBatch(jobs=[JobOut.model_validate(job) for job in jobs])
@@ -96,7 +96,7 @@ def get_job(service: ServiceOf, caller: Reader, job_id: str) -> JobOut:
 
 
 def known_job(service: ServiceOf, caller: Reader, job_id: str) -> str:
-    """Returns the job's id, or raises NotFound before a stream begins, since the status is sent before its first
+    """Returns the id of a job. Raises NotFound before a stream begins, since the status is sent before a stream's first
     byte."""
     service.jobs.state(job_id)
     return job_id
@@ -127,7 +127,7 @@ async def job_events(
 
 @router.post("/jobs/{job_id}/cancel", responses=documented(404))
 def cancel_job(service: ServiceOf, caller: Submitter, job_id: str) -> JobOut:
-    """Cancels a job within a second, in any stage. A finished job does not change."""
+    """Cancels a job, in any stage; its worker stops within a second. A finished job does not change."""
     return JobOut.model_validate(service.cancel(job_id))
 
 

@@ -1,4 +1,5 @@
-"""Declares the routes of health, readiness, metrics, models, templates, keys and webhooks, and the page of the API."""
+"""Declares the routes of health, readiness, metrics, models, templates, keys and webhooks, and the page that shows the
+API."""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -9,7 +10,7 @@ from fastapi.responses import FileResponse
 
 from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
-from server.http.schemas import (
+from server.http.operation_schemas import (
     CheckOut,
     Health,
     InfoOut,
@@ -46,14 +47,14 @@ def docs() -> FileResponse:
 
 @router.get("/healthz", tags=["operations"])
 async def healthz() -> Health:
-    """Answers as long as the process runs."""
+    """Answers as long as the process runs. It checks nothing else; ``/readyz`` does."""
     return Health(status="ok", version=version("eigenhead"))
 
 
 @router.get("/readyz", tags=["operations"], responses={503: {"model": Ready, "description": "Not ready"}})
 def readyz(service: ServiceOf, response: Response) -> Ready:
-    """Tells whether the service can take work: EGL, disk, database, a worker, the rig. If not, the status is 503, with
-    the same document."""
+    """Returns whether the service can take work: OpenGL, disk, database, a worker, the rig. If not, the status is 503,
+    with the same document."""
     checks = readiness(service)
     ready = all(check.ok for check in checks.values())
     response.status_code = 200 if ready else 503
@@ -121,17 +122,17 @@ def remove_key(service: ServiceOf, caller: Admin, key_id: str) -> None:
 
 @router.post("/v1/webhooks", status_code=201, tags=["webhooks"], responses=documented(400, 413, 415, 507))
 def add_webhook(service: ServiceOf, caller: Admin, wanted: NewWebhook) -> NewWebhookOut:
-    """Registers an address for signed messages about ended jobs (standardwebhooks.com)."""
+    """Registers an address that gets a signed message whenever a job or a batch ends (standardwebhooks.com)."""
     return NewWebhookOut.model_validate(service.webhooks.add(wanted.url))
 
 
 @router.get("/v1/webhooks", tags=["webhooks"], responses=documented())
 def list_webhooks(service: ServiceOf, caller: Admin) -> WebhookList:
-    """Lists the addresses that are notified when a job ends."""
+    """Lists the addresses that get a message whenever a job or a batch ends, oldest first."""
     return WebhookList(webhooks=[WebhookOut.model_validate(hook) for hook in service.webhooks.all()])
 
 
 @router.delete("/v1/webhooks/{webhook_id}", status_code=204, tags=["webhooks"], responses=documented(404))
 def remove_webhook(service: ServiceOf, caller: Admin, webhook_id: str) -> None:
-    """Removes an address; it is notified no more."""
+    """Removes an address, which gets no further messages."""
     service.webhooks.remove(webhook_id)

@@ -12,12 +12,15 @@ from fastapi.responses import StreamingResponse
 from server.errors import Unavailable
 from server.http.auth import ServiceOf, require
 from server.http.calibration_schemas import UseCalibration
-from server.http.rig_schemas import BackgroundOut, PlatesList, PlatesOut, UsePlates
-from server.http.schemas import (
+from server.http.rig_schemas import (
+    BackgroundOut,
     CameraSettingsEdit,
     CameraSettingsOut,
     Lights,
+    PlatesList,
+    PlatesOut,
     RigOut,
+    UsePlates,
 )
 from server.services.keys import Caller
 from server.services.service import Service
@@ -33,7 +36,7 @@ UNKEPT = {"Cache-Control": "no-store"}
 
 @router.get("", responses=documented())
 def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
-    """Returns cameras, drivers and faults of the rig, and its calibration."""
+    """Returns the cameras, drivers and faults of the rig, and whether it is calibrated."""
     return RigOut.model_validate(service.rig.describe())
 
 
@@ -43,7 +46,7 @@ def rig_state(service: ServiceOf, caller: Reader) -> RigOut:
     responses={200: {"content": {"image/jpeg": {}}}, **documented(404)},
 )
 def rig_preview(service: ServiceOf, caller: Reader, name: str) -> Response:
-    """Returns the camera's present picture."""
+    """Returns a camera's present picture, at most 640 pixels wide."""
     return Response(service.rig.preview(name), media_type="image/jpeg", headers=UNKEPT)
 
 
@@ -104,10 +107,11 @@ def set_lights(service: ServiceOf, caller: Taker, wanted: Lights) -> Lights:
 
 @router.post("/background", responses=documented(409, 507))
 def take_background(service: ServiceOf, caller: Taker) -> BackgroundOut:
-    """Takes new clean plates of the empty studio.
+    """Takes new clean plates of the empty studio and uses them for later captures.
 
-    The old ones stay in use if that fails (503), or if the new ones show somebody whom the old ones do not (409). In
-    the latter case the new ones are kept, and PUT can put them to use nevertheless."""
+    If that fails (503), or if the new plates show a person whom the old ones do not (409), the old ones stay in use.
+    After a 409 the new plates are kept, and ``PUT`` can put them to use nevertheless.
+    """
     service.store.reserve(0, service.settings.free_bytes)
     return BackgroundOut.model_validate(service.rig.take_background())
 
@@ -127,6 +131,6 @@ def use_plates(service: ServiceOf, caller: Taker, wanted: UsePlates) -> PlatesLi
 
 @router.put("/calibration", responses=documented(400, 404, 409, 413, 415, 507))
 def use_calibration(service: ServiceOf, caller: Taker, wanted: UseCalibration) -> RigOut:
-    """Selects the calibration of every later capture. 409 for one whose verdict is poor, with the reasons, unless
-    ``poor`` is set."""
+    """Selects the calibration of every later capture. Answers 409, with the reasons, for a calibration whose verdict is
+    poor, unless ``poor`` is set."""
     return RigOut.model_validate(service.use_calibration(wanted.calibration_id, poor=wanted.poor))

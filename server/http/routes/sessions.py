@@ -18,7 +18,7 @@ Taker = Annotated[Caller, Depends(require("capture"))]
 
 @router.post("/sessions", status_code=201, responses=documented(400, 413, 415, 507))
 def make_session(service: ServiceOf, caller: Taker, wanted: NewSession, response: Response) -> SessionOut:
-    """Begins a session of one subject."""
+    """Begins a session, which holds captures of one subject."""
     made = service.sessions.add(wanted.label, wanted.consent)
     response.headers["Location"] = f"/v1/sessions/{made.id}"
     return SessionOut.model_validate(made)
@@ -45,7 +45,8 @@ def list_subjects(
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> SubjectList:
-    """Lists people, each with the newest head. Sessions with the same name are one person's."""
+    """Lists people in pages, each with the newest head. Sessions with the same name are one person's. ``q`` searches
+    label and consent."""
     found = service.sessions.subjects(q, sort, limit, cursor, tag=tag)
     subjects = [PersonOut.model_validate(subject) for subject in found.items]
     return SubjectList(subjects=subjects, next=found.next, total=found.total)
@@ -59,13 +60,13 @@ def get_session(service: ServiceOf, caller: Reader, session_id: str) -> SessionO
 
 @router.patch("/sessions/{session_id}", responses=documented(400, 404, 413, 415, 507))
 def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: SessionEdit) -> SessionOut:
-    """Changes the label or the consent note."""
+    """Changes the label or the consent note of a session. Keys that are left out keep their values."""
     changed = service.sessions.edit(session_id, label=wanted.label, consent=wanted.consent)
     return SessionOut.model_validate(changed)
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))
 def erase_session(service: ServiceOf, caller: Taker, session_id: str) -> None:
-    """Erases a subject: cancels the jobs, then removes images, results, caches and the subject's data in the job
+    """Erases a session for good: cancels its jobs, then removes images, results, caches and its data in the job
     database."""
     service.sessions.erase(session_id)

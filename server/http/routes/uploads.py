@@ -34,7 +34,7 @@ COMMON = {"Tus-Resumable": VERSION, "Cache-Control": "no-store"}
 
 @router.options("", status_code=204, responses=documented())
 def tus_options(service: ServiceOf) -> Response:
-    """Returns which parts of the tus protocol this server supports."""
+    """Returns which parts of the tus protocol this server supports, and the largest upload."""
     headers = {
         "Tus-Version": VERSION,
         "Tus-Extension": "creation,termination,checksum,expiration",
@@ -94,7 +94,8 @@ async def tus_patch(
     upload_offset: Annotated[str | None, Header(alias="Upload-Offset")] = None,
     upload_checksum: Annotated[str | None, Header(alias="Upload-Checksum", max_length=200)] = None,
 ) -> Response:
-    """Appends bytes at ``Upload-Offset``. With the last byte the capture is made."""
+    """Appends bytes at ``Upload-Offset``. The last byte makes the capture: the answer has its ``Location``, or 422
+    names every fault."""
     _check_version(tus_resumable)
     if request.headers.get("content-type") != "application/offset+octet-stream":
         raise Problem(415, "unsupported-media-type", compose("offset-stream-wanted"))

@@ -1,17 +1,20 @@
 """A trace is what Chrome's viewer reads: spans that nest thread by thread, of every slice that ran."""
 
 import json
+import subprocess
+import sys
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.compute import threads as threads_module
 from pipeline.compute.threads import TRACED_THREADS, in_threads, map_in_threads, slice_count, task_pool
-from pipeline.compute.trace import FORMAT, Trace, active_trace, name_of, recorded, span, traced
+from pipeline.compute.trace import FORMAT, Trace, active_trace, name_of, peak_memory_mb, recorded, span, traced
 
 COUNT = 100
 
@@ -156,3 +159,10 @@ def test_a_loop_is_named_by_what_holds_it() -> None:
     assert {name_of(inner), name_of(lambda: None)} == {held}
     assert name_of(slice_count) == "compute.threads.slice_count"
     assert name_of(squares) == f"{__name__}.squares"
+
+
+def test_the_memory_of_a_large_parent_is_not_the_childs() -> None:
+    held = np.ones(300 << 20, np.uint8)  # ru_maxrss of a child begins with what its parent held
+    program = "from pipeline.compute.trace import peak_memory_mb; print(peak_memory_mb())"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert 1.0 < float(done.stdout) < held.nbytes / (1 << 20) < peak_memory_mb()

@@ -8,7 +8,8 @@ import pytest
 import sqlalchemy as sa
 
 from server.cli import doctor
-from server.services.jobs import WORKFLOW, migrate
+from server.services.job_rows import WORKFLOW
+from server.services.jobs import migrate
 from server.services.keys import Keys
 from server.settings import ServiceSettings
 from server.storage.database import open_database

@@ -17,7 +17,7 @@ from pipeline.evidence.measurements import DISTANCES
 from rig.acquisition import shot, verdict
 from server.console.theme import PAGES
 from server.services.batches import ITEM_STATES
-from server.services.jobs import FINISHED
+from server.services.job_rows import FINISHED
 from server.services.storage_use import KINDS
 from server.storage.batches import BatchState
 from tests.support.console_words import (

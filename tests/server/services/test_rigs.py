@@ -19,7 +19,10 @@ from rig.messages.message import texts_of
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from rig.studio.scene.layout import default_layout
 from server.errors import Conflict, NotFound, Unavailable
-from server.services.rigs import RealRig, SimulatedRig, jpeg, open_rig, reduced
+from server.services.rigs.opening import open_rig
+from server.services.rigs.previews import jpeg, reduced
+from server.services.rigs.real import RealRig
+from server.services.rigs.simulated import SimulatedRig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.textured_studio import NAMES, FlatStudio
@@ -128,7 +131,7 @@ def test_settings_reach_the_driver_and_are_kept(
         configured[camera.name] = camera
         return driver_for(camera, folder)
 
-    monkeypatch.setattr("server.services.rigs.RigSession", lambda config: RigSession(config, noting))
+    monkeypatch.setattr("server.services.rigs.real.RigSession", lambda config: RigSession(config, noting))
     rig.look()
     assert configured["cam03"].exposure_ms is None
     changed = rig.set_camera("cam03", {"exposure_ms": 8.0, "gain_db": 3.0})

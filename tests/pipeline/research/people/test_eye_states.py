@@ -14,7 +14,7 @@ from pipeline.research.people.eye_states import (
     figures,
     photograph_eyes,
     table,
-    told_sides,
+    warned_sides,
 )
 from pipeline.warnings import ReportWarning
 from rig.errors import EigenheadError
@@ -32,10 +32,10 @@ def eyes_closed(text: str, code: str = "eyes-closed") -> ReportWarning:
 
 
 def test_the_eyes_are_those_that_the_warning_names() -> None:
-    assert told_sides([eyes_closed("both eyes are closed: no white")]) == {"right", "left"}
-    assert told_sides([eyes_closed("the left eye is closed: no white")]) == {"left"}
-    assert told_sides([eyes_closed("the left eye is closed", "view")]) == frozenset()
-    assert told_sides([]) == frozenset()
+    assert warned_sides([eyes_closed("both eyes are closed: no white")]) == {"right", "left"}
+    assert warned_sides([eyes_closed("the left eye is closed: no white")]) == {"left"}
+    assert warned_sides([eyes_closed("the left eye is closed", "view")]) == frozenset()
+    assert warned_sides([]) == frozenset()
 
 
 def test_every_fourth_head_moves_one_eye() -> None:

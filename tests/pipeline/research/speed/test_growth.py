@@ -41,7 +41,7 @@ def test_exponents_of_known_costs() -> None:
 def test_jobs_run_in_children_and_their_rows_are_kept(tmp_path: Path, renderer: Renderer) -> None:
     args = {"cpu_s": 1.0, "process_cpu_s": 1.0}
     stage = {"ph": "X", "cat": "stage", "name": "a", "tid": 1, "ts": 0, "dur": 1e6, "args": args}
-    trace = {"format": FORMAT, "before_cpu_s": 0.5, "traceEvents": [stage]}
+    trace = {"format": FORMAT, "before_cpu_s": 0.5, "peak_memory_mb": 512.0, "traceEvents": [stage]}
     (tmp_path / "job.py").write_text(
         "import os, sys\n"
         "views = len(os.listdir(os.path.join(sys.argv[1], 'images')))\n"

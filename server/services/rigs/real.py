@@ -1,8 +1,4 @@
-"""The rig behind ``POST /v1/captures``: the simulated studio, or real cameras named by a rig.toml.
-
-A calibration that was put to use lies in ``<data>/rig/cameras.json`` and goes into every capture from then on; until
-then the rig's own one does (the studio's layout, or what rig.toml names).
-"""
+"""Makes the real cameras that a rig.toml describes usable as the service's rig."""
 
 import json
 import threading
@@ -10,10 +6,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
-
-import cv2
-import numpy as np
 
 from rig.acquisition.commands import board_shot
 from rig.acquisition.plate_checks import PlatesRefused
@@ -28,156 +20,21 @@ from rig.formats.capture_folder import write_capture
 from rig.formats.images import write_image
 from rig.formats.rig_toml import RigConfig, adjusted, read_rig_config
 from rig.image import ImageRgb
-from rig.messages.message import Message, compose, message_of
+from rig.messages.message import compose, message_of
 from rig.rig import Rig
 from server.errors import Conflict, NotFound, Unavailable
 from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
-from server.settings import ServiceSettings
+from server.services.rigs.backend import check_names, rig_state
+from server.services.rigs.previews import jpeg
 from server.storage.records import RIG_ADJUSTMENT, RigAdjustment
-from server.tasks.child import Child, WorkFailed
-from server.tasks.simulate import SimulatedCertificate, look, simulated
-
-PREVIEW_WIDTH = 640
-PREVIEW_QUALITY = 80
-SHOT_BYTES = 64 << 20
-
-
-class RigBackend(Protocol):
-    """Declares what the service needs of a rig. Methods block: call them from a thread."""
-
-    def describe(self) -> RigState: ...
-
-    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument | SimulatedCertificate:
-        """Takes a shot into ``folder/files`` and returns its certificate. Raises Unavailable naming what is missing.
-
-        ``board``: the shot shows the calibration board, for which neither a calibration nor every camera is needed.
-        """
-        ...
-
-    def look(self) -> Mapping[str, ImageRgb]:
-        """Returns what each camera sees now; cameras that show nothing are left out. Raises Unavailable."""
-        ...
-
-    def preview(self, camera: str) -> bytes:
-        """Returns a JPEG file of what a camera sees now. Raises NotFound and Unavailable."""
-        ...
-
-    def camera_settings(self, camera: str) -> CameraSettings:
-        """Returns the exposure, gain and white balance that were requested of a camera. Raises NotFound."""
-        ...
-
-    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
-        """Changes settings of a camera from now on; an open rig is opened anew. Raises NotFound, InputError and
-        Conflict."""
-        ...
-
-    def lights(self) -> tuple[int, ...]:
-        """Returns the light outputs that are on during a shot."""
-        ...
-
-    def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
-        """Changes which light outputs are on during a shot, from now on. Raises InputError and Conflict."""
-        ...
-
-    def take_background(self) -> CleanPlates:
-        """Takes new clean plates of the empty studio. Raises Unavailable, and Conflict where they show somebody."""
-        ...
-
-    def plates(self) -> list[PlatesVersion]:
-        """Returns the clean plates in use and those kept, newest first."""
-        ...
-
-    def use_plates(self, version: str) -> None:
-        """Puts clean plates that were kept to use again. Raises NotFound."""
-        ...
-
-    def use(self, calibration: Path) -> None:
-        """Uses the calibration in a cameras.json file from now on. Raises Conflict if it is of another rig."""
-        ...
-
-    def close(self) -> None: ...
-
-
-class SimulatedRig:
-    """Takes shots of the simulated studio, rendered in a child process with a GL context of its own. The truth of a
-    shot is kept beside it."""
-
-    def __init__(self, calibration: Path) -> None:
-        self._calibration = calibration
-        self._child = Child(niceness=3)
-        self._one_at_a_time = threading.Lock()
-
-    def describe(self) -> RigState:
-        rig = self._rig()
-        cameras = [RigCamera(name, "simulated", "ready") for name in rig.names]
-        calibrated = "own" if self._calibration.is_file() else "studio"
-        return _state("simulated", "simulated", cameras, [], calibrated)
-
-    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> SimulatedCertificate:
-        """Takes a shot of a person even if ``board`` is set: the studio has no board to show."""
-        with self._one_at_a_time:
-            try:
-                shot = self._child.remote(simulated)(folder=str(folder), seed=seed)
-            except WorkFailed as error:
-                raise Unavailable("shot-failed", error.message, [error.message]) from error
-        if self._calibration.is_file():
-            write_rig(read_rig(self._calibration), folder / "files" / "cameras.json")
-        return shot
-
-    def look(self) -> Mapping[str, ImageRgb]:
-        with self._one_at_a_time:
-            return self._child.remote(look)(cameras=list(self._rig().names))
-
-    def preview(self, camera: str) -> bytes:
-        if camera not in self._rig():
-            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
-        with self._one_at_a_time:
-            return jpeg(self._child.remote(look)(cameras=[camera])[camera])
-
-    def camera_settings(self, camera: str) -> CameraSettings:
-        if camera not in self._rig():
-            raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
-        return CameraSettings(None, None, None, ())
-
-    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
-        self.camera_settings(camera)
-        raise fixed_studio()
-
-    def lights(self) -> tuple[int, ...]:
-        return ()
-
-    def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
-        raise fixed_studio()
-
-    def take_background(self) -> CleanPlates:
-        """Takes no pictures: the simulated studio takes clean plates with every shot. Returns its
-        cameras and a note."""
-        return CleanPlates(self._rig().names, 2, compose("hint-studio-plates"))
-
-    def plates(self) -> list[PlatesVersion]:
-        return []
-
-    def use_plates(self, version: str) -> None:
-        raise NotFound(compose("thing-plates-version"), version, compose("hint-studio-plates"))
-
-    def use(self, calibration: Path) -> None:
-        _check_names(read_rig(calibration), self._rig().names)
-        self._calibration.parent.mkdir(exist_ok=True)
-        write_rig(read_rig(calibration), self._calibration)
-
-    def close(self) -> None:
-        self._child.close()
-
-    @staticmethod
-    def _rig() -> Rig:
-        from rig.studio.scene.layout import default_layout
-
-        return default_layout()
 
 
 class RealRig:
-    """Takes shots with the cameras of a rig.toml. The rig is opened when first needed and stays open; where that fails,
-    it is tried again."""
+    """Takes shots with the cameras of a rig.toml, one at a time.
+
+    The cameras are opened at the first use and stay open. If opening fails, the next use tries again. Settings that the
+    operator changed lie beside the calibration in adjusted.json and hold after a restart.
+    """
 
     def __init__(self, path: Path, calibration: Path) -> None:
         self._from_file: RigConfig = read_rig_config(path)
@@ -188,6 +45,8 @@ class RealRig:
         self._lock = threading.RLock()
 
     def describe(self) -> RigState:
+        """Returns the state of the rig. Cameras that were not used yet are "closed", which is no fault; a missing
+        calibration is one."""
         with self._lock:
             states = {} if self._session is None else self._session.states()
             error = None if self._session is None else self._session.trigger_error()
@@ -201,9 +60,15 @@ class RealRig:
         rig = self._calibrated()
         if rig is None:
             faults.append(compose("rig-not-calibrated"))
-        return _state(self._config.name, "real", cameras, faults, None if rig is None else "own")
+        return rig_state(self._config.name, "real", cameras, faults, None if rig is None else "own")
 
     def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument:
+        """Takes a shot and writes the capture, with links to the clean plates, or copies of them where the disk has no
+        links. Nothing is written if a camera failed.
+
+        Raises InputError for a seed, and Unavailable if the rig has no calibration (unless ``board`` is set), cannot be
+        opened, or a camera fails.
+        """
         if seed is not None:
             raise InputError("request", [compose("seed-of-real-rig")])
         if board:
@@ -235,10 +100,13 @@ class RealRig:
         return shot.document()
 
     def look(self) -> Mapping[str, ImageRgb]:
+        """Takes one picture with each camera, without trigger. Raises Unavailable if the rig cannot be opened."""
         with self._lock:
             return self._opened().look()
 
     def preview(self, camera: str) -> bytes:
+        """Takes one picture with one camera and returns it as a JPEG file. Raises NotFound for an unknown camera, and
+        Unavailable if it delivers none."""
         if camera not in self._config.names:
             raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
         with self._lock:
@@ -248,6 +116,8 @@ class RealRig:
         return jpeg(image)
 
     def camera_settings(self, camera: str) -> CameraSettings:
+        """Returns the settings requested of a camera, by rig.toml or by the operator, and those that the driver did not
+        take. Raises NotFound for an unknown camera."""
         wanted = next((found for found in self._config.cameras if found.name == camera), None)
         if wanted is None:
             raise NotFound(compose("thing-rig-camera"), camera, compose("hint-rig"))
@@ -257,6 +127,8 @@ class RealRig:
         return CameraSettings(wanted.exposure_ms, wanted.gain_db, wanted.white_balance_k, unmet)
 
     def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+        """Changes settings of a camera and stores them in adjusted.json. An open rig is closed and opened again, since
+        drivers take settings when they open. Raises NotFound and InputError."""
         self.camera_settings(camera)
         with self._lock:
             before = self._adjustment()
@@ -265,9 +137,12 @@ class RealRig:
             return self.camera_settings(camera)
 
     def lights(self) -> tuple[int, ...]:
+        """Returns the numbers of the trigger box's light outputs that are on during a shot."""
         return self._config.lights.outputs
 
     def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
+        """Chooses the light outputs that are on during a shot and stores the choice in adjusted.json. Raises InputError
+        for wrong outputs."""
         with self._lock:
             self._adjust(replace(self._adjustment(), lights=outputs))
             return self.lights()
@@ -290,6 +165,8 @@ class RealRig:
                 self._opened()
 
     def take_background(self) -> CleanPlates:
+        """Takes clean plates with all cameras and puts them to use. Raises Unavailable if cameras fail. Raises Conflict
+        if the plates show a person; they are kept as a version that ``use_plates`` can put to use all the same."""
         with self._lock:
             try:
                 plates = self._opened().take_plates()
@@ -303,17 +180,22 @@ class RealRig:
         return CleanPlates(tuple(sorted(plates.files)), self._config.shot.plates, None)
 
     def plates(self) -> list[PlatesVersion]:
+        """Returns the versions of clean plates on the disk, newest first."""
         return plates_versions(self._config.plates_folder)
 
     def use_plates(self, version: str) -> None:
+        """Puts a version of the clean plates to use. Raises NotFound for an unknown version, and Unavailable if the rig
+        cannot be opened."""
         with self._lock:
             if all(kept.id != version for kept in self.plates()):
                 raise NotFound(compose("thing-plates-version"), version, compose("hint-plates"))
             self._opened().use_plates(version)
 
     def use(self, calibration: Path) -> None:
+        """Copies a calibration to the data folder and uses it for every later shot. Raises Conflict if its cameras are
+        not those of rig.toml."""
         rig = read_rig(calibration)
-        _check_names(rig, self._config.names)
+        check_names(rig, self._config.names)
         self._calibration.parent.mkdir(exist_ok=True)
         write_rig(rig, self._calibration)
         with self._lock:
@@ -321,6 +203,7 @@ class RealRig:
                 self._session.rig = rig
 
     def close(self) -> None:
+        """Closes the cameras. The next use opens them again."""
         with self._lock:
             if self._session is not None:
                 self._session.close()
@@ -347,45 +230,3 @@ class RealRig:
             if self._config.calibration_file is not None:
                 return read_rig(self._config.calibration_file)
         return None
-
-
-def fixed_studio() -> Conflict:
-    detail = compose("simulated-rig-fixed")
-    return Conflict("simulated-rig", detail)
-
-
-def open_rig(settings: ServiceSettings) -> RigBackend:
-    """Returns the rig of the settings: simulated, or described by a rig.toml. Raises InputError naming every fault of
-    rig.toml."""
-    calibration = settings.data / "rig" / "cameras.json"
-    return SimulatedRig(calibration) if settings.rig is None else RealRig(settings.rig, calibration)
-
-
-def jpeg(image: ImageRgb, width: int = PREVIEW_WIDTH) -> bytes:
-    """Encodes RGB pixels as a JPEG file, reduced to a width of at most ``width`` pixels."""
-    small = reduced(image, width)
-    done, data = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, PREVIEW_QUALITY])
-    assert done
-    return data.tobytes()
-
-
-def reduced(image: ImageRgb, width: int) -> ImageRgb:
-    """Returns the image, reduced to a width of ``width`` pixels where it is wider."""
-    if image.shape[1] <= width:
-        return image
-    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
-
-
-def _check_names(rig: Rig, names: tuple[str, ...]) -> None:
-    if set(rig.names) != set(names):
-        differing = sorted(set(rig.names) ^ set(names))
-        detail = compose("calibration-of-other-rig")
-        raise Conflict("other-rig", detail, [compose("camera-in-one-alone", camera=name) for name in differing])
-
-
-def _state(
-    identity: str, kind: str, cameras: list[RigCamera], faults: list[Message], calibration: str | None
-) -> RigState:
-    ready = not faults and all(camera.state != "missing" for camera in cameras)
-    return RigState(identity, kind, ready, tuple(cameras), tuple(faults), calibration)

@@ -1,0 +1,153 @@
+"""Converts captures and sessions to the entries of the lists on pages."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from typing import TypedDict, cast
+
+from rig.acquisition.shot import CameraSyncDocument, FaultDocument, SyncDocument
+from rig.messages.message import MessageDocument, compose, documents_of
+from server.console.page import shared
+from server.console.removal import removals
+from server.errors import NotFound
+from server.services.records import Session
+from server.services.service import Service
+from server.storage.records import CaptureRecord
+from server.tasks.simulate import SimulatedCertificate, SimulatedSync
+
+SESSIONS_SHOWN = 200  # newest ones, in lists to choose from; older ones are found on the page Subjects
+
+
+class JobOfCapture(TypedDict):
+    """Holds a job of a capture. ``progress`` (0 to 1) is None unless the job runs."""
+
+    id: str
+    state: str
+    progress: float | None
+
+
+class SyncLine(TypedDict):
+    """Holds a sentence on how nearly the pictures of a shot show the same moment. ``good``: they do."""
+
+    message: MessageDocument
+    good: bool
+
+
+class CaptureLine(TypedDict):
+    """Holds a capture as a list shows it. ``size``: of the first camera's pictures (px); ``sizes``: width and height by
+    camera; ``jobs``: all its jobs, newest first."""
+
+    id: str
+    created: str
+    source: str
+    label: str
+    expression: str
+    front: str
+    features: bool
+    cameras: list[str]
+    bytes: int
+    session: str | None
+    jobs: list[JobOfCapture]
+    board: bool
+    size: dict[str, str | int]
+    sizes: dict[str, tuple[int, int]]
+    verdict: str | None
+    faults: list[FaultDocument]
+    warnings: list[MessageDocument]
+    sync: SyncLine | None
+    tags: list[str]
+
+
+class SessionLine(TypedDict):
+    """Holds a session as a list shows it. ``captures``: how many it has."""
+
+    id: str
+    created: str
+    label: str
+    consent: str
+    captures: int
+
+
+def jobs_of(service: Service, captures: Sequence[str]) -> dict[str, list[JobOfCapture]]:
+    """Returns the jobs of each capture, newest first, with the progress of those that run. Jobs that are being removed
+    are left out."""
+    found = service.jobs.of_captures(captures)
+    running = [job for jobs in found.values() for job, state in jobs if state == "running"]
+    progress = {job.id: job.progress for job in service.jobs.of(running)}
+    return {
+        capture: [
+            {"id": job, "state": state, "progress": progress.get(job)} for job, state in jobs if job not in removals
+        ]
+        for capture, jobs in found.items()
+    }
+
+
+def capture_line(record: CaptureRecord, jobs: list[JobOfCapture]) -> CaptureLine:
+    """Converts a capture's record to an entry of a list. ``jobs``: the capture's jobs, as ``jobs_of`` returns them."""
+    return {
+        "id": record.id,
+        "created": record.created,
+        "source": record.source,
+        "label": record.label,
+        "expression": record.expression,
+        "front": record.front,
+        "features": record.features,
+        "cameras": [camera.name for camera in record.cameras],
+        "bytes": record.bytes,
+        "session": record.session,
+        "jobs": jobs,
+        "board": record.board,
+        "size": asdict(record.cameras[0]),
+        "sizes": {camera.name: (camera.width, camera.height) for camera in record.cameras},
+        "verdict": record.verdict,
+        "faults": [fault.document() for fault in record.faults],
+        "warnings": documents_of(record.warnings),
+        "sync": None if record.shot is None else sync_line(record.shot),
+        "tags": [*record.tags],
+    }
+
+
+def sync_line(shot: Mapping[str, object]) -> SyncLine:
+    """Makes a sentence on how nearly the pictures of a shot show the same moment. ``shot`` is its certificate."""
+    lines = sync_of(shot)
+    late = sorted(name for name, line in lines.items() if line["status"] not in ("in sync", "recorded"))
+    if late:
+        return {"message": compose("not-in-sync", cameras=late).document(), "good": False}
+    spread_ms = cast(SyncDocument, shot["sync"])["spread_ms"] if "sync" in shot else None
+    if spread_ms is None:
+        return {"message": compose("cameras-in-sync", count=len(lines)).document(), "good": True}
+    return {
+        "message": compose("cameras-in-sync-within", count=len(lines), spread_ms=spread_ms).document(),
+        "good": True,
+    }
+
+
+def sync_of(shot: Mapping[str, object]) -> Mapping[str, CameraSyncDocument | SimulatedSync]:
+    """Returns the sync status and skew of each camera from the certificate of a shot, of a real rig or of the simulated
+    studio."""
+    certificate = cast(SyncDocument | SimulatedCertificate, shot.get("sync", shot))
+    return certificate.get("cameras", {})
+
+
+def sessions_list(service: Service, chosen: str | None = None) -> list[SessionLine]:
+    """Returns the newest ``SESSIONS_SHOWN`` sessions, newest first, and the session ``chosen`` even if it is older."""
+
+    def make() -> list[Session]:
+        return [*service.sessions.page(limit=SESSIONS_SHOWN).items]
+
+    sessions = shared.get("sessions", 0.5, make)
+    if chosen and all(session.id != chosen for session in sessions):
+        with suppress(NotFound):
+            sessions = [*sessions, service.sessions.get(chosen)]
+    return [session_line(session) for session in sessions]
+
+
+def session_line(session: Session) -> SessionLine:
+    """Converts a session to an entry of a list. Captures that are being removed do not count."""
+    return {
+        "id": session.id,
+        "created": session.created,
+        "label": session.label,
+        "consent": session.consent,
+        "captures": sum(capture not in removals for capture in session.captures),
+    }

@@ -1,0 +1,60 @@
+"""Jobs as the job engine keeps them: names of its workflows, and what its rows say in our words."""
+
+from dataclasses import replace
+from typing import cast
+
+from dbos import EnqueueOptions, WorkflowStatus
+
+from server.services.records import moment_of
+from server.storage.job_index import JobQuery
+from server.storage.records import JobRequest
+
+APPLICATION = "eigenhead"
+APPLICATION_VERSION = "eigenhead-jobs-1"  # pinned: a job outlives an upgrade; changes only with the steps themselves
+WORKFLOW = "reconstruct"
+DELIVERY = "deliver"
+STATES = {
+    "DELAYED": "queued",
+    "ENQUEUED": "queued",
+    "PENDING": "running",
+    "SUCCESS": "succeeded",
+    "ERROR": "failed",
+    "MAX_RECOVERY_ATTEMPTS_EXCEEDED": "failed",
+    "CANCELLED": "cancelled",
+}
+STATUSES = {state: [s for s, t in STATES.items() if t == state] for state in set(STATES.values())}
+FINISHED = ("succeeded", "failed", "cancelled")
+
+
+def enqueue_options(job_id: str, queue: str, priority: int, attributes: dict[str, str | None]) -> EnqueueOptions:
+    """Returns how the job engine is to queue a job."""
+    return {
+        "workflow_name": WORKFLOW,
+        "queue_name": queue,
+        "workflow_id": job_id,
+        "app_version": APPLICATION_VERSION,
+        "priority": priority,
+        "attributes": attributes,
+    }
+
+
+def by_state(query: JobQuery) -> JobQuery:
+    """Returns a query in which words that name states select jobs in those states."""
+    words = query.sought.split()
+    states = [word.casefold() for word in words if word.casefold() in STATUSES]
+    if not states:
+        return query
+    statuses = [status for state in states for status in STATUSES[state]]
+    both = statuses if query.statuses is None else [status for status in statuses if status in query.statuses]
+    rest = " ".join(word for word in words if word.casefold() not in STATUSES)
+    return replace(query, sought=rest, statuses=both)
+
+
+def request_of(row: WorkflowStatus) -> JobRequest | None:
+    """Returns a copy of what the job was asked for; None where its input cannot be read."""
+    return cast(JobRequest, dict(row.input["args"][0])) if row.input else None
+
+
+def moment(milliseconds: int | None) -> str | None:
+    """Returns a time in ms since 1970 as text."""
+    return None if milliseconds is None else moment_of(milliseconds)

@@ -1,0 +1,101 @@
+"""Declares the methods that the service needs of a rig, and holds helpers that every rig uses."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+from rig.acquisition.plates import PlatesVersion
+from rig.acquisition.shot import ShotDocument
+from rig.image import ImageRgb
+from rig.messages.message import Message, compose
+from rig.rig import Rig
+from server.errors import Conflict
+from server.services.records import CameraSettings, CleanPlates, RigCamera, RigState
+from server.tasks.simulate import SimulatedCertificate
+
+SHOT_BYTES = 64 << 20  # that a shot may take on the disk
+
+
+class RigBackend(Protocol):
+    """Declares what the service needs of a rig, simulated or real. Methods block, so call them from a thread."""
+
+    def describe(self) -> RigState:
+        """Returns the state of the rig without opening its cameras."""
+        ...
+
+    def capture(self, folder: Path, *, seed: int | None, board: bool = False) -> ShotDocument | SimulatedCertificate:
+        """Takes a shot, writes the capture to ``folder/files`` and returns the shot's certificate.
+
+        ``board``: the shot shows the calibration board, for which neither a calibration nor every camera is needed.
+        ``seed`` chooses the subject of the simulated studio. Raises Unavailable naming what is missing, and InputError
+        for a seed of a real rig.
+        """
+        ...
+
+    def look(self) -> Mapping[str, ImageRgb]:
+        """Returns a current picture of each camera, by name. Cameras that deliver none are left out. Raises
+        Unavailable."""
+        ...
+
+    def preview(self, camera: str) -> bytes:
+        """Returns a current picture of one camera as a JPEG file, at most ``PREVIEW_WIDTH`` pixels wide. Raises
+        NotFound for an unknown camera, and Unavailable."""
+        ...
+
+    def camera_settings(self, camera: str) -> CameraSettings:
+        """Returns the exposure, gain and white balance requested of a camera. Raises NotFound for an unknown camera."""
+        ...
+
+    def set_camera(self, camera: str, changes: Mapping[str, float | None]) -> CameraSettings:
+        """Changes settings of a camera and keeps them across restarts; an open rig is closed and opened again. Raises
+        NotFound for an unknown camera, InputError for wrong values, and Conflict for the simulated studio."""
+        ...
+
+    def lights(self) -> tuple[int, ...]:
+        """Returns the numbers of the light outputs that are on during a shot."""
+        ...
+
+    def set_lights(self, outputs: tuple[int, ...]) -> tuple[int, ...]:
+        """Chooses which light outputs are on during a shot, keeps that across restarts, and returns them. Raises
+        InputError for wrong outputs, and Conflict for the simulated studio."""
+        ...
+
+    def take_background(self) -> CleanPlates:
+        """Takes new clean plates of the empty studio and puts them to use. Raises Unavailable if cameras fail, and
+        Conflict if the pictures show a person."""
+        ...
+
+    def plates(self) -> list[PlatesVersion]:
+        """Returns the versions of clean plates, the one in use and earlier ones, newest first."""
+        ...
+
+    def use_plates(self, version: str) -> None:
+        """Puts an earlier version of the clean plates to use again. Raises NotFound for an unknown version, and
+        Unavailable."""
+        ...
+
+    def use(self, calibration: Path) -> None:
+        """Uses the calibration in a cameras.json file from now on; the file is copied. Raises Conflict if its cameras
+        are not those of the rig."""
+        ...
+
+    def close(self) -> None:
+        """Closes the cameras, or the child process that simulates them."""
+        ...
+
+
+def check_names(rig: Rig, names: tuple[str, ...]) -> None:
+    """Raises Conflict, naming the cameras that only one of both has, unless a calibration is of the cameras
+    ``names``."""
+    if set(rig.names) != set(names):
+        differing = sorted(set(rig.names) ^ set(names))
+        detail = compose("calibration-of-other-rig")
+        raise Conflict("other-rig", detail, [compose("camera-in-one-alone", camera=name) for name in differing])
+
+
+def rig_state(
+    identity: str, kind: str, cameras: list[RigCamera], faults: list[Message], calibration: str | None
+) -> RigState:
+    """Returns the state of a rig, which is ready if it has no fault and no camera is missing."""
+    ready = not faults and all(camera.state != "missing" for camera in cameras)
+    return RigState(identity, kind, ready, tuple(cameras), tuple(faults), calibration)
