@@ -1,6 +1,7 @@
 """Calibrates a rig from pictures of a board: detection, lenses, pose graph, bundle adjustment and checks in one
 function."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +33,7 @@ from calibration.quality.checks import (
     check_against_previous,
     check_cheirality,
     check_determined,
+    check_frame,
     check_held_out,
     check_scale,
     failed,
@@ -117,6 +119,8 @@ class _Fit:
 
 
 def _refuse_blind_cameras(detections: Detections, dropped: Sequence[Dropped]) -> None:
+    if len(detections.sizes) == 1:
+        raise CalibrationRefused([compose("camera-alone", camera=next(iter(detections.sizes)))])
     seen = {view.camera for view in detections.views}
     blind = [name for name in detections.sizes if name not in seen]
     if not blind:
@@ -178,11 +182,9 @@ def _finish(
 ) -> _Fit:
     """Single corners out, Huber's cost, time offsets where they explain something."""
     names = graph.names
-    blind = [name for name in names if name not in {view.camera for view in views}]
-    if blind:
-        raise CalibrationRefused(
-            [compose("views-all-contradict", camera=name) for name in blind] + [drop.message() for drop in dropped[:5]]
-        )
+    contradicting = _contradicting_cameras(names, views, dropped)
+    if contradicting:
+        raise CalibrationRefused([*contradicting, *(drop.message() for drop in dropped[:5])])
     shots = tuple(shot for shot in graph.shots if any(view.shot == shot for view in views))
     at = [graph.shots.index(shot) for shot in shots]
     state = replace(
@@ -215,6 +217,17 @@ def _finish(
     seen = everything.subset(kept)
     _, sync = corner_sigma(state, seen, noise)
     return _Fit(solution, seen, views, kept, names, prior, sigma, sync, offsets, free, dropped)
+
+
+def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
+    """Returns a reason for each camera of which no view is left, or more were left out as contradictory than are left:
+    one that is mirrored fits the others in any single shot."""
+    left, lost = Counter(view.camera for view in views), Counter(drop.camera for drop in dropped)
+    return [
+        compose("views-contradict", camera=name, count=lost[name], all=lost[name] + left[name])
+        for name in names
+        if left[name] < max(lost[name], 1)
+    ]
 
 
 def _prior(
@@ -266,11 +279,13 @@ def _judged(
     blocks = [covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(rig))]
     rig = Rig(tuple(replace(camera, covariance=block) for camera, block in zip(rig, blocks, strict=True)))
     aspect, aspect_sigma = measure_aspect(fit.solution.state, fit.seen, fit.prior, fit.sigma, fit.free)
+    frame = check_frame(rig, detections.board)
     checks = [
         check_cheirality(state, fit.seen, detections.board),
         check_held_out(fit.solution.state, fit.seen, fit.prior, fit.sigma, fit.free),
         check_scale(detections.board, aspect, aspect_sigma),
-        check_determined(rig, pose_sigma),
+        frame,
+        *([check_determined(rig, pose_sigma)] if frame.passed else []),  # at a subject of a head's size
         *check_against_previous(rig, previous),
     ]
     report("checks", 1.0)

@@ -22,6 +22,7 @@ FOCAL_LEAST = 0.15  # of the picture's width; 0.26 is a fisheye of 220 degrees, 
 FRAME_LEAST_MM = 100.0  # longer side of what the pictures show where the cameras look: half a head
 FRAME_USUAL_MM = 600.0  # the simulated studio's arrangements have 556 to 559
 FRAME_MOST_MM = 10_000.0  # a head is 2 % of the side then; for the spread too, since nearly parallel axes meet anywhere
+AWAY_MOST_MM = 1e6  # from the world's origin: meshes hold 24 bits of a number, 0.06 mm there
 UNIT_MOST = 1_000_000  # units per millimetre (nanometres); a larger factor is no unit
 UNITS = {10: compose("centimetres"), 25.4: compose("inches"), 100: compose("decimetres"), 1000: compose("metres")}
 UNIT_FRAME_MOST_MM = 2500.0  # limit for a guessed unit: a head fills a twelfth of the picture then
@@ -126,6 +127,9 @@ def _spread_faults(rig: Rig) -> list[Message]:
         wrong = factor > UNIT_MOST
         remedy = compose("look-for-wrong-one") if wrong else compose("divide-translations", factor=factor)
         return [compose("cameras-show-much", frame_m=f"{frame / 1000:.3g}", remedy=remedy)]
+    away = float(np.linalg.norm(np.median(centres, axis=0)))
+    if away > AWAY_MOST_MM:
+        return [compose("cameras-away", away_km=f"{away * 1e-6:.3g}", step_mm=f"{away * 2.0**-24:.2g}")]
     return []
 
 

@@ -5,7 +5,7 @@ import contextlib
 import hashlib
 import io
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from calibration.board.board import Board
 from calibration.board.corners import Found, detect
-from calibration.board.markers import RATIO_OFF, board_of, find_layout, find_markers
+from calibration.board.markers import RATIO_OFF, board_of, find_layout, find_markers, other_dictionary
 from calibration.board.missing import explain, explain_markers
 from calibration.board.picture_files import filed_by_shot, list_pictures
 from rig.atomic_write import write_atomically
@@ -27,6 +27,8 @@ from rig.progress import Progress
 VERSION = 2  # of the detector: part of the cache's key
 EXPLAINED = 4  # pictures of a blind camera that are looked at twice
 MEASURED = 24  # pictures whose markers are measured where the board is not found as it was described ...
+SHARP_PX = 4.0  # of an edge: 1.5 in focus; the edges of markers beside a square's corner are 5 px and more apart
+TRIED = 6  # pictures in which the markers of all dictionaries are looked for
 FEW_FOUND = 0.2  # ... that is in less than this share of them
 
 
@@ -120,6 +122,8 @@ def detect_folder(
     detections = _detect_pictures(folder, pictures, board, cache, workers, report)
     if board.kind == "charuco":
         detections = _with_measured_pattern(folder, pictures, detections, cache, workers, report)
+    elif len(_sharp(detections.views)) < FEW_FOUND * sum(map(len, pictures.values())):
+        _refuse_markers(pictures)
     if detections.notes and not detections.views:
         raise WrongBoard(reasons_of(detections.notes))
     if filed_by_shot(pictures):
@@ -160,6 +164,21 @@ def _with_measured_pattern(
     keys += [f"first_marker = {measured.first_marker}"] if measured.first_marker != board.first_marker else []
     remark = compose("board-found-with", keys=keys)
     return replace(again, remarks=(remark,))
+
+
+def _sharp(views: Sequence[View]) -> list[View]:
+    return [view for view in views if view.found.rise_px < SHARP_PX]
+
+
+def _refuse_markers(pictures: dict[str, dict[str, Path]]) -> None:
+    """Raises WrongBoard where pictures that should show a checkerboard show markers. Some squares of a ChArUco board
+    pass for a checkerboard, and the markers' edges for blur."""
+    paths = [path for shots in pictures.values() for path in shots.values()]
+    sample = paths[:: max(1, len(paths) // TRIED)][:TRIED]
+    greys = [grey for path in sample if (grey := _decode(path.read_bytes())) is not None]
+    dictionary = other_dictionary(greys, "")
+    if dictionary is not None:
+        raise WrongBoard([compose("board-has-markers", dictionary=dictionary)])
 
 
 def _detect_pictures(

@@ -46,9 +46,19 @@ def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
     faults += [compose("camera-rename", fault=fault) for name in cameras if (fault := name_fault(name))]
     if not cameras:
         faults.append(compose("no-pictures"))
+    faults += _named_apart(cameras)
     if faults:
         raise InputError(str(folder.name), say_once(faults, cameras))
     return cameras
+
+
+def _named_apart(cameras: Filed) -> list[Message]:
+    """Returns a fault if no two cameras have a shot of the same name, as where each numbers its own files."""
+    shots = [shot for files in cameras.values() for shot in files]
+    if len(cameras) < 2 or len(set(shots)) < len(shots):
+        return []
+    (one, first), (other, second), *_ = cameras.items()
+    return [compose("shots-named-apart", camera=one, shot=min(first), other=other, other_shot=min(second))]
 
 
 def filed_by_shot(pictures: Filed) -> bool:

@@ -15,6 +15,7 @@ from calibration.board.board import Board
 from rig.geometry import rigid_fit
 from rig.messages.message import Message, compose
 from rig.parabola import second_difference, vertex_offset
+from rig.plausibility import FRAME_LEAST_MM, frame_mm
 from rig.rig import Rig
 
 HELD_OUT_EVERY = 5  # every fifth shot is held out once
@@ -99,6 +100,14 @@ def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
         detail = compose("print-aspect-off", aspect=aspect, sigma=aspect_sigma, off=notes)
     advice = compose("advice-scale")
     return Check("scale", not off and not skewed, detail, advice)
+
+
+def check_frame(rig: Rig, board: Board) -> Check:
+    """Checks that a head fits into what the pictures show where the cameras look, as it does not where ``square_mm`` is
+    in another unit."""
+    frame = frame_mm(rig)
+    advice = compose("advice-square-unit", square_mm=board.square_mm)
+    return Check("frame", frame >= FRAME_LEAST_MM, compose("frame-shown", frame_mm=frame), advice)
 
 
 def check_determined(rig: Rig, pose_sigma_px: Float[np.ndarray, " c"]) -> Check:

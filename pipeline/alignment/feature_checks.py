@@ -2,6 +2,7 @@
 whether they lie on the face in the photographs."""
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
 from pipeline.alignment.landmarks import MIN_POINTS, MIN_TRIANGLE_MM, flatness
@@ -53,17 +54,35 @@ def features_beside_face(
     if not names:
         return None
     positions, _ = locate_landmarks(face, model, places, [marks[name] for name in names])
-    offsets_px, distances_mm = [], []
-    for name, position in zip(names, positions, strict=True):
-        for camera in (rig[view] for view in features[name] if view in rig):
-            offset_px = features[name][camera.name] - camera.project(position[None])[0]
-            offsets_px.append(offset_px)
-            distances_mm.append(float(np.linalg.norm(offset_px)) * pixel_mm(camera, position))
-    if not np.median(distances_mm or [0.0]) > BESIDE_MM:
+    seen = [
+        (features[name][view], rig[view], position)
+        for name, position in zip(names, positions, strict=True)
+        for view in features[name]
+        if view in rig
+    ]
+    if not seen:
         return None
-    right_px, down_px = np.median(offsets_px, axis=0).tolist()
-    distance_mm = float(np.median(distances_mm))
-    return compose("features-beside-face", distance_mm=distance_mm, right_px=right_px, down_px=down_px)
+    picked = np.array([pixel for pixel, _, _ in seen])
+    expected = np.array([camera.project(position[None])[0] for _, camera, position in seen])
+    scale_mm = np.array([pixel_mm(camera, position) for _, camera, position in seen])
+    ends = np.array([(camera.intrinsics.width - 1.0, camera.intrinsics.height - 1.0) for _, camera, _ in seen])
+
+    def median_mm(pixels: Float[np.ndarray, "n 2"]) -> float:
+        return float(np.median(np.linalg.norm(pixels - expected, axis=1) * scale_mm))
+
+    distance_mm = median_mm(picked)
+    if not distance_mm > BESIDE_MM:
+        return None
+    factor = float((picked * picked).sum() / max(float((picked * expected).sum()), 1e-9))
+    right_px, down_px = np.median(picked - expected, axis=0).tolist()
+    beside = compose("features-beside-face", distance_mm=distance_mm, right_px=right_px, down_px=down_px)
+    readings = {
+        beside: picked - (right_px, down_px),
+        compose("features-from-bottom"): np.column_stack([picked[:, 0], ends[:, 1] - picked[:, 1]]),
+        compose("features-of-size", factor=factor): picked / factor,
+    }
+    nearest = min(readings, key=lambda reading: median_mm(readings[reading]))
+    return nearest if median_mm(readings[nearest]) < BESIDE_MM else beside
 
 
 def unknown_landmarks(features: Features) -> list[Message]:

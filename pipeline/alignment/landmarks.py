@@ -24,12 +24,13 @@ from jaxtyping import Bool, Float
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
 from pipeline.geometry.procrustes import block_diagonal, generalised_procrustes, procrustes
-from pipeline.head_model.landmarks import mirrored
+from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS, mirrored
 from pipeline.head_model.model import HeadModel
 from pipeline.multiview.triangulation import TriangulatedPoint
 from pipeline.settings import AlignmentSettings
 from rig.capture import Features
 from rig.errors import EigenheadError
+from rig.formats.fault_groups import some_of
 from rig.geometry import RigidTransform, Similarity
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -86,6 +87,8 @@ def align_to_features(model: HeadModel, features: Features, rig: Rig, settings: 
 def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> FeatureAlignment:
     """Aligns the mean head to picked feature points: rejects outliers, minimises eq. (3), then weighs the points by
     their covariance. Raises TooFewFeatures or WrongFeatures."""
+    if features.keys().isdisjoint(NAMES):
+        raise WrongFeatures(compose("features-of-no-landmark", names=some_of([*features]), known=SEVEN_POINTS))
     whole = features_as_wholes(features, rig, noise_px=settings.feature_noise_px)
     if whole is not None:
         raise WrongFeatures(whole)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.special import chdtrc
 
 from pipeline.contour_fit.fit import Fit
@@ -24,6 +24,8 @@ MAX_COEFFICIENT = 4.6  # standard deviations of the largest; the same rig scaled
 MIN_CHANCE = 1e-9  # of a sum of squares this large; a posterior mean is shrunk, so that good heads stay far below
 MAX_SIZE = 2.9  # standard deviations of the heads' own size, which good heads exceed once in 268
 MAX_SCALE_OFF = 0.07  # of size; 0.053 of a head from another population, more of a rig whose unit is wrong
+MAX_UNSEEN = 0.12  # share of the face's vertices: 0.14 to 0.24 where three or four cameras stand on one side, 0.10 at
+# most with a camera in front and one at each side, 0.01 before eleven
 MAX_OUTSIDE_PX_PER_WIDTH = 0.003  # 3 px of 1024; at most 0.6 in 66 cameras of six good captures
 OUTSIDE_TIMES_MEDIAN = 6.0  # and this many times what the other cameras have
 
@@ -80,6 +82,17 @@ def unexplained_outlines(cameras: Mapping[str, CameraFigures], pixels_mm: Mappin
     poor = sum(share >= UNEXPLAINED_SHARE for share in shares)
     off_mm = np.median(misses_mm)
     return compose("outlines-unexplained", poor=poor, views=len(shares), off_mm=off_mm)
+
+
+def unseen_face(views: UInt8[np.ndarray, " v"], face_region: Bool[np.ndarray, " v"]) -> ReportWarning | None:
+    """Returns a warning if no camera sees a good part of the face, which the fit then takes from faces like it.
+
+    Args:
+        views: number of photographs that coloured each vertex.
+        face_region: the face's vertices.
+    """
+    share = float(np.mean(views[face_region] == 0))
+    return compose("face-unseen", share=share) if share > MAX_UNSEEN else None
 
 
 def refuse(warnings: Iterable[ReportWarning], fail_on: Sequence[str]) -> None:

@@ -28,7 +28,7 @@ INSET_PX = 4.0  # from the outline, where a keypoint is of the backdrop, too
 BAND = 0.004  # of the picture's width beside the line that the other camera allows: 4 px
 RATIO, MAX_DISTANCE = 0.85, 0.6  # of descriptors: to the second best, and at all
 MIN_LIKENESS = 1.0 - 0.5 * (MAX_DISTANCE / RATIO) ** 2  # of a second best that could put the best one in doubt
-MIN_VIEWS = 3
+MIN_VIEWS = 3  # of a point; with 2 there are more points, and each says less
 MAX_MISS = 0.005  # of the picture's width: more is a wrong match
 
 
@@ -40,6 +40,7 @@ class SceneTracks:
     points: Int[np.ndarray, " n"]
     cameras: Int[np.ndarray, " n"]
     pixels: Float[np.ndarray, "n 2"]
+    min_views: int = MIN_VIEWS
 
     @property
     def count(self) -> int:
@@ -47,15 +48,18 @@ class SceneTracks:
         return int(self.points.max()) + 1 if len(self.points) else 0
 
     def chosen(self, good: Bool[np.ndarray, " n"]) -> "SceneTracks":
-        """Returns the observations that are ``good``, without the points that then have fewer than ``MIN_VIEWS`` of
+        """Returns the observations that are ``good``, without the points that then have fewer than ``min_views`` of
         them."""
-        left = good & (np.bincount(self.points[good], minlength=self.count)[self.points] >= MIN_VIEWS)
+        left = good & (np.bincount(self.points[good], minlength=self.count)[self.points] >= self.min_views)
         _, numbers = np.unique(self.points[left], return_inverse=True)
-        return SceneTracks(numbers, self.cameras[left], self.pixels[left])
+        return SceneTracks(numbers, self.cameras[left], self.pixels[left], self.min_views)
 
 
-def find_tracks(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig) -> SceneTracks:
-    """Finds points of the subject in all views of the rig, each in three views or more whose rays nearly meet."""
+def find_tracks(
+    images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], rig: Rig, *, min_views: int = MIN_VIEWS
+) -> SceneTracks:
+    """Finds points of the subject in all views of the rig, each in ``min_views`` views or more whose rays nearly
+    meet."""
     names = rig.names
     seen = map_in_threads(lambda k: _keypoints(images[names[k]], silhouettes[names[k]]), len(rig))
     numbers = {name: k for k, name in enumerate(names)}
@@ -65,7 +69,7 @@ def find_tracks(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhou
         return _matches(rig.cameras[a], seen[a], rig.cameras[b], seen[b])
 
     matched = map_in_threads(lambda k: match(*pairs[k]), len(pairs))
-    tracks = _joined(pairs, matched, seen)
+    tracks = _joined(pairs, matched, seen, min_views)
     widths = np.array([camera.intrinsics.width for camera in rig], float)
     for factor in (2.0, 1.0):  # wrong matches move the point of right ones
         if tracks.count:
@@ -108,7 +112,7 @@ def _keypoints(image: ImageRgb, silhouette: Silhouette) -> Keypoints:
     if scale < 1.0:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    finder = cv2.SIFT.create(nfeatures=MAX_KEYPOINTS, contrastThreshold=CONTRAST)
+    finder = cv2.SIFT.create(nfeatures=MAX_KEYPOINTS, contrastThreshold=CONTRAST, enable_precise_upscale=True)
     found, descriptors = finder.detectAndCompute(grey, mask)
     if not len(found):
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
@@ -157,7 +161,9 @@ def _beside_lines(
     return missed * (one.intrinsics.fx / one.intrinsics.width)
 
 
-def _joined(pairs: list[tuple[int, int]], matched: list[Int[np.ndarray, "_ 2"]], seen: list[Keypoints]) -> SceneTracks:
+def _joined(
+    pairs: list[tuple[int, int]], matched: list[Int[np.ndarray, "_ 2"]], seen: list[Keypoints], min_views: int
+) -> SceneTracks:
     """Returns chains of matches as points; chains that meet one view twice are left out."""
     from scipy.sparse import coo_array  # a tenth of a second
     from scipy.sparse.csgraph import connected_components
@@ -172,6 +178,6 @@ def _joined(pairs: list[tuple[int, int]], matched: list[Int[np.ndarray, "_ 2"]],
     cameras = np.repeat(np.arange(len(seen)), np.diff(starts))
     times = np.zeros((count, len(seen)), int)
     np.add.at(times, (chain, cameras), 1)
-    good = ((times.max(axis=1) == 1) & (times.sum(axis=1) >= MIN_VIEWS))[chain]
+    good = ((times.max(axis=1) == 1) & (times.sum(axis=1) >= min_views))[chain]
     _, numbers = np.unique(chain[good], return_inverse=True)
-    return SceneTracks(numbers, cameras[good], np.concatenate([pixels for pixels, _ in seen])[good])
+    return SceneTracks(numbers, cameras[good], np.concatenate([pixels for pixels, _ in seen])[good], min_views)

@@ -23,7 +23,12 @@ from pipeline.evidence.expression import (
     shut_eyes,
 )
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
-from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines
+from pipeline.evidence.plausibility import (
+    UnexplainedOutlines,
+    plausibility_warnings,
+    unexplained_outlines,
+    unseen_face,
+)
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
@@ -96,7 +101,8 @@ def judge_head(
     unexplained = None if pose.is_on_face else unexplained_outlines(cameras, pixels_mm)
     if unexplained is not None and context.settings.unexplained_outlines == "refuse":
         raise UnexplainedOutlines(unexplained)
-    warnings += [] if unexplained is None else [unexplained]
+    unseen = unseen_face(texturing.vertices.views, model.levels["full"].face_region)
+    warnings += [warning for warning in (unexplained, unseen) if warning is not None]
     closed_eyes = confirmed_closed(shut_eyes(model, made) | closed_eyes, faces.eye_openings)
     return Staged(evidence, [*warnings, *eye_warnings(closed_eyes)])
 

@@ -37,6 +37,7 @@ from pipeline.warnings import ReportWarning
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
+from rig.formats.fault_groups import some_of
 from rig.mesh import Mesh
 from rig.messages.message import compose
 from rig.rig import Rig
@@ -182,11 +183,14 @@ def _by_name(rig: Rig, values: Float[np.ndarray, "k 3"]) -> dict[str, Rgb]:
 
 
 def _gain_warnings(gains: Mapping[str, Rgb]) -> tuple[ReportWarning, ...]:
-    return tuple(
-        compose("camera-gain", camera=name, factor=1 / min(gain))
-        for name, gain in gains.items()
-        if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
-    )
+    """Returns a warning for one camera that is brighter or darker than the others, and one for several together."""
+    strong = {
+        name: 1 / min(gain) for name, gain in gains.items() if max(gain) > STRONG_GAIN or min(gain) < 1 / STRONG_GAIN
+    }
+    if len(strong) < 2:
+        return tuple(compose("camera-gain", camera=name, factor=factor) for name, factor in strong.items())
+    least, most = min(strong.values()), max(strong.values())
+    return (compose("cameras-uneven", cameras=some_of([*strong]), count=len(strong), least=least, most=most),)
 
 
 def _untextured(count: int) -> Texture:

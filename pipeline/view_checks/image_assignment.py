@@ -24,7 +24,7 @@ from pipeline.view_checks.camera_assignment import (
     own_misfit,
     ring_messages,
 )
-from pipeline.view_checks.mask_edges import masks_alone_exchanged
+from pipeline.view_checks.mask_edges import masks_alone_exchanged, turned_masks
 from pipeline.view_checks.rig_agreement import loose_outlines, wrong_rig
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture, Features, reassign_images
@@ -111,7 +111,7 @@ def assign_images(
         raise ExchangedPictures(found, doubtful=not assignment.overwhelming)
     wrong = None if assignment.pictures else wrong_rig(distinct, rig)
     if wrong:
-        raise WrongRig(wrong)
+        raise WrongRig(turned_masks(capture.images, silhouettes, capture.masks) or wrong)
     pictures = {} if masks else assignment.pictures
     if masks:
         capture = reassign_images(capture, masks=masks)

@@ -10,7 +10,7 @@ Enters: photographs and silhouettes. Leaves: position and height of the peak, an
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from jaxtyping import Float32
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.warnings import ReportWarning
 from rig.image import ImageRgb
-from rig.messages.message import compose
+from rig.messages.message import Message, compose
 
 REACH = 0.06  # of a mask's size (root of its area), to both sides of the outline: 15 mm of a head
 STEADY_PX = 3.0  # blur under which the outline's direction is measured
@@ -29,6 +29,7 @@ FLAT_LEVELS = 5.0  # change across the whole reach below which a sample says lit
 CLEAR = 2.0  # height of a peak that is an edge's: 2.1 and more in 69 true masks, 1.1 in the mean of others'
 CLEARER = 1.5  # than what lies at the outline itself
 MIN_OFF = 0.006  # of a mask's size: 3 px of 480, 1.6 mm of a head; true masks have 1 px at most, in hair
+AS_IS, BACK = slice(None), slice(None, None, -1)  # ways along rows and columns
 OWN_GAIN = 1.5  # how much higher the peaks must be where masks are given to other pictures
 
 
@@ -128,3 +129,40 @@ def masks_alone_exchanged(
         return False
     before, after = (float(np.median(of)) for of in heights)
     return after >= CLEAR and after > OWN_GAIN * before
+
+
+def turned_masks(
+    images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette], ready: Collection[str]
+) -> Message | None:
+    """Returns the fault of ready masks that follow the photographs only once all are flipped or turned by 180 degrees,
+    as programs write them that count rows from the bottom; None if there is none.
+
+    Args:
+        images: by camera.
+        silhouettes: by camera.
+        ready: cameras whose mask was given.
+    """
+    judged = [name for name in ready if name in images and name in silhouettes]
+
+    def height(rows: slice, columns: slice) -> float:
+        turned = {name: _turned(silhouettes[name], rows, columns) for name in judged}
+        edges = [edge_beside(images[name], turned[name]) for name in judged]
+        return float(np.median([edge.height_at_outline for edge in edges if edge is not None] or [0.0]))
+
+    as_written = height(AS_IS, AS_IS)
+    if as_written >= CLEAR or len(judged) < 2:
+        return None
+    turns = {
+        compose("flip-down"): height(BACK, AS_IS),
+        compose("flip-across"): height(AS_IS, BACK),
+        compose("turned-half"): height(BACK, BACK),
+    }
+    turn = max(turns, key=lambda one: turns[one])
+    if turns[turn] < CLEAR or turns[turn] < OWN_GAIN * as_written:
+        return None
+    return compose("masks-turned", turn=turn)
+
+
+def _turned(silhouette: Silhouette, rows: slice, columns: slice) -> Silhouette:
+    mask, distance = (np.ascontiguousarray(of[rows, columns]) for of in (silhouette.mask, silhouette.distance))
+    return replace(silhouette, mask=mask, distance=distance)

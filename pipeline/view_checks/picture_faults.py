@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.view_checks.image_assignment import common_share, thumbnail
 from rig.capture import Capture
+from rig.colour_space import linear_from_srgb
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
 
@@ -28,6 +29,8 @@ MAX_BLURRED = (
 )
 # views of six captures, from face to back
 INSET_PX = 4.0  # inside the outline, of which a loose mask shows the backdrop
+OTHER_EXPOSURE = 1.8  # between plate and shot: up to one stop is levelled
+MIN_LIGHT, MAX_LIGHT = 0.002, 0.98  # neither black nor burnt out
 MIN_PIXELS, MIN_COMPARED = 500, 3  # of a subject, and views, that tell anything
 
 
@@ -78,6 +81,21 @@ def blurred_views(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silh
         for name, detail in details.items()
         if detail < MAX_BLURRED * usual
     }
+
+
+def plates_brightness(capture: Capture) -> float | None:
+    """Returns how many times as bright as the pictures the clean plates are, in linear light; None where that is no
+    other exposure. The subject covers less than half of a picture, so that the median is of the backdrop."""
+    ratios = []
+    for name, plates in capture.backgrounds.items():
+        if name in capture.images and plates and plates[0].shape == capture.images[name].shape:
+            light = [
+                linear_from_srgb(of[::8, ::8].astype(np.float32) / 255.0) for of in (plates[0], capture.images[name])
+            ]
+            known = (light[0] < MAX_LIGHT).all(axis=2) & (light[1] > MIN_LIGHT).all(axis=2)
+            ratios += [float(np.median(light[0][known] / light[1][known]))] if known.any() else []
+    factor = float(np.median(ratios)) if ratios else 1.0
+    return factor if abs(np.log(factor)) > np.log(OTHER_EXPOSURE) else None
 
 
 def _detail(image: ImageRgb, silhouette: Silhouette) -> float | None:

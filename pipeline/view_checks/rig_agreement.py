@@ -83,6 +83,8 @@ def _contradiction(silhouettes: Mapping[str, Silhouette], seen: Rig) -> Message 
         message = compose("other-convention", convention=other, remedy=remedy)
         found.append((_judged_misfit(hulls, read), message))
     found.append((_judged_misfit(hulls, _counted_from_below(seen)), compose("principal-points-from-below")))
+    for message, turn in () if square else _SQUARE_CONVENTIONS:  # width and height were exchanged with the pictures
+        found.append((_judged_misfit(_read(hulls, seen, turn), _on_its_side(seen)), message))
     (best, message), *others = sorted(found, key=lambda one: one[0])
     next_best = min(as_written, *(misfit for misfit, other in others if other != message))
     if best <= MAX_RIGHT or (best <= MAX_CLEAR and best <= CLEARLY * next_best):
@@ -147,6 +149,17 @@ def _counted_from_below(rig: Rig) -> Rig:
     def read(camera: Camera) -> Camera:
         k = camera.intrinsics
         return replace(camera, intrinsics=replace(k, cy=k.height - 1.0 - k.cy))
+
+    return Rig(tuple(map(read, rig)))
+
+
+def _on_its_side(rig: Rig) -> Rig:
+    """Returns the rig with the axes of each camera's picture exchanged."""
+
+    def read(camera: Camera) -> Camera:
+        k = camera.intrinsics
+        exchanged = replace(k, width=k.height, height=k.width, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx)
+        return replace(camera, intrinsics=exchanged)
 
     return Rig(tuple(map(read, rig)))
 

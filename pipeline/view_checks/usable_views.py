@@ -14,7 +14,7 @@ from pipeline.view_checks.camera_drift import find_drift
 from pipeline.view_checks.head_size import judge_head_size
 from pipeline.view_checks.image_assignment import assign_images
 from pipeline.view_checks.mask_edges import masks_off_edges
-from pipeline.view_checks.picture_faults import with_picture_faults
+from pipeline.view_checks.picture_faults import plates_brightness, with_picture_faults
 from pipeline.view_checks.rig_agreement import misplaced_camera
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
@@ -38,10 +38,15 @@ class TooFewViews(EigenheadError):
         ]
         if capture.masks:
             remedy = compose("advice-correct-masks")
+        elif any(remark.code == "rims-empty" for remark in capture.remarks):
+            remedy = compose("advice-plates-alike")
         elif capture.backgrounds:
             remedy = compose("advice-new-plates")
         else:
             remedy = compose("advice-supply-plates")
+        factor = None if capture.masks else plates_brightness(capture)
+        if factor is not None:  # everything else follows from it
+            reasons, remedy = [compose("plates-of-other-exposure", factor=factor)], compose("advice-same-exposure")
         said = say_once(reasons, silhouettes, named_most=len(silhouettes))
         usable, every = len(silhouettes) - len(poor), len(silhouettes)
         super().__init__(

@@ -23,9 +23,10 @@ from rig.formats.opencv_toml import looks_like_aniposelib, read_toml, write_anip
 from rig.formats.opencv_yaml import read_yaml, write_yaml
 from rig.formats.picture_names import is_junk
 from rig.formats.reading import CamerasRead
-from rig.formats.realitycapture import COLUMNS, read_csv, read_xmp, write_csv, write_xmp
+from rig.formats.realitycapture import looks_like_csv, read_csv, read_xmp, write_csv, write_xmp
 from rig.formats.transforms_json import read_transforms, write_transforms
 from rig.formats.unread_keys import unread_keys
+from rig.formats.unread_programs import unread_programs
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -46,11 +47,18 @@ FORMATS = tuple(WRITERS)
 FOLDER_FORMATS = ("colmap", "colmap-text", "realitycapture", "opencv-yaml")  # formats of several files
 NO_RIG = compose("no-rig-file")
 COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
+ARCHIVE_ENDINGS = (".zip", ".tar", ".tgz", ".gz", ".xz", ".bz2", ".7z", ".rar")
 HEAD_BYTES = 1 << 16  # read to recognise an XMP file; the names of the formats in it stand near its beginning
 
 
 def no_rig_fault(folder: Path) -> Message:
-    """Returns the fault of a folder without a rig's file; if it contains captures instead, the fault names them."""
+    """Returns the fault of a folder without a rig's file; if it contains captures, an archive, or cameras of a program
+    that is not read instead, the fault names them."""
+    if unread := unread_programs(folder):
+        return unread[0]
+    archives = [path.name for path in sorted(folder.iterdir()) if path.name.lower().endswith(ARCHIVE_ENDINGS)]
+    if archives:
+        return compose("archives-inside", archives=some_of(archives))
     inner = sorted(path for path in folder.iterdir() if path.is_dir() and not is_junk(path.name))
     captures = [path.name for path in inner if find_rig_file(path) is not None]
     return compose("captures-inside", captures=some_of(captures)) if len(captures) > 1 else NO_RIG
@@ -83,7 +91,7 @@ def rig_files(folder: Path) -> Iterator[Path]:
         for path in sorted((folder / place).glob("*.xmp"))
         if b"capturingreality" in _head(path)
     )
-    tables = (path for path in sorted(folder.glob("*.csv")) if _head(path).startswith(",".join(COLUMNS[:8]).encode()))
+    tables = (path for path in sorted(folder.glob("*.csv")) if looks_like_csv(_head(path)))
     for found in (
         [native],
         colmap,

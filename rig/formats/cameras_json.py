@@ -55,7 +55,9 @@ def read_rig(path: Path) -> Rig:
     """Returns the rig in ``cameras.json``. Raises InputError naming every fault in it."""
     try:
         document = json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        raise InputError(path.name, [compose("no-file-read", reason=error.strerror or str(error))]) from error
+    except (ValueError, RecursionError) as error:
         raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
     return rig_from_document(document, path.name)
 

@@ -29,8 +29,9 @@ from rig.formats.cameras_json import write_rig
 from rig.formats.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.fault_groups import say_once, some_of
 from rig.formats.features_json import document_from_features, features_from_bytes
-from rig.formats.images import cut_out_alpha, decode_image_file, picture_size, write_image
+from rig.formats.images import cut_out_alpha, decode_image_file, page_count, picture_size, write_image
 from rig.formats.picture_names import is_junk
+from rig.formats.picture_rims import fill_rims
 from rig.formats.picture_samples import WHOLE_BITS, measure_samples
 from rig.formats.reading import CamerasRead
 from rig.formats.shot_files import (
@@ -48,7 +49,7 @@ from rig.rig import Rig
 from rig.text import suggest
 
 SCALE = "scale.json"
-ENCLOSING_MOST = 3  # levels of single folders around a capture, as nested packing leaves them
+ENCLOSING_MOST = 8  # levels of single folders around a capture, as nested packing leaves them
 ALIKE_LEAST = 0.75  # likeness of two folders' names: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 
 
@@ -213,13 +214,14 @@ def read_shot(
     subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)
     if with_cut_outs and not masks and not backgrounds and len(images) == len(rig):
         subjects = _cut_outs(folder, jobs, rig, pixels_most) or subjects
+    shown, plates, rims = fill_rims(images, backgrounds, subjects.masks)
     return Capture(
-        images,
-        {name: tuple(plates) for name, plates in backgrounds.items()},
+        shown,
+        plates,
         subjects.masks,
         features,
         digests,
-        (*levels, *_grey_remarks(images), *subjects.remarks),
+        (*levels, *_page_remarks(folder, jobs), *_grey_remarks(images), *rims, *subjects.remarks),
         subjects.soft,
     )
 
@@ -258,6 +260,14 @@ def _sample_bits(
         folders = [f"{kind}/" for kind in kinds if bits[kind] == used]
         remarks.append(compose("picture-levels", folders=folders, most=2**used - 1, bits=used, shift=WHOLE_BITS - used))
     return bits, remarks
+
+
+def _page_remarks(folder: Path, jobs: Sequence[tuple[str, str, Path]]) -> list[Message]:
+    """Returns a remark that names the files of several pictures, of which the first is read."""
+    paged = [path.relative_to(folder).as_posix() for _, _, path in jobs if page_count(path) > 1]
+    if not paged:
+        return []
+    return [compose("file-unread", remark=compose("pages-unread", count=len(paged), pictures=some_of(paged)))]
 
 
 def _grey_remarks(images: Mapping[str, np.ndarray]) -> list[Message]:
@@ -311,7 +321,9 @@ def _decode(
         return None, digest, fault
     size = (pixels.shape[1], pixels.shape[0]) if whole or share == 1.0 else picture_size(path)
     if size != wanted:
-        return None, "", size_fault(where, size, camera.intrinsics)
+        differs = size_fault(where, size, camera.intrinsics)
+        pages = page_count(path)
+        return None, "", differs if pages == 1 else compose("first-page-differs", fault=differs, pages=pages)
     if whole:  # masks are interpreted together, and before pixels are averaged
         return pixels, digest, fault
     if camera.recorded is not None:

@@ -5,13 +5,16 @@ from typing import Any, TypedDict
 
 import numpy as np
 
+from rig.camera import Camera
 from rig.capture import Features
+from rig.formats.fault_groups import say_once
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 FILE = "features.json"
 FEATURES_FORMAT = "eigenhead-features/1"
 POINTS_MOST = 200  # feature points in features.json
+OUTSIDE_LEAST, OUTSIDE_SHARE = 3, 0.2  # points outside their pictures, and of all, that are no slip of the hand
 
 
 class FeaturesDocument(TypedDict):
@@ -45,22 +48,55 @@ def features_from_document(document: Any, rig: Rig, faults: list[Message]) -> Fe
         fault = compose("features-many", count=len(document["points"]), most=POINTS_MOST)
         faults.append(compose("located", where=FILE, fault=fault))
         return {}
+    whole = _fault_of_all(document["points"], rig)
+    if whole is not None:
+        faults.append(compose("located", where=FILE, fault=whole))
+        return {}
     features: dict[str, dict[str, np.ndarray]] = {}
+    strange: list[Message] = []
     for landmark, views in document["points"].items():
         if not isinstance(views, dict):
-            faults.append(_of_point(landmark, compose("feature-no-object")))
+            strange.append(_of_point(landmark, compose("feature-no-object")))
             continue
         for name, pixel in views.items():
             point = _pixel(pixel)
             if name not in rig:
-                faults.append(_of_point(landmark, compose("feature-strange-camera", camera=f"{name!r:.80}")))
+                strange.append(_of_point(landmark, compose("feature-strange-camera", camera=f"{name!r:.80}")))
             elif point is None:
-                faults.append(_of_point(landmark, compose("feature-no-pixels", camera=name, pixel=f"{pixel!r:.80}")))
-            elif not _inside(point, rig[name].intrinsics.width, rig[name].intrinsics.height):
-                faults.append(_of_point(landmark, compose("feature-outside", camera=name, pixel=f"{pixel!r:.80}")))
+                strange.append(_of_point(landmark, compose("feature-no-pixels", camera=name, pixel=f"{pixel!r:.80}")))
+            elif not _is_in_picture(point, rig[name]):
+                strange.append(_of_point(landmark, compose("feature-outside", camera=name, pixel=f"{pixel!r:.80}")))
             else:
                 features.setdefault(landmark, {})[name] = point
+    inner = {name for views in document["points"].values() if isinstance(views, dict) for name in views}
+    faults += say_once(strange, {*rig.names, *document["points"], *inner})
     return features
+
+
+def _fault_of_all(points: dict[str, Any], rig: Rig) -> Message | None:
+    """Returns the fault that all points share: cameras outside and landmarks inside, shares of the picture in place of
+    pixels, or pixels of other pictures. None if there is none."""
+    inner = {name for views in points.values() if isinstance(views, dict) for name in views}
+    if points and inner and all(name in rig for name in points) and not any(name in rig for name in inner):
+        return compose("features-by-camera")
+    pairs = [
+        (rig[name], point)
+        for views in points.values()
+        if isinstance(views, dict)
+        for name, pixel in views.items()
+        if name in rig and (point := _pixel(pixel)) is not None
+    ]
+    if len(pairs) >= OUTSIDE_LEAST and all(point.min() >= 0.0 and point.max() <= 1.0 for _, point in pairs):
+        return compose("features-in-shares")
+    outside = [(camera, point) for camera, point in pairs if not _is_in_picture(point, camera)]
+    if len(outside) < max(OUTSIDE_LEAST, OUTSIDE_SHARE * len(pairs)):
+        return None
+    if all(_is_in_picture(point[::-1], camera) for camera, point in pairs):
+        return compose("features-transposed")
+    camera, point = outside[0]
+    size = f"{camera.intrinsics.width} x {camera.intrinsics.height}"
+    pixel = f"[{point[0]:.0f}, {point[1]:.0f}]"
+    return compose("features-outside", count=len(outside), all=len(pairs), pixel=pixel, camera=camera.name, size=size)
 
 
 def _of_point(landmark: str, fault: Message) -> Message:
@@ -82,5 +118,6 @@ def _pixel(value: Any) -> np.ndarray | None:
     return np.array(value, dtype=float)
 
 
-def _inside(point: np.ndarray, width: int, height: int) -> bool:
-    return bool((point >= -0.5).all() and point[0] <= width - 0.5 and point[1] <= height - 0.5)
+def _is_in_picture(point: np.ndarray, camera: Camera) -> bool:
+    k = camera.intrinsics
+    return bool((point >= -0.5).all() and point[0] <= k.width - 0.5 and point[1] <= k.height - 0.5)

@@ -39,6 +39,8 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
         if path.stat().st_size > BYTES_MOST:
             raise InputError(path.name, [compose("file-large", most_mib=BYTES_MOST >> 20)])
         return parse(path.read_bytes())
+    except FileNotFoundError as error:
+        raise InputError(path.name, [compose("file-absent")]) from error
     except OSError as error:
         raise InputError(path.name, [compose("no-file-read", reason=str(error.strerror or error))]) from error
     except struct.error as error:

@@ -21,7 +21,7 @@ from rig.atomic_write import write_atomically
 from rig.errors import InputError, how_to_install
 from rig.formats.mask_values import Plane, mask_plane
 from rig.formats.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
-from rig.formats.picture_samples import WHOLE_BITS
+from rig.formats.picture_samples import TIFF, WHOLE_BITS
 from rig.formats.work_size import at_share, halvings
 from rig.image import ImageRgb
 from rig.mask_polarity import subject_convention
@@ -55,6 +55,7 @@ COLOUR_FLAGS = (  # the reducing ones give BGR; OpenCV has no RGB variant of the
     cv2.IMREAD_REDUCED_COLOR_4,
     cv2.IMREAD_REDUCED_COLOR_8,
 )
+PAGED_SUFFIXES = (".tif", ".tiff", ".webp")  # of files that hold several pictures
 PIXELS_MOST = 100_000_000  # 100 Mpx, the largest studio backs; more is a decompression bomb
 
 
@@ -104,6 +105,17 @@ def picture_size(path: Path) -> tuple[int, int]:
         return _header_size(path.read_bytes(), path.suffix.lower())[0]
 
 
+def page_count(path: Path) -> int:
+    """Returns how many pictures a TIFF or WebP file holds, of which the first is read; 1 for other and damaged ones."""
+    if path.suffix.lower() not in PAGED_SUFFIXES:
+        return 1
+    try:
+        with _faults_of(path.name), Image.open(path, formats=IMAGE_FORMATS) as header:
+            return int(getattr(header, "n_frames", 1))
+    except InputError:
+        return 1
+
+
 def open_picture(path: Path) -> Image.Image:
     """Opens a picture with Pillow, which decodes only as much as a thumbnail needs. Raises InputError."""
     if path.suffix.lower() in (*RAW_SUFFIXES, *HEIC_SUFFIXES):
@@ -125,9 +137,10 @@ def decode_image_file(
         share: scale of width and height, 1 or less; masks keep all their pixels.
         bits: how many bits the samples of a 16-bit file use (``rig.formats.picture_samples``).
     """
-    data, suffix = path.read_bytes(), path.suffix.lower()
+    suffix, data = path.suffix.lower(), b""
     try:
         with _faults_of(where):
+            data = path.read_bytes()
             (width, height), profile = _header_size(data, suffix)
         if width * height > PIXELS_MOST:
             raise InputError(where, [compose("picture-large", width=width, height=height, most=PIXELS_MOST)])
@@ -135,7 +148,8 @@ def decode_image_file(
             pixels = _decoded(data, suffix, kind, halved=halvings(share, (width, height)), bits=bits)
         pixels = _plane(pixels, where) if kind == "mask" else at_share(pixels, (width, height), share)
     except InputError as error:
-        return None, "", compose("of-file", file=where, fault=error.faults[0])
+        fault = compose("picture-floats") if _holds_floats(data) else error.faults[0]
+        return None, "", compose("of-file", file=where, fault=fault)
     if data.startswith(PNG) and PNG_END not in data:  # OpenCV silently fills the missing part of a truncated file
         return None, "", compose("of-file", file=where, fault=compose("picture-damaged"))
     if profile and kind == "colour":
@@ -178,6 +192,8 @@ def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
     said = fault or compose("no-picture")
     try:
         yield
+    except PermissionError as error:
+        raise InputError(where, [compose("no-file-read", reason=error.strerror or str(error))]) from error
     except Image.DecompressionBombError as error:
         raise InputError(where, [compose("picture-huge", most=PIXELS_MOST)]) from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, cv2.error) as error:
@@ -226,6 +242,14 @@ def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: 
     if kind == "mask":
         return pixels
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if kind == "grey" else np.ascontiguousarray(pixels)
+
+
+def _holds_floats(data: bytes) -> bool:
+    """Tells whether a TIFF file holds floating-point numbers, as programs for high dynamic range write them."""
+    if not data.startswith(TIFF):
+        return False
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return pixels is not None and pixels.dtype.kind == "f"
 
 
 def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:

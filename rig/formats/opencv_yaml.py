@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
@@ -55,15 +56,17 @@ def read_yaml(path: Path) -> CamerasRead:
             faults.append(compose("coefficients-many", key=f"dist_{name}", most=len(keys), names=" ".join(keys)))
         if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
             faults.append(compose("matrix-skewed", key=f"K_{name}"))
-        turned = poses.get(f"Rot_{name}")
-        if turned is None and (rodrigues := poses.get(f"R_{name}")) is not None:
+        turned, rodrigues = poses.get(f"Rot_{name}"), _array(poses, f"R_{name}")
+        if turned is None:
             turned = rotation_from_vector(rodrigues.ravel()) if rodrigues.size == 3 else rodrigues
         rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
         _check_alike(poses, name, faults)
-        translation = number_array(poses.get(f"T_{name}", np.zeros(0)).ravel(), (3,), f"T_{name}", faults)
+        translation = number_array(_array(poses, f"T_{name}").ravel(), (3,), f"T_{name}", faults)
         size: tuple[float, float]
         if f"W_{name}" in lenses and f"H_{name}" in lenses:
-            width, height = (number_array(lenses[key].ravel(), (1,), key, faults) for key in (f"W_{name}", f"H_{name}"))
+            width, height = (
+                number_array(_array(lenses, key).ravel(), (1,), key, faults) for key in (f"W_{name}", f"H_{name}")
+            )
             size = float(width[0]), float(height[0])
         else:
             size = sized(path.parent, name, faults)
@@ -111,8 +114,8 @@ def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) 
 
 def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> None:
     """Appends a fault if a camera's rotation vector and rotation matrix are both given and disagree."""
-    vector, matrix = poses.get(f"R_{name}"), poses.get(f"Rot_{name}")
-    if vector is None or matrix is None or vector.size not in (3, 9) or matrix.shape != (3, 3):
+    vector, matrix = _array(poses, f"R_{name}"), _array(poses, f"Rot_{name}")
+    if vector.size not in (3, 9) or matrix.shape != (3, 3):
         return
     other = rotation_from_vector(vector.ravel()) if vector.size == 3 else vector.reshape(3, 3)
     if not np.abs(other - matrix).max() < 1e-3:
@@ -174,11 +177,27 @@ def _matrices(data: bytes) -> dict[str, Any]:
             elif node.isReal() or node.isInt():
                 found[key] = np.array([node.real()])
             elif node.isSeq():
-                words = [node.at(i) for i in range(node.size())]
-                found[key] = [word.string() for word in words if word.isString()]
+                found[key] = _listed(node)
             elif node.isString():
                 found[key] = node.string()
         return found
     except (cv2.error, SystemError, TypeError) as error:
         said = " ".join(str(error).split())[:120]
         raise Malformed(compose("no-opencv-yaml", reason=said)) from None
+
+
+def _listed(node: "cv2.FileNode") -> list[str] | Float[np.ndarray, "..."]:
+    """Returns the words of a list, or its numbers as an array, which is empty where its rows differ in length."""
+    entries = [node.at(i) for i in range(node.size())]
+    if any(entry.isString() for entry in entries):
+        return [entry.string() for entry in entries if entry.isString()]
+    try:
+        return np.array([_listed(entry) if entry.isSeq() else entry.real() for entry in entries], float)
+    except ValueError:
+        return np.zeros(0)
+
+
+def _array(values: Mapping[str, Any], key: str) -> Float[np.ndarray, "..."]:
+    """Returns the numbers under a key; an empty array if there are none."""
+    value = values.get(key)
+    return value if isinstance(value, np.ndarray) else np.zeros(0)

@@ -94,7 +94,7 @@ def write_xmp(rig: Rig, folder: Path) -> None:
 
 def read_csv(path: Path) -> CamerasRead:
     """Returns the rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
-    rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(data.decode("utf-8-sig")))))
+    rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(_with_commas(data.decode("utf-8-sig"))))))
     if not rows or not set(COLUMNS[:8]) <= rows[0].keys():
         raise InputError(path.name, [compose("no-camera-csv", columns=",".join(COLUMNS))])
     reading = Reading(path.name)
@@ -121,6 +121,16 @@ def read_csv(path: Path) -> CamerasRead:
             )
         )
     return reading.finish(entries)
+
+
+def looks_like_csv(head: bytes) -> bool:
+    """Tells whether a file that begins so is the CSV, as RealityCapture wrote it or as a spreadsheet saved it."""
+    return _with_commas(head.decode("utf-8", "replace")).startswith(",".join(COLUMNS[:8]))
+
+
+def _with_commas(text: str) -> str:
+    """Returns the table with commas between values, where a spreadsheet put semicolons and decimal commas."""
+    return text.replace(",", ".").replace(";", ",") if text.startswith(COLUMNS[0] + ";") else text
 
 
 def write_csv(rig: Rig, path: Path) -> None:

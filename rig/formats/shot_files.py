@@ -167,12 +167,10 @@ def _missing(
         named = True
     else:
         for name in lacking:
-            other = _of_other_kind(name, strays["images"])
+            other = _of_other_kind(name, folder, strays["images"])
             if other is not None:
                 named = True
-                where = other.relative_to(folder).as_posix()
-                kind = UNREAD_PICTURES[other.suffix.lower()]
-                faults.append(compose("picture-kind-unread", picture=where, kind=kind))
+                faults.append(other)
             elif link := _broken_link(places["images"], name):
                 where, target = link.relative_to(folder).as_posix(), link.readlink().as_posix()
                 faults.append(compose("picture-link-broken", picture=where, target=target))
@@ -182,12 +180,19 @@ def _missing(
     cause = _cause(rig, lacking, strays["masks"], "masks/", compose("a-mask"))
     cause = cause or _cause(rig, lacking, strays["background"], "background/", compose("a-clean-plate"))
     for name in () if cause else lacking:
-        faults.append(compose("plate-missing", camera=name))
+        other = _of_other_kind(name, folder, [*strays["masks"], *strays["background"]])
+        named = named or other is not None
+        faults.append(other or compose("plate-missing", camera=name))
     return [*faults, *([cause] if cause else [])], named or bool(cause)
 
 
-def _of_other_kind(name: str, strays: Sequence[Path]) -> Path | None:
-    return next((p for p in strays if picture_stem(p.name) == name and p.suffix.lower() in UNREAD_PICTURES), None)
+def _of_other_kind(name: str, folder: Path, strays: Sequence[Path]) -> Message | None:
+    """Returns the fault of a camera's file of a kind that is not read, or None."""
+    for path in strays:
+        kind = UNREAD_PICTURES.get(path.suffix.lower())
+        if kind is not None and picture_stem(path.name) == name:
+            return compose("picture-kind-unread", picture=path.relative_to(folder).as_posix(), kind=kind)
+    return None
 
 
 def _broken_link(place: Path, name: str) -> Path | None:

@@ -37,6 +37,7 @@ from rig.formats.fault_groups import say_once
 from rig.formats.images import is_picture, picture_size, write_image
 from rig.formats.scale_json import read_scale
 from rig.formats.shot_files import find_files, picture_folder
+from rig.formats.unread_programs import unread_programs
 from rig.formats.work_size import WORK_PIXELS, work_rig
 from rig.messages.message import Message, compose, documents_of, read_message
 from rig.plausibility import rig_faults
@@ -119,6 +120,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     scale = root / SCALE
     found = calibrate_scene(root, scale=scale if scale.is_file() else None, front=front, report=report)
     warnings = [compose("view-left-out", remark=absence) for absence in found.absences()]
+    warnings += [compose("file-unread", remark=unread) for unread in unread_programs(root)]
     if found.scale.assumed:
         warnings.append(compose("scale-assumed", scale=found.scale.provenance))
     rig = found.rig

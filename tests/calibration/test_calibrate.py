@@ -110,8 +110,33 @@ def two_rigs(source: Session) -> Detections:
     )
 
 
+def mirrored_in_few_shots(source: Session) -> Detections:
+    """Any single one of them fits."""
+    mirrored = mirror_one_camera(source)
+    shots = [view.shot for view in mirrored.views if view.camera == "cam02"][:5]
+    return replace(mirrored, views=tuple(v for v in mirrored.views if v.camera != "cam02" or v.shot in shots))
+
+
+def one_camera_alone(source: Session) -> Detections:
+    detections = source.detections
+    views = tuple(view for view in detections.views if view.camera == "cam02")
+    return replace(detections, sizes={"cam02": detections.sizes["cam02"]}, views=views)
+
+
+def squares_in_centimetres(source: Session) -> Detections:
+    board = replace(source.detections.board, square_mm=0.1 * source.detections.board.square_mm)
+    return replace(source.detections, board=board)
+
+
 REFUSED = {
+    "squares in centimetres": (squares_in_centimetres, CalibrationRefused, "write the side of a square in millimetres"),
     "mirrored camera": (mirror_one_camera, PoseGraphError, "cam02 is mirrored"),
+    "mirrored camera in few shots": (
+        mirrored_in_few_shots,
+        CalibrationRefused,
+        "cam02 contradicts the other cameras in",
+    ),
+    "one camera alone": (one_camera_alone, CalibrationRefused, "cam02 is the only camera, and a rig has several"),
     "blind camera": (one_camera_is_blind, CalibrationRefused, "cam04 never sees the board"),
     "two groups": (two_rigs, PoseGraphError, "shares no shot with the others"),
 }

@@ -12,7 +12,7 @@ PARTS = {
     *("feature-view-missing", "feature-left-out", "feature-contradictory", "feature-view-contradicts"),  # features
     *("view-unused", "located"),  # view-left-out
     "names-and-more",  # face-elsewhere
-    *("pictures-distorted", "pictures-undistorted"),  # lens-doubtful
+    *("pictures-distorted", "pictures-undistorted", "principal-points-counted"),  # lens-doubtful
     *("outlines-inside", "outlines-outside"),  # masks-off-edges
 }
 """What becomes a parameter of a warning."""

@@ -147,6 +147,15 @@ def test_translations_that_are_too_large_are_named_with_the_remedy(factor, remed
     assert fault.text.endswith(f"translations are wanted in millimetres; {remedy}")
 
 
+def test_cameras_far_from_the_origin_are_named_since_meshes_hold_24_bits():
+    """As in coordinates on the globe, 5300 km north of the equator."""
+    for north_mm, words in ((1e5, None), (5.3e9, "5.3e+03 km from the world's origin")):
+        shifted = RigidTransform(np.eye(3), np.array([0.0, north_mm, 0.0]))
+        faults = rig_faults(posed(default_layout(), lambda pose, world=shifted: pose @ world))
+        assert bool(faults) == (words is not None)
+        assert words is None or words in faults[0].text
+
+
 def test_cameras_at_one_place_are_named():
     place = np.array([1.0, 2.0, 3.0])
     one = posed(default_layout(), lambda pose: RigidTransform(pose.rotation, -pose.rotation @ place))

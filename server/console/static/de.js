@@ -724,6 +724,7 @@ export default {
   "cheirality": "Seitigkeit",
   "held-out shots": "zurückgehaltene Aufnahmen",
   "scale": "Maßstab",
+  "frame": "Bildausschnitt",
   "determined": "bestimmt",
   "known layout": "bekannter Aufbau",
   "lens stability": "Objektive unverändert",

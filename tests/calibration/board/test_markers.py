@@ -99,3 +99,9 @@ def test_a_wrong_width_of_markers_is_said_once_and_passes_for_no_blur(tmp_path: 
     with pytest.raises(WrongBoard, match="correct marker_ratio") as refused:
         detect_folder(written(tmp_path, TOLD), replace(TOLD, marker_ratio=0.6))
     assert str(refused.value).count("marker_ratio") == 1
+
+
+def test_a_charuco_board_that_is_called_a_checkerboard_is_named(tmp_path: Path) -> None:
+    checkerboard = Board("checkerboard", TOLD.columns, TOLD.rows, TOLD.square_mm)
+    with pytest.raises(WrongBoard, match=r'its squares hold markers .*write kind = "charuco"'):
+        detect_folder(written(tmp_path, TOLD), checkerboard)

@@ -1,5 +1,6 @@
 """Board pictures filed by camera or by shot."""
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -69,3 +70,12 @@ def test_a_folder_without_pictures_is_refused(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "absent"):
         with pytest.raises(InputError, match="wanted IMAGES"):
             list_pictures(folder)
+
+
+def test_cameras_that_number_their_files_themselves_are_named(tmp_path: Path) -> None:
+    for camera, prefix in (("left", "IMG_00"), ("right", "DSC_10")):
+        write(tmp_path, [f"{prefix}{k}" for k in range(3)], by_shot=False, cameras=(camera, f"{camera}2", f"{camera}3"))
+    for other in ("left2", "left3", "right2", "right3"):
+        shutil.rmtree(tmp_path / other)
+    with pytest.raises(InputError, match=r"no two cameras have a shot of the same name \(left has IMG_000, right has"):
+        list_pictures(tmp_path)

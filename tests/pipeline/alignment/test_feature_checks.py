@@ -27,7 +27,13 @@ def picked(offset_px: tuple[float, float], share: float = 1.0, noise_px: float =
 
 @pytest.mark.parametrize(
     ("offset_px", "share", "word"),
-    [((0.0, 0.0), 1.0, None), ((70.0, 0.0), 1.0, "+70 px"), ((0.0, -70.0), 1.0, "-70 px"), ((0.0, 0.0), 0.5, "size")],
+    [
+        ((0.0, 0.0), 1.0, None),
+        ((70.0, 0.0), 1.0, "+70 px"),
+        ((0.0, -70.0), 1.0, "-70 px"),
+        ((0.0, 0.0), 0.5, "0.5"),
+        ((0.0, 0.0), 0.8, "0.8"),
+    ],
 )
 def test_points_of_another_crop_or_size_lie_beside_the_face(
     offset_px: tuple[float, float], share: float, word: str | None
@@ -36,7 +42,11 @@ def test_points_of_another_crop_or_size_lie_beside_the_face(
     face = found_on(MODEL.vertices(np.random.default_rng(3).normal(size=8)), places, rig)
     found = features_beside_face(picked(offset_px, share), face, rig, MODEL, places)
     assert (found is None) == (word is None)
-    if found is not None and word != "size":
+    if share != 1.0:
+        assert found is not None
+        assert found.code == "features-of-size"
+        assert found.parameters["factor"] == pytest.approx(share, rel=0.03)
+    elif found is not None:
         assert int(str(word).split()[0]) == pytest.approx(
             max((float(str(found.parameters[side])) for side in ("right_px", "down_px")), key=abs), abs=12
         )
@@ -46,3 +56,15 @@ def test_points_of_no_landmark_say_nothing() -> None:
     rig, places = default_layout(), landmark_map(MODEL)
     face = found_on(MODEL.vertices(np.zeros(0)), places, rig)
     assert features_beside_face({"nobody": {"cam00": np.zeros(2)}}, face, rig, MODEL, places) is None
+
+
+def test_points_whose_rows_count_from_the_bottom_are_named() -> None:
+    rig, places = default_layout(), landmark_map(MODEL)
+    face = found_on(MODEL.vertices(np.random.default_rng(3).normal(size=8)), places, rig)
+    turned = {
+        name: {v: np.array([x, rig[v].intrinsics.height - 1 - y]) for v, (x, y) in views.items()}
+        for name, views in picked((0.0, 0.0)).items()
+    }
+    found = features_beside_face(turned, face, rig, MODEL, places)
+    assert found is not None
+    assert found.code == "features-from-bottom"

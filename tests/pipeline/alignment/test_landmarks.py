@@ -180,6 +180,13 @@ def test_sides_that_are_the_viewer_s_are_named(model: HeadModel) -> None:
         align_to_features(model, exchanged, RIG, AlignmentSettings())
 
 
+def test_points_that_are_numbered_are_named_as_no_landmarks(model: HeadModel) -> None:
+    features = picked(model, Similarity(1.0, np.eye(3), np.array([5.0, 0.0, 0.0])), NAMES)
+    numbered = {str(number): views for number, views in enumerate(features.values())}
+    with pytest.raises(WrongFeatures, match=r"no point has the name of a landmark \(0, 1, 2, 3 and"):
+        align_to_features(model, numbered, RIG, AlignmentSettings())
+
+
 def test_rows_and_columns_that_are_exchanged_are_named(model: HeadModel) -> None:
     features = picked(model, Similarity(1.0, np.eye(3), np.array([45.0, 0.0, 0.0])), SEVEN_POINTS)
     exchanged = {name: {camera: at[::-1] for camera, at in views.items()} for name, views in features.items()}

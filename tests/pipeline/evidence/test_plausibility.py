@@ -13,11 +13,13 @@ from pipeline.evidence.plausibility import (
     refuse,
     size_of,
     unexplained_outlines,
+    unseen_face,
 )
 from pipeline.head_model.model import load_model
 from pipeline.settings import Settings, settings_from_document
 from rig.errors import InputError
 from rig.geometry import Similarity
+from rig.mesh import Mesh
 from rig.messages.message import compose
 
 WIDTHS = {f"cam{k:02}": 1024 for k in range(11)}
@@ -133,3 +135,17 @@ def test_views_without_a_rim_and_views_left_out_have_no_say():
     bad = explained([1.0] * 3, [100.0] * 3, used=False)
     none = {"cam09": CameraFigures(True, None, None, None)}
     assert unexplained_outlines(bad | none, dict.fromkeys(bad | none, 0.5)) is None
+
+
+@pytest.mark.parametrize(
+    ("azimuths_deg", "unseen"), [((35, 38, 65), True), ((0, 35, -65), False), ((-40, 0, 40), False)]
+)
+def test_a_face_that_no_camera_sees_on_one_side_is_named(azimuths_deg: tuple[int, ...], unseen: bool) -> None:
+    """Cameras at these azimuths see what is turned towards them by 20 degrees or more."""
+    level = standard_model().levels["full"]
+    normals = Mesh(standard_model().vertices(np.zeros(0)), level.faces).normals()
+    ways = np.array([(np.sin(a), 0.1, np.cos(a)) for a in np.radians(azimuths_deg)])
+    views = (normals @ ways.T > np.sin(np.radians(20))).sum(axis=1).astype(np.uint8)
+    found = unseen_face(views, level.face_region)
+    assert (found is not None) == unseen
+    assert found is None or "no camera sees" in found.text

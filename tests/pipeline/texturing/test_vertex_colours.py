@@ -169,6 +169,14 @@ def test_a_strongly_different_exposure_is_named() -> None:
     assert "cam02" in warnings[0].text
 
 
+def test_cameras_of_uneven_exposure_are_named_in_one_sentence() -> None:
+    gains = np.ones((7, 3))
+    gains[1:6] = np.array([0.4, 2.5, 0.45, 2.2, 0.4])[:, None]
+    warnings = colour(shoot(gains)).warnings
+    assert [w.code for w in warnings] == ["cameras-uneven"]
+    assert int(str(warnings[0].parameters["count"])) >= 4
+
+
 def test_sharpening_takes_back_blur_where_there_is_detail_and_lifts_no_noise() -> None:
     rng = np.random.default_rng(5)
     truth = np.full((240, 320, 3), 120.0)

@@ -73,6 +73,32 @@ def test_coefficients_that_are_not_the_pictures_are_named(
     assert [warning.code for warning in found] == ["lens-doubtful"] * len(codes)
 
 
+@pytest.mark.parametrize("counted_from", [1.0, 0.0, -1.0])
+def test_principal_points_that_count_from_one_are_named(shots, counted_from: float) -> None:
+    """The bias of keypoints is below a tenth of a pixel; a quarter is what OpenCV has by itself."""
+    rig, images, silhouettes = shots[-0.3]
+    points = [replace(c.intrinsics, cx=c.intrinsics.cx + counted_from, cy=c.intrinsics.cy + counted_from) for c in rig]
+    written = Rig(tuple(replace(camera, intrinsics=k) for camera, k in zip(rig, points, strict=True)))
+    found = [warning.parameters["finding"] for warning in judge_distortion(images, silhouettes, written)]
+    assert len(found) == (counted_from != 0.0)
+    for finding in found:
+        assert isinstance(finding, Message)
+        assert finding.code == "principal-points-counted"
+        assert finding.parameters["shift_px"] == pytest.approx(counted_from, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("taken", "written", "finding"),
+    [(0.0, 0.0, None), (-0.3, -0.3, None), (0.0, -0.3, "pictures-undistorted"), (-0.3, 0.0, "pictures-distorted")],
+)
+def test_three_views_tell_by_points_of_two(shots, taken: float, written: float, finding: str | None) -> None:
+    rig, images, silhouettes = shots[taken]
+    three = lensed(rig, written).subset(("cam00", "cam01", "cam03"))
+    found = judge_distortion(images, silhouettes, three)
+    codes = [inner.code for warning in found if isinstance(inner := warning.parameters["finding"], Message)]
+    assert codes == ([finding] if finding else [])
+
+
 def test_rays_of_right_cameras_miss_by_a_fraction_of_a_pixel(shots) -> None:
     rig, images, silhouettes = shots[-0.3]
     tracks = find_tracks(images, silhouettes, rig)

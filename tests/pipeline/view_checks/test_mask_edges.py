@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
-from pipeline.view_checks.mask_edges import edge_beside, masks_alone_exchanged, masks_off_edges
+from pipeline.view_checks.mask_edges import edge_beside, masks_alone_exchanged, masks_off_edges, turned_masks
 
 NAMES = ("cam00", "cam01", "cam02")
 
@@ -71,3 +71,15 @@ def test_masks_under_other_names_are_told_from_pictures_and_masks_together() -> 
     assert masks_alone_exchanged(IMAGES, masks, owners)
     together = {filed: IMAGES[name] for name, filed in owners.items()}
     assert not masks_alone_exchanged(together, masks, owners)
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "turn"),
+    [(-1, 1, "upside down"), (1, -1, "left to right"), (-1, -1, "by 180 degrees"), (1, 1, None)],
+)
+def test_masks_that_are_turned_against_the_photographs_are_named(rows: int, columns: int, turn: str | None) -> None:
+    masks = {name: grown(np.ascontiguousarray(subject(k)[::rows, ::columns]), 0) for k, name in enumerate(NAMES)}
+    found = turned_masks(IMAGES, masks, NAMES)
+    assert (found is None) == (turn is None)
+    assert found is None or str(turn) in found.text
+    assert turned_masks(IMAGES, masks, ()) is None

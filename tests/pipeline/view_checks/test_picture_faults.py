@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
-from pipeline.view_checks.picture_faults import blurred_views, turned_against_plate, with_picture_faults
+from pipeline.view_checks.picture_faults import (
+    blurred_views,
+    plates_brightness,
+    turned_against_plate,
+    with_picture_faults,
+)
 from rig.capture import Capture
+from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.messages.message import compose
 
 HEIGHT, WIDTH = 192, 256
@@ -75,3 +81,15 @@ def test_a_turned_picture_is_named_and_left_out(capture: Capture, outlines: dict
 
 def test_two_views_do_not_tell_what_is_sharp(capture: Capture, outlines: dict[str, Silhouette]) -> None:
     assert blurred_views({name: capture.images[name] for name in "ab"}, outlines) == {}
+
+
+@pytest.mark.parametrize("exposure", [1.0, 1.5, 4.0, 0.25])
+def test_clean_plates_of_another_exposure_are_measured(capture: Capture, exposure: float) -> None:
+    def exposed(image: np.ndarray) -> np.ndarray:
+        light = exposure * linear_from_srgb(image / 255.0)
+        return np.rint(255.0 * srgb_from_linear(np.clip(light, 0.0, 1.0))).astype(np.uint8)
+
+    plates = {name: tuple(map(exposed, of)) for name, of in capture.backgrounds.items()}
+    found = plates_brightness(replace(capture, backgrounds=plates))
+    assert (found is None) == (0.6 < exposure < 1.8)
+    assert found is None or found == pytest.approx(exposure, rel=0.1)

@@ -144,6 +144,17 @@ def test_square_pictures_turned_by_90_degrees_are_named(seen, quarters, word):
     assert word in str(wrong_rig(silhouettes(turned), square))
 
 
+@pytest.mark.parametrize(("quarters", "word"), [(1, "90 degrees anticlockwise"), (3, "90 degrees clockwise")])
+def test_turned_pictures_whose_cameras_had_width_and_height_exchanged_are_named(seen, quarters, word):
+    """The sizes agree then, and so do the principal points; the poses do not."""
+    rig, masks, _ = seen
+    lenses = {c.name: c.intrinsics for c in rig}
+    on_side = {n: replace(k, width=k.height, height=k.width, cx=k.cy, cy=k.cx) for n, k in lenses.items()}
+    written = Rig(tuple(replace(camera, intrinsics=on_side[camera.name]) for camera in rig))
+    turned = {name: np.rot90(mask, quarters) for name, mask in masks.items()}  # anticlockwise
+    assert word in str(wrong_rig(silhouettes(turned), written))
+
+
 def test_the_calibration_of_another_rig_is_named(seen):
     _, _, of_all = seen
     for name in ARRANGEMENTS_DEG:

@@ -51,7 +51,7 @@ WORDS = {
     "alphabets": (tar_of(("\u0430b", b"1")), "'\u0430b' mixes letters of several alphabets in its name: rename it"),
     "letters": (tar_of(("x/A", b"1"), ("x/a", b"2")), "'x/a' is the same name as 'x/A' in other letters"),
     "twice": (tar_of(("a", b"1"), ("a", b"2")), "'a' occurs twice"),
-    "encrypted": (encrypted_zip(), "'cameras.json' is encrypted"),
+    "encrypted": (encrypted_zip(), "'cameras.json' is encrypted: pack the folder without a password"),
     "overlap": (overlapping_zip(), "'a.png' overlaps the next member: a zip bomb"),
     "nothing": (zip_of(("folder/", b"")), "holds no files"),
 }

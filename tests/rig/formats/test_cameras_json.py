@@ -172,8 +172,8 @@ def test_cameras_are_read_in_the_encodings_of_windows(tmp_path: Path, encoding: 
 
 def test_bytes_that_are_no_text_and_a_missing_file(tmp_path: Path) -> None:
     (tmp_path / "cameras.json").write_bytes(b"\xff\xfe\x00")
-    for name in ("cameras.json", "absent.json"):
-        with pytest.raises(InputError, match="cannot be read as JSON"):
+    for name, words in (("cameras.json", "cannot be read as JSON"), ("absent.json", "No such file")):
+        with pytest.raises(InputError, match=words):
             read_rig(tmp_path / name)
 
 

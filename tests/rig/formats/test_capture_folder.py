@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
@@ -195,8 +196,18 @@ def remove(path: str) -> Callable[[Path], None]:
     return lambda folder: (folder / path).unlink()
 
 
+def rename(path: str, other: str) -> Callable[[Path], None]:
+    def harm(folder: Path) -> None:
+        (folder / path).rename(folder / other)
+
+    return harm
+
+
 def png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", image)[1].tobytes()
+
+
+FEATURES = "eigenhead-features/1"
 
 
 def points(document: Any) -> Callable[[Path], None]:
@@ -221,6 +232,8 @@ def feature(views: Any) -> Callable[[Path], None]:
         (damage("images/b.jpg", png(picture())), "images/ holds b.jpg, b.png: which one is meant?"),
         (damage("background/b/001.png", b""), "background/b/001.png is damaged"),
         (damage("masks/c.png", png(np.zeros((HEIGHT, WIDTH), np.uint8))), "masks/c.png is empty"),
+        (rename("masks/c.png", "masks/c.gif"), "masks/c.gif is not read: of GIF files nothing is"),
+        (rename("background/a.png", "background/a.npy"), "background/a.npy is not read: of NumPy files nothing is"),
         (damage("features.json", b"{"), "features.json cannot be read as JSON"),
         (points([]), "features.json is no object"),
         (points({"points": {}}), "features.json: format is None"),
@@ -394,3 +407,97 @@ def test_pictures_and_points_of_a_fisheye_come_undistorted(tmp_path: Path) -> No
     )  # half a level, and the way of reading
     np.testing.assert_allclose(capture.features["pronasale"]["a"], wanted[0], atol=1e-6)
     assert capture.masks["c"].dtype == bool
+
+
+def all_points(views: Callable[[str, list[float]], tuple[str, Any]]) -> Callable[[Path], None]:
+    """Rewrites every point of three landmarks in three cameras."""
+    pixels = {"a": [20.0, 30.0], "b": [40.0, 25.0], "c": [50.0, 20.0]}
+    names = ("pronasale", "subnasale", "gnathion")
+    return points({"format": FEATURES, "points": {name: dict(views(*of) for of in pixels.items()) for name in names}})
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (all_points(lambda name, at: (name, [at[0] / 64, at[1] / 48])), "the points are shares of the picture's size"),
+        (all_points(lambda name, at: (name, [4 * at[0], 4 * at[1]])), "9 of 9 points lie outside their pictures"),
+        (all_points(lambda name, at: (name, [at[1], at[0]])), "the points agree once rows and columns are exchanged"),
+        (all_points(lambda name, at: (name, [*at, 0.9])), "is no pair of finite pixels; the same is true of 8 more"),
+        (all_points(lambda name, at: (name, None)), "is no pair of finite pixels; the same is true of 8 more"),
+        (all_points(lambda name, at: (f"x{name}", at)), "which the rig does not have; the same is true of 8 more"),
+        (
+            points({"format": FEATURES, "points": {c: {"pronasale": [9, 9], "gnathion": [8, 8]} for c in "abc"}}),
+            "the points are listed by camera",
+        ),
+    ],
+)  # fmt: skip
+def test_a_fault_of_all_points_is_one_sentence(folder: Path, harm: Callable[[Path], None], words: str) -> None:
+    harm(folder)
+    with pytest.raises(InputError) as caught:
+        read_capture(folder)
+    assert len(caught.value.faults) == 1
+    assert words in caught.value.faults[0].text
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("transforms_train.json", b"{}", r"transforms_train\.json: .* join their frames in one transforms\.json"),
+        ("cameras.sfm", b"{}", "Meshroom"),
+        ("bundle.out", b"# Bundle file v0.3", "Bundler"),
+        ("cameras_sphere.npz", b"PK", "NeuS"),
+        ("a.yml", b"%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n", "OpenCV's calibration of one camera"),
+        ("inner.zip", b"PK\3\4", r"holds an archive \(inner\.zip\)"),
+    ],
+)
+def test_cameras_that_are_not_read_and_archives_are_named(folder: Path, name: str, data: bytes, words: str) -> None:
+    (folder / "cameras.json").unlink()
+    (folder / name).write_bytes(data)
+    with pytest.raises(InputError, match=words):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize("thumbnail", [False, True])
+def test_files_of_several_pictures_are_told_and_a_thumbnail_before_them_is_named(folder: Path, thumbnail: bool) -> None:
+    whole = Image.fromarray(read_image(folder / "images" / "a.png"))
+    pages = [whole.resize((16, 12)), whole] if thumbnail else [whole, whole]
+    (folder / "images" / "a.png").unlink()
+    pages[0].save(folder / "images" / "a.tif", save_all=True, append_images=pages[1:])
+    if thumbnail:
+        with pytest.raises(InputError, match=r"16 x 12 pixels.*the file holds 2 pictures, and the first is read"):
+            read_capture(folder)
+        return
+    capture, _ = read_capture(folder)
+    assert "images/a.tif holds several pictures, and the first is read" in [r.text for r in capture.remarks]
+    np.testing.assert_array_equal(capture.images["a"], np.asarray(whole))
+
+
+@pytest.mark.parametrize("locked", ["a.png", "cameras.json"])
+def test_what_may_not_be_read_is_neither_damaged_nor_wrong(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, locked: str
+) -> None:
+    read_bytes = Path.read_bytes
+
+    def refused(path: Path) -> bytes:
+        if path.name == locked and path.parent.name != "background":
+            raise PermissionError(13, "Permission denied")
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", refused)
+    with pytest.raises(InputError, match=r"cannot be read \(Permission denied\)"):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize("shape", [(HEIGHT, WIDTH), (HEIGHT, WIDTH, 3)])
+def test_pictures_of_floating_point_are_not_damaged(folder: Path, shape: tuple[int, ...]) -> None:
+    (folder / "images" / "a.png").unlink()
+    (folder / "images" / "a.tif").write_bytes(cv2.imencode(".tif", np.full(shape, 0.5, np.float32))[1].tobytes())
+    with pytest.raises(InputError, match=r"images/a\.tif holds floating-point numbers: save it in 8 or 16 bits"):
+        read_capture(folder)
+
+
+def test_folders_around_a_capture_may_be_many(folder: Path) -> None:
+    deep = folder.parent / "a" / "b" / "2025-01-01" / "take 2" / "scan"
+    deep.mkdir(parents=True)
+    folder.rename(deep / "capture")
+    assert capture_root(folder.parent / "a") == deep / "capture"

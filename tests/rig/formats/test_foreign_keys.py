@@ -21,6 +21,7 @@ from rig.formats.colmap import COLMAP_MODELS, REFUSED_MODELS
 from rig.formats.foreign_keys import FOREIGN_KEYS, ForeignKey, markdown_table, says_nothing
 from rig.formats.images import write_image
 from rig.formats.reading import CamerasRead
+from rig.formats.unread_programs import OPENCV_KEYS, PATTERNS
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from tests.rig.formats.test_other_cameras import NAMES, POINTS, fan, square
@@ -471,3 +472,9 @@ def test_every_image_of_a_colmap_text_is_read(way: str, tmp_path: Path) -> None:
     }[way]
     images.write_text(text + "\n")
     assert read_cameras(path).rig.names == fan(4).names
+
+
+def test_the_page_names_the_files_of_cameras_that_are_not_read() -> None:
+    page = PAGE.read_text(encoding="utf-8").split("## Not read")[1]
+    assert [pattern for pattern, _ in PATTERNS if f"`{pattern}`" not in page] == []
+    assert [key for key in OPENCV_KEYS if key.decode().strip("\n:").lower() not in page.lower()] == []

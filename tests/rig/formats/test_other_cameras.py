@@ -316,7 +316,7 @@ FAULTS = {
     "binary: a huge count of points": ["promises 4611686018427387904"],
     "binary: NaN focal length": ["cam00.intrinsics.fx"],
     "binary: fisheye": ["number 7"],
-    "binary: no images file": ["cannot be read"],
+    "binary: no images file": ["is missing: copy all files of the model"],
     "text: NaN translation": ["cam00.camera_from_world.translation"],
     "text: zero quaternion": ["cam00.camera_from_world.rotation"],
     "text: unknown camera": ["'cam02' names camera 77"],
@@ -373,3 +373,39 @@ def whole_file(kind: str, folder: Path) -> Path:
     write(kind, fan(3), folder)
     path = {"colmap text": folder / "sparse/0/cameras.txt", "colmap binary": folder / "cameras.bin"}.get(kind)
     return path or folder / ("camera_array.toml" if kind == "caliscope" else "calibration.toml")
+
+
+def test_opencv_yaml_of_plain_lists_is_read_and_words_in_place_of_numbers_are_named(tmp_path: Path) -> None:
+    """As written by hand, or cut off within a matrix."""
+    rig, path = fan(3), tmp_path / "studio.yml"
+    lines = ["%YAML:1.0", "---"]
+    for camera in rig:
+        pose, name = camera.camera_from_world, camera.name
+        rows = {f"K_{name}": camera.intrinsics.matrix(), f"Rot_{name}": pose.rotation}
+        lines += [f"{key}: [{', '.join(str(row.tolist()) for row in matrix)}]" for key, matrix in rows.items()]
+        lines += [f"dist_{name}: {camera.intrinsics.distortion.opencv().tolist()}"]
+        lines += [f"T_{name}: {pose.translation.tolist()}"]
+        lines += [f"W_{name}: {camera.intrinsics.width}", f"H_{name}: {camera.intrinsics.height}"]
+    path.write_text("\n".join(lines) + "\n")
+    back = read_rig_file(path)
+    for camera in rig:
+        np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-6)
+    words = [f"{line.split(':')[0]}: east" if line.startswith(("T_", "Rot_cam01")) else line for line in lines]
+    path.write_text("\n".join(words) + "\n")
+    with pytest.raises(InputError, match="T_cam00 is missing or no list of 3 numbers"):
+        read_rig_file(path)
+
+
+def test_a_csv_that_a_spreadsheet_saved_with_semicolons_is_read(tmp_path: Path) -> None:
+    rig, path = square(fan()), tmp_path / "cameras.csv"
+    for camera in rig:
+        blank = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+        write_image(tmp_path / "images" / f"{camera.name}.png", blank)
+    write_rig_file(rig, path, "realitycapture-csv")
+    plain = read_rig_file(path)
+    path.write_text("\ufeff" + path.read_text().replace(",", ";").replace(".", ",").replace(",png", ".png"), "utf-8")
+    assert find_rig_file(tmp_path) == path
+    saved = read_rig_file(path)
+    assert saved.names == plain.names
+    for one, other in zip(saved, plain, strict=True):
+        np.testing.assert_allclose(one.project(POINTS), other.project(POINTS))

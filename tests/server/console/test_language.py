@@ -28,7 +28,7 @@ from tests.support.console_words import (
 )
 
 SCRIPTS = [path for path in sorted(CONSOLE.rglob("*.js")) if path.name not in ("de.js", "messages_de.js")]
-CHECKS = ("cheirality", "held-out shots", "scale", "determined", "known layout", "lens stability")
+CHECKS = ("cheirality", "held-out shots", "scale", "frame", "determined", "known layout", "lens stability")
 REASONS = ("step limit", "evaluation limit")
 PARTS = ("database", "disk", "worker", "rig")
 SENTENCE = re.compile(r"[a-z]{2,}[,.:;]? [a-z({\d]")
