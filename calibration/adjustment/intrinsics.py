@@ -113,7 +113,7 @@ def _lens(
 
 def noise_of(misses: Float[np.ndarray, "n 2"]) -> float:
     """Returns the robust standard deviation (px) of one coordinate: the median length of the residuals over 1.1774,
-    that of a 2D Gaussian of unit variance."""
+    that of a 2D Gaussian of unit variance. At least ``CORNER_SIGMA_LEAST``; 1 without residuals."""
     if not len(misses):
         return 1.0
     return max(float(np.median(np.linalg.norm(misses, axis=1))) / 1.1774, CORNER_SIGMA_LEAST)

@@ -50,8 +50,9 @@ class HeadGuide:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """Holds one view's coarse grid of cells. Positions belong to the fitted head where it covers a cell; beside the
-    head, to the plane through its middle that faces the camera."""
+    """Holds one view's coarse grid of cells. A cell's place on the head (``into_face_mm``, ``above_chin_mm``) is that
+    of the fitted head's surface where the head covers the cell, and elsewhere that of the plane through the head's
+    middle that faces the camera."""
 
     camera: Camera
     size_px: int

@@ -59,7 +59,8 @@ class Message:
 
 
 def compose(code: str, /, **parameters: Raw) -> Message:
-    """Makes the message of a code. Its parameters must be exactly those that the template names."""
+    """Makes the message of a code. Its parameters must be exactly those that the template names: others, and a code
+    that the catalogue lacks, are programming errors (AssertionError, KeyError)."""
     template, values = CATALOGUE[code], {name: _parameter(value) for name, value in parameters.items()}
     assert values.keys() == fields_of(template).keys(), f"{code}: {sorted(values)} for {template!r}"
     return Message(code, values, render(template, values))

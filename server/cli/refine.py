@@ -32,7 +32,8 @@ def refine_locally(
     a head ``model`` also by the rims of fitted heads. ``focal``: refines focal lengths, too.
 
     A camera that the drift watch finds moved in a capture is left out of that capture: it must be calibrated anew with
-    the board. Raises InputError, TooFewCaptures for fewer than two, and the errors of aligning a head.
+    the board. Raises InputError for captures that cannot be read or are not of one rig, TooFewCaptures for fewer than
+    two and, with a model, TooFewFeatures, WrongFeatures and NoSubject.
     """
     if len(captures) < 2:
         raise TooFewCaptures(len(captures))

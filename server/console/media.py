@@ -258,7 +258,7 @@ def batch_table(who: Reader, batch_id: str, form: TableFormat) -> Response:
 
 @pages.get("/console/batches/{batch_id}/sheet.html")
 def batch_sheet(who: Reader, batch_id: str) -> Response:
-    """Returns the contact sheet of a batch."""
+    """Returns the contact sheet of a batch: an HTML page with views of each head. Raises NotFound."""
     return send_sheet(who[0], batch_id)
 
 

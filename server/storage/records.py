@@ -264,7 +264,8 @@ class WebhookMessage(TypedDict):
 
 
 class EventDocument(TypedDict, total=False):
-    """Holds what happened to a job: a stage with its progress (0 to 1) and remaining time (s), or a new state."""
+    """Holds what happened to a job: the stage that it is in, with progress (0 to 1) and remaining time (s) of the whole
+    job, or a new state. ``camera_moved``: cameras that no longer stand where they were calibrated."""
 
     state: str
     stage: str

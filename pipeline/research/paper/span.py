@@ -65,7 +65,9 @@ def run(
 
 
 def floor(name: str, model: HeadModel, truth: Truth, count: int = 0) -> dict:
-    """Returns one row: distances (mm, area-weighted) between the true face and the model's best fit to it."""
+    """Fits the first ``count`` modes of the model (0: all) to the true face, and returns one row of the table: median,
+    mean and 95th percentile of the distances (mm, area-weighted), and the size of the coefficients in standard
+    deviations. ``name``: the model's name in the row."""
     used = min(count or len(model.modes), len(model.modes))
     fit = best_likeness(model, truth, used)
     z = np.abs(fit.coefficients)

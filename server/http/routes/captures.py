@@ -171,7 +171,8 @@ def get_background(service: ServiceOf, caller: Reader, request: Request, capture
 
 @router.put("/captures/{capture_id}/features", responses=documented(400, 404, 409, 413, 415, 507))
 def put_features(service: ServiceOf, caller: Taker, capture_id: str, features: NewFeatures) -> CaptureOut:
-    """Stores feature points; 422 names every point that does not fit the capture. Later jobs use them."""
+    """Stores feature points (pixels) in place of earlier ones; later jobs use them. 422 names every point that does not
+    fit the capture; 409 is for a capture of the calibration board."""
     return CaptureOut.model_validate(service.captures.put_features(capture_id, features.points))
 
 

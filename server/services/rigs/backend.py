@@ -33,13 +33,13 @@ class RigBackend(Protocol):
         ...
 
     def look(self) -> Mapping[str, ImageRgb]:
-        """Returns a current picture of each camera, by name. Cameras that deliver none are left out. Raises
-        Unavailable."""
+        """Returns a current picture of each camera, by name. Cameras that deliver none are left out. Raises Unavailable
+        if the rig cannot be opened."""
         ...
 
     def preview(self, camera: str) -> bytes:
         """Returns a current picture of one camera as a JPEG file, at most ``PREVIEW_WIDTH`` pixels wide. Raises
-        NotFound for an unknown camera, and Unavailable."""
+        NotFound for an unknown camera, and Unavailable if the rig cannot be opened or the camera delivers none."""
         ...
 
     def camera_settings(self, camera: str) -> CameraSettings:
