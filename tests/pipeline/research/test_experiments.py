@@ -204,6 +204,7 @@ def test_a_short_run_leaves_rows_a_table_and_figures(tmp_path: Path, name: str, 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.gl
 def test_intervals_are_counted_at_every_level_for_both_populations(tmp_path: Path) -> None:
     data = shared("data/ict-facekit").parent
