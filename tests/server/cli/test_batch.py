@@ -142,7 +142,7 @@ def test_a_scheduler_and_ctrl_c_end_it_and_leave_nothing(shots: Path, tmp_path: 
             time.sleep(0.05)
         children = [int(line.split()[3]) for line in log.read_text().splitlines()]
         running.send_signal(number)
-        assert running.wait(20) == 130
+        assert running.wait(45) == 130
     assert list(out.iterdir()) == []
     assert not [child for child in children if Path(f"/proc/{child}").exists()]
 
