@@ -126,10 +126,13 @@ class Results:
 
     def _fetch(self, job_id: str, name: str, entry: FileEntry, path: Path) -> None:
         assert self._objects is not None
+
+        def admit(size: int) -> None:
+            self._store.reserve(size, self._spare)
+
         with self._store.incoming() as folder:
             part = folder / "file"
             try:
-                admit = lambda size: self._store.reserve(size, self._spare)  # noqa: E731
                 self._objects.fetch(f"{job_id}/{name}", part, entry["sha256"], admit)
             except ObjectMissing as error:
                 raise Conflict("result-missing", compose("result-missing")) from error
