@@ -52,8 +52,15 @@ class Results:
         """Tells whether results lie in a store, whatever lies in the data folder."""
         return self._objects is not None
 
-    def keep(self, job_id: str, files: Mapping[str, FileEntry], wanted: Callable[[], bool]) -> None:
-        """Stores a result, and waits for a store that is away. Raises Cancelled once the job is not ``wanted``."""
+    def keep(
+        self,
+        job_id: str,
+        files: Mapping[str, FileEntry],
+        wanted: Callable[[], bool],
+        pause: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """Stores a result, and waits for a store that is away. Raises Cancelled once the job is not ``wanted``,
+        and what ``pause`` raises."""
         if self._objects is None:
             return
         pause_s = FIRST_PAUSE_S
@@ -66,7 +73,7 @@ class Results:
                     break
                 except (StoreUnavailable, StoreDenied) as error:  # the head is made: it waits for its operator, too
                     log.warning("a result waits for the store", reason=error.detail.text)
-                time.sleep(pause_s)
+                pause(pause_s)
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
     def file(self, job_id: str, name: str, entry: FileEntry) -> StoredFile:

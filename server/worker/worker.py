@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from importlib.metadata import version
 
 import sqlalchemy as sa
@@ -60,6 +61,7 @@ from server.tasks.stage_durations import StageDurations
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
 from server.worker.engine import engine_config, take_over
 from server.worker.heartbeat import dead_workers
+from server.worker.pauses import pause
 from server.worker.result_files import described, warnings_of
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
@@ -279,7 +281,7 @@ class Worker:
         for old in folder.glob("attempt-*"):
             shutil.rmtree(old, ignore_errors=True)
         files = described(target)
-        self.results.keep(job_id, files, lambda: self._states.runs(job_id))
+        self.results.keep(job_id, files, lambda: self._states.runs(job_id), partial(pause, self._stop))
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 
