@@ -55,7 +55,7 @@ from server.storage.records import (
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkFailed, function_at
-from server.tasks.progress import JobProgress, ProgressMeter
+from server.tasks.progress import EVERY_S, JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
@@ -205,7 +205,7 @@ class Worker:
             folder.mkdir(parents=True)
             chosen = settings_from_document(settings)
             progress = JobProgress(self._durations.of(chosen))
-            meter = ProgressMeter(self.events, job_id, progress)
+            meter = ProgressMeter(self.events, job_id, progress, max(EVERY_S, self.settings.poll_s))
 
             def cancelled() -> bool:
                 meter.tick()  # asked many times a second, also where a stage reports nothing
@@ -236,7 +236,7 @@ class Worker:
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
-        meter = ProgressMeter(self.events, identity, JobProgress(expected(folder)))
+        meter = ProgressMeter(self.events, identity, JobProgress(expected(folder)), max(EVERY_S, self.settings.poll_s))
 
         def tick() -> bool:
             meter.tick()
