@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from server.metrics import Metrics, QueueFigures
+from server.metrics import Metrics, QueueFigures, StoreFigures
 from server.problem_types import PROBLEM_TYPES
 from server.settings import PREFIX, ServiceSettings
 
@@ -141,11 +141,9 @@ def test_the_alerts_ask_for_metrics_that_there_are() -> None:
     text = (DEPLOY / "prometheus-rules.yml").read_text()
     rules = [rule for group in yaml.safe_load(text)["groups"] for rule in group["rules"]]
     figures = {"cpu": QueueFigures(3, 10.0, 1)}
-    shown = (
-        Metrics()
-        .exposition({"queued": 3}, captures=1, free=1, damaged=0, queues=figures, failures={"no-subject": 2})
-        .decode()
-    )
+    store = StoreFigures(False, {("put", "unavailable"): 3}, {"put": 1.0})
+    others: dict[str, Any] = {"failures": {"no-subject": 2}, "store": store}
+    shown = Metrics().exposition({"queued": 3}, captures=1, free=1, damaged=0, queues=figures, **others).decode()
     known = set(re.findall(r"^# TYPE (\w+)", shown, re.M))
     assert {name for rule in rules for name in re.findall(r"eigenhead_\w+", rule["expr"])} <= known
     kinds = "|".join(found for rule in rules for found in re.findall(r'kind=~"([^"]+)"', rule["expr"]))
