@@ -6,11 +6,13 @@ A service and its worker, each with its default pauses, are counted by pg_stat_s
 brings it): idle for ``IDLE_S``; while JOBS pinned jobs of no length run; and while LONG_JOBS of SECONDS seconds run
 side by side. ``statements_a_job``: those of a job of no length, its submission over HTTP included, and BEGIN and COMMIT
 counted, less those of an idle farm in that time; ``statements_a_job_second``: what each second adds that a job runs.
-``bytes_a_job``: what tables and their indexes grew by at the end of the jobs, vacuumed; ``rows_left``: what
-remains of that once all jobs were removed, as retention does it.
+``bytes_a_job``: what tables and their indexes grew by at the end of the jobs, vacuumed; ``rows_left``: what remains of
+that once all jobs were removed, as retention does it; ``capacity_statements_per_s``: what pgbench gets.
 """
 
 import json
+import re
+import subprocess
 import sys
 import tempfile
 import time
@@ -25,7 +27,7 @@ import httpx
 import psycopg
 
 from tests.server.worker.test_durability import pinned_worker
-from tests.support.postgres import running_postgres
+from tests.support.postgres import programs, running_postgres
 from tests.support.services import running_service, uploaded_capture
 
 IDLE_S = 8.0
@@ -75,6 +77,15 @@ class Database:
             time.sleep(0.25)
 
 
+def capacity(url: str, folder: Path) -> float:
+    """Statements a second of this machine's PostgreSQL, by pgbench with four clients: what a worker asks most."""
+    script = folder / "ask.sql"
+    script.write_text("BEGIN;\nSELECT status FROM dbos.workflow_status WHERE workflow_uuid = 'none';\nCOMMIT;\n")
+    command = [str(programs() / "pgbench"), "-n", "-c", "4", "-T", "5", "-f", str(script), url]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    return 3 * float(re.findall(r"tps = ([\d.]+)", done.stdout)[0])
+
+
 def figures_of(jobs: int, seconds: float, long_jobs: int, folder: Path) -> dict[str, Any]:
     with ExitStack() as stack:
         url = stack.enter_context(running_postgres("-c shared_preload_libraries=pg_stat_statements"))
@@ -99,6 +110,7 @@ def figures_of(jobs: int, seconds: float, long_jobs: int, folder: Path) -> dict[
         for job in client.get("/v1/jobs", params={"limit": 1000}).raise_for_status().json()["jobs"]:
             client.delete(f"/v1/jobs/{job['id']}").raise_for_status()
         left = database.rows()
+        most = capacity(url, folder)
     a_job = (short.total() - idle_per_s * short_s) / jobs
     grown = after_short - empty
     return {
@@ -110,6 +122,7 @@ def figures_of(jobs: int, seconds: float, long_jobs: int, folder: Path) -> dict[
         "bytes_a_job_by_table": {table: round(size / jobs) for table, size in grown.most_common(SHOWN)},
         f"bytes_a_job_of_{seconds:g}_s": round((after_long - after_short).total() / long_jobs),
         "rows_left": left,
+        "capacity_statements_per_s": round(most),
         "often, idle, per second": often(idle, idle_s),
         "often, of a job that runs, per second": often(long - alone, long_jobs * long_s),
     }
