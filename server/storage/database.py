@@ -220,11 +220,14 @@ def database_identity(engine: sa.Engine) -> str:
 def scrub(engine: sa.Engine) -> None:
     """Overwrites what deleted rows left in the database's files, names of people included. Pages that another
     connection is reading stay until the next call."""
-    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-        if engine.dialect.name != "sqlite":
-            tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
+    if engine.dialect.name != "sqlite":
+        tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
+        with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.execute(sa.text(f"VACUUM {tables}"))
-            return
+        return
+    with (
+        engine.connect() as connection
+    ):  # the driver begins no transaction before a pragma; AUTOCOMMIT would outlast it
         for _ in range(SCRUB_TRIES):
             busy, _, _ = connection.execute(sa.text("PRAGMA wal_checkpoint(TRUNCATE)")).one()
             if not busy:
