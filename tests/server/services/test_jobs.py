@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from sqlalchemy import event
 
 from server.services.jobs import Jobs, migrate
 from server.services.work import ReconstructionRequest
@@ -46,7 +47,7 @@ def capture(jobs: Jobs, tmp_path: Path) -> str:
 
 def test_a_page_of_queued_jobs_asks_no_more_for_many_than_for_few(jobs: Jobs, engine: sa.Engine, capture: str) -> None:
     statements = list[str]()
-    sa.event.listen(engine, "before_cursor_execute", lambda *arguments: statements.append(arguments[2]))
+    event.listen(engine, "before_cursor_execute", lambda *arguments: statements.append(arguments[2]))
 
     def count_of(limit: int) -> int:
         statements.clear()
