@@ -221,7 +221,7 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
 
 
 def main(*numbers: str) -> None:
-    defaults = ("4", "200", "4", "12", "6")
+    defaults = ("4", "96", "8", "8", "6")
     workers, jobs, seconds, kills, cuts = (*numbers, *defaults[len(numbers) :])
     with tempfile.TemporaryDirectory(prefix="eigenhead-farm-") as folder:
         figures = figures_of(int(workers), int(jobs), float(seconds), int(kills), int(cuts), Path(folder))
