@@ -10,7 +10,7 @@ import structlog
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import Settings, document_from_settings
-from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
+from rig.formats.cameras.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.messages.message import compose, verbatim
 from server.errors import Refused
 from server.metrics import QueueFigures, StoreFigures
