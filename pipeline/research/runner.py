@@ -26,6 +26,7 @@ from pipeline.research.paper.robustness import robustness
 from pipeline.research.paper.views import views
 from pipeline.research.people.expressions import expressions
 from pipeline.research.people.people import people
+from pipeline.research.speed.farm import scale
 from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
 from pipeline.research.surface.hidden import hidden
@@ -278,6 +279,10 @@ def _growth(task: Task) -> Outcome:
         )
 
 
+def _scale(task: Task) -> Outcome:
+    return scale()
+
+
 def _templates(task: Task) -> Outcome:
     count = {"draws": task.subjects} if task.subjects else {}
     facekit = _facekit(task.shared)
@@ -325,6 +330,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "shapes": _shapes,
     "scaling": _scaling,
     "growth": _growth,
+    "scale": _scale,
 }
 
 

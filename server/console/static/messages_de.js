@@ -117,6 +117,8 @@ export default {
   "rig-described": "{kind:word}, {count} Kameras",
   "records-damaged": "{count} beschädigte Aufzeichnungen liegen in set-aside: {names}",
   "no-record-damaged": "keine beschädigt",
+  "store-answers": "{place} antwortet",
+  "store-none": "Ergebnisse liegen im Datenordner",
   "results-missing": "{count} Aufträge haben keinen Ergebnisordner mehr: {jobs}",
   "results-complete": "alle da",
   "capture-in-use": "Wartende oder laufende Aufträge brauchen diese Aufnahme; erst abbrechen.",

@@ -1,0 +1,232 @@
+"""Workers without a common folder, killed and cut off while they work; prints one JSON object.
+
+    python -m tests.benchmarks.farm_cuts [WORKERS] [JOBS] [SECONDS] [KILLS] [CUTS]
+
+PostgreSQL and a whole S3 server (SeaweedFS), a service, and WORKERS workers, each with a data folder of its own and in
+a pid namespace of its own (so that each is another machine to the rest; needs root), ``SLOTS`` jobs at once. Captures
+are copied to each beforehand. What a worker asks of database and store goes through two proxies of its own on the
+loopback, its links. JOBS pinned jobs sleep SECONDS each. While they run, workers are SIGKILLed and started again KILLS
+times, and CUTS links, of the database and of the store in turn, are cut for ``CUT_S`` seconds: every other one is
+silent (what was connected stays connected, nothing comes through), the others refuse.
+
+``efficiency``: seconds slept for results, by the seconds of all slots until the last job ended. ``undisturbed``: the
+same of a fourth of the jobs before anything is killed.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psycopg
+import sqlalchemy as sa
+
+from tests.support.object_server import KEYS, client_of, running_object_server
+from tests.support.postgres import running_postgres
+from tests.support.services import ROOT, RunningService, running_service, uploaded_capture
+
+SLOTS = 2
+CUT_S = (5.0, 20.0)
+DEAD_S = 6.0
+SEED = 37
+BLOCK = 1 << 16
+ENDED = """SELECT document::json ->> 'state', count(*) FROM eigenhead_events
+           WHERE document::json ->> 'state' IN ('succeeded', 'failed', 'cancelled') GROUP BY 1"""
+
+
+class Link:
+    """A way to a server on the loopback, which can be cut."""
+
+    def __init__(self, port: int) -> None:
+        self._server, self._target = socket.create_server(("127.0.0.1", 0)), port
+        self.port = self._server.getsockname()[1]
+        self.passes, self._refuses = threading.Event(), False
+        self.passes.set()
+        self._open = set[socket.socket]()
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self, seconds: float, *, refuse: bool) -> None:
+        """Cuts the link for so long; returns at once."""
+        self._refuses = refuse
+        self.passes.clear()
+        for one in [*self._open] if refuse else []:
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+        threading.Timer(seconds, self.passes.set).start()
+
+    def _accept(self) -> None:
+        while True:
+            here, _ = self._server.accept()
+            if self._refuses and not self.passes.is_set():
+                here.close()
+                continue
+            there = socket.create_connection(("127.0.0.1", self._target))
+            self._open |= {here, there}
+            for pair in ((here, there), (there, here)):
+                threading.Thread(target=self._forward, args=pair, daemon=True).start()
+
+    def _forward(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(BLOCK):
+                if not self.passes.wait(60.0):
+                    break
+                target.sendall(data)
+        for one in (source, target):
+            self._open.discard(one)
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+
+@dataclass
+class FarmWorker:
+    """One worker with its folder and its links."""
+
+    data: Path
+    environment: dict[str, str]
+    links: tuple[Link, Link]
+    process: "subprocess.Popen[bytes] | None" = field(default=None, init=False)
+
+    def start(self) -> None:
+        apart = ["unshare", "--pid", "--fork", "--kill-child", "--mount-proc"]
+        with Path(f"{self.data}.log").open("ab") as log:
+            command = [*apart, sys.executable, "-m", "server.cli", "worker"]
+            self.process = subprocess.Popen(command, env=os.environ | self.environment, cwd=ROOT, stderr=log)
+
+    def kill(self) -> None:
+        assert self.process is not None
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+
+def farm_worker(number: int, folder: Path, service: RunningService, database: str, store: str) -> FarmWorker:
+    data, url = folder / f"worker{number}", sa.make_url(database)
+    shutil.copytree(service.data / "captures", data / "captures")
+    links = Link(url.port or 0), Link(int(store.rpartition(":")[2]))
+    mine = url.set(port=links[0].port).render_as_string(hide_password=False)
+    environment = service.environment | {
+        "EIGENHEAD_DATA": str(data),
+        "EIGENHEAD_DATABASE_URL": mine,
+        "EIGENHEAD_STORE_ENDPOINT": f"http://127.0.0.1:{links[1].port}",
+        "EIGENHEAD_CONCURRENCY": str(SLOTS),
+        "EIGENHEAD_THREADS": "1",
+    }
+    return FarmWorker(data, environment, links)
+
+
+class Farm:
+    """The service, its database and its workers."""
+
+    def __init__(self, client: httpx.Client, database: "psycopg.Connection[Any]", workers: list[FarmWorker]) -> None:
+        self.client, self.database, self.workers = client, database, workers
+
+    def submit(self, capture: str, jobs: int, seconds: float) -> list[str]:
+        wanted = {"capture_id": capture, "settings": {"front": f"{seconds:g}"}}
+        return [self.client.post("/v1/jobs", json=wanted).raise_for_status().json()["id"] for _ in range(jobs)]
+
+    def under_way(self) -> int:
+        query = "SELECT count(*) FROM dbos.workflow_status WHERE status IN ('PENDING', 'ENQUEUED')"
+        return self.database.execute(query).fetchall()[0][0]
+
+    def finish(self, timeout_s: float = 400.0) -> None:
+        deadline = time.monotonic() + timeout_s
+        while self.under_way():
+            assert time.monotonic() < deadline, self.under_way()
+            time.sleep(0.2)
+
+    def harm(self, kills: int, cuts: int, seconds: float) -> None:
+        """Kills and cuts at random moments of about so many seconds."""
+        rng = random.Random(SEED)
+        acts = ["kill"] * kills + ["cut"] * cuts
+        rng.shuffle(acts)
+        cut = 0
+        for number, act in enumerate(acts):
+            time.sleep(rng.uniform(0.5, 1.5) * seconds / len(acts))
+            worker = self.workers[number % len(self.workers)]
+            if act == "kill":
+                worker.kill()
+                worker.start()
+            else:
+                worker.links[cut % 2].cut(rng.uniform(*CUT_S), refuse=cut // 2 % 2 == 1)
+                cut += 1
+
+
+def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, folder: Path) -> dict[str, Any]:
+    with ExitStack() as stack:
+        os.environ.update(KEYS)
+        database_url, store = stack.enter_context(running_postgres()), stack.enter_context(running_object_server())
+        bucket = client_of(store)
+        bucket.create_bucket(Bucket="heads")
+        settings: dict[str, Any] = {
+            "database_url": database_url,
+            "results_store": "s3://heads/of/",
+            "store_endpoint": store,
+        }
+        settings |= {"store_timeout_s": "3", "silent_s": str(DEAD_S), "heartbeat_s": "1", "poll_s": "0.25"}
+        service = stack.enter_context(
+            running_service(folder / "service", worker=False, jobs_per_key="100000", attempts="1000", **settings)
+        )
+        client = stack.enter_context(httpx.Client(base_url=service.url, timeout=60))
+        database = stack.enter_context(psycopg.connect(database_url, autocommit=True))
+        capture = uploaded_capture(service, folder)
+        made = [farm_worker(number, folder, service, database_url, store) for number in range(workers)]
+        farm = Farm(client, database, made)
+        for worker in made:
+            worker.start()
+            stack.callback(worker.kill)
+        farm.submit(capture, 2 * workers * SLOTS, 0.5)
+        farm.finish()  # every child is started
+        began = time.monotonic()
+        farm.submit(capture, jobs // 4, seconds)
+        farm.finish()
+        undisturbed_s = time.monotonic() - began
+        began = time.monotonic()
+        ids = farm.submit(capture, jobs, seconds)
+        farm.harm(kills, cuts, 0.9 * jobs * seconds / (workers * SLOTS))
+        farm.finish()
+        took = time.monotonic() - began
+        ended = [client.get(f"/v1/jobs/{job}").json() for job in ids]
+        files = Counter(json.dumps(job["files"], sort_keys=True) for job in ended)
+        objects = bucket.get_paginator("list_objects_v2").paginate(Bucket="heads", Prefix="of/")
+        keys = {entry["Key"] for page in objects for entry in page.get("Contents", ())} - {"of/owner"}
+        everything = client.get("/v1/jobs", params={"limit": 1}).json()["total"]
+        said = dict(database.execute(ENDED).fetchall())
+    return {
+        "workers": workers,
+        "slots": workers * SLOTS,
+        "jobs": jobs,
+        "kills": kills,
+        "cuts": cuts,
+        "states": dict(Counter(job["state"] for job in ended)),
+        "different_results": len(files),
+        "ends_said_more_than_once": sum(said.values()) - everything,
+        "objects_left_over": len(keys) - 3 * everything,
+        "seconds": round(took, 1),
+        "efficiency_undisturbed": round(jobs // 4 * seconds / (workers * SLOTS * undisturbed_s), 3),
+        "efficiency": round(jobs * seconds / (workers * SLOTS * took), 3),
+    }
+
+
+def main(*numbers: str) -> None:
+    defaults = ("4", "96", "8", "8", "6")
+    workers, jobs, seconds, kills, cuts = (*numbers, *defaults[len(numbers) :])
+    with tempfile.TemporaryDirectory(prefix="eigenhead-farm-") as folder:
+        figures = figures_of(int(workers), int(jobs), float(seconds), int(kills), int(cuts), Path(folder))
+    sys.stdout.write(json.dumps(figures, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,61 @@
+"""The events of jobs: numbers that grow, one writer or two, and no more rows for a long job than for a short one."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+from server.storage.events import EventLog
+from server.tasks.progress import JobProgress, ProgressMeter
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[EventLog]:
+    engine = open_database(ServiceSettings(data=tmp_path / "data"))
+    yield EventLog(engine)
+    engine.dispose()
+
+
+def test_a_new_event_supersedes_the_one_that_it_names(log: EventLog) -> None:
+    for job, share in (("a", 0.0), ("b", 0.0), ("a", 0.25)):
+        log.append(job, {"stage": "fit", "progress": share})
+    assert log.append("a", {"stage": "fit", "progress": 0.5}, instead_of=2) == 3
+    assert [(event.seq, event.document.get("progress")) for event in log.since("a", 0)] == [(1, 0.0), (3, 0.5)]
+    assert log.append("a", {"stage": "fit", "progress": 0.6}, instead_of=2) == 4, "it was superseded before"
+    assert [event.seq for event in log.since("a", 0)] == [1, 3, 4]
+    assert [event.seq for event in log.since("b", 0)] == [1]
+
+
+def test_two_writers_never_share_a_number(log: EventLog) -> None:
+    numbers = list[int | None]()
+
+    def write() -> None:
+        last = None
+        for _ in range(20):
+            last = log.append("job", {"state": "running"}, instead_of=last)
+            numbers.append(last)
+
+    threads = [threading.Thread(target=write) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(filter(None, numbers)) == list(range(1, 41))
+    assert len(log.since("job", 0)) == 2
+
+
+def test_a_long_job_has_as_many_events_as_it_has_stages(log: EventLog) -> None:
+    seconds = 0.0
+    meter = ProgressMeter(log, "job", JobProgress({"read": 1.0, "fit": 9.0}, lambda: seconds), every_s=0.0)
+    seen = list[float]()
+    for step in range(100):
+        seconds = step / 10
+        meter.report("read" if step < 10 else "fit", step % 10 / 10)
+        new = log.since("job", int(seen[-1]) if seen else 0)
+        seen += [event.seq for event in new]
+    assert len(seen) == len({*seen}) == 100, "whoever looks often sees each"
+    kept = [(event.document.get("stage"), event.seq) for event in log.since("job", 0)]
+    assert kept == [("read", 1), ("fit", 11), ("fit", 100)]
