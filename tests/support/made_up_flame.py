@@ -17,7 +17,7 @@ from pipeline.head_model.model import HeadModel, load_model
 from pipeline.templates.carrying import bind_vertices, surface_binding
 from pipeline.templates.flame_model import FlameModel
 from pipeline.templates.template_file import Template
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
 
 SHAPES, EXPRESSIONS = 300, 100

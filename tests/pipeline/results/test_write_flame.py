@@ -12,7 +12,7 @@ from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
 from pipeline.templates.flame_file import read_flame
 from rig.capture import Capture
-from rig.formats.polygon_obj import read_polygons
+from rig.formats.meshes.polygon_obj import read_polygons
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from tests.support.made_up_flame import flame_surface, flame_template, made_up_flame, write_archive

@@ -8,7 +8,7 @@ from pipeline.fusion.crossings import crossing_faces
 from pipeline.results.write_template_shapes import animated_glb
 from pipeline.templates.animated import AnimatedMesh
 from pipeline.templates.eyeballs import Eyeball, lifted, placed_eyeballs
-from rig.formats.glb_document import opened_glb
+from rig.formats.meshes.glb_document import opened_glb
 from rig.geometry import rotation_from_vector
 from rig.mesh import boundary_edges, vertex_normals
 
