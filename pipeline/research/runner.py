@@ -29,6 +29,7 @@ from pipeline.research.people.people import people
 from pipeline.research.speed.farm import scale
 from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
+from pipeline.research.surface.eyeballs import eyeballs
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
 from pipeline.research.surface.relief import relief
@@ -293,6 +294,10 @@ def _shapes(task: Task) -> Outcome:
     return shapes(task.head, _facekit(task.shared), report=task.report, folder=task.folder)
 
 
+def _eyeballs(task: Task) -> Outcome:
+    return eyeballs(_facekit(task.shared), report=task.report, folder=task.folder)
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
@@ -328,6 +333,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "light": _drawn(light),
     "templates": _templates,
     "shapes": _shapes,
+    "eyeballs": _eyeballs,
     "scaling": _scaling,
     "growth": _growth,
     "scale": _scale,

@@ -44,9 +44,11 @@ from rig.messages.message import documents_of, texts_of
 ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 1 in each channel"
 
 
-def report_document(result: Reconstruction, template: TemplateHeader | None = None) -> Report:
+def report_document(
+    result: Reconstruction, template: TemplateHeader | None = None, flame: Mapping[str, float] | None = None
+) -> Report:
     """Returns the report as JSON types. Every number is finite; unknown ones are None. ``template`` is the template in
-    whose vertex order the head was also written."""
+    whose vertex order the head was also written, ``flame`` the figures of its FLAME model's fit."""
     head, evidence, refined = result.head, result.evidence, result.refined
     return {
         "format": FORMAT,
@@ -69,7 +71,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "coefficients": _shape_coefficients(head),
         "expression": [_expression(found) for found in evidence.expression],
         "morphs": None if evidence.blendshape_rig is None else _morphs(evidence.blendshape_rig),
-        "template": None if template is None else _template(template),
+        "template": None if template is None else _template(template, flame),
         "world_from_head": similarity_document(head.fit.world_from_head),
         "landmarks": {
             name: {"position": _numbers(mark.position_mm), "std": _optional_numbers(mark.std_mm)}
@@ -161,13 +163,16 @@ def _morphs(blendshape_rig: BlendshapeRig) -> MorphsReport:
     return {"weights": used, "without_counterpart": list(blendshape_rig.missing)}
 
 
-def _template(template: TemplateHeader) -> TemplateReport:
-    return {
+def _template(template: TemplateHeader, flame: Mapping[str, float] | None) -> TemplateReport:
+    figures: TemplateReport = {
         "name": template.name,
         "source": template.source,
         "sha256": template.source_sha256,
         "registration": dict(template.figures),
     }
+    if flame is not None:
+        figures["flame"] = dict(flame)
+    return figures
 
 
 def similarity_document(transform: Similarity) -> SimilarityReport:

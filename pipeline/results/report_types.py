@@ -98,12 +98,14 @@ class MorphsReport(TypedDict):
 
 class TemplateReport(TypedDict):
     """Describes the template in whose vertex order head-NAME.obj is. ``sha256`` is that of its mesh's file;
-    ``registration`` has the figures that ``eigenhead template add`` printed."""
+    ``registration`` has the figures that ``eigenhead template add`` printed, ``flame`` those of its FLAME
+    model's fit, where it has one."""
 
     name: str
     source: str
     sha256: str
     registration: dict[str, float]
+    flame: NotRequired[dict[str, float]]
 
 
 class SimilarityReport(TypedDict):

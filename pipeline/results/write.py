@@ -9,6 +9,7 @@
     landmarks.mrk.json  on request: the landmarks as a point list of 3D Slicer
     head-NAME.obj       on request: the head in the vertex order of the template NAME, with its texture
     head-NAME.glb, head-NAME-shapes.npz     with morphs: that mesh without expression, with shapes and pivots
+    flame_param.npz     where NAME was made of a FLAME model: its parameters for this head
 
 Files of the same input, model, settings and version are the same bytes, report.json's seconds excepted.
 """
@@ -27,6 +28,7 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.slicer_landmarks import landmarks_document
 from pipeline.results.write_expression import write_expression
+from pipeline.results.write_flame import write_flame
 from pipeline.results.write_template import template_colours, write_template
 from pipeline.results.write_template_shapes import write_template_shapes
 from pipeline.stages.bust import Bust
@@ -56,6 +58,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
     capture = reassign_images(capture, pictures=result.views.assignment)
     head, blendshape_rig = head_mesh(result), result.evidence.blendshape_rig
     with task_pool(THREADS) as pool:
+        fitted = None if template is None else pool.submit(write_flame, folder, result, template)
         jobs = [
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),
@@ -67,10 +70,11 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
         ]
         for job in jobs:
             job.result()
+        flame = None if fitted is None else fitted.result()
     if result.settings.outputs.slicer:
         points = json.dumps(landmarks_document(result), indent=1, allow_nan=False)
         write_atomically(folder / "landmarks.mrk.json", points.encode())
-    text = json.dumps(report_document(result, template), indent=1, allow_nan=False)
+    text = json.dumps(report_document(result, template, flame), indent=1, allow_nan=False)
     write_atomically(folder / "report.json", text.encode())
 
 

@@ -24,7 +24,11 @@ def export(
     *,
     result: Annotated[
         Path | None,
-        typer.Option(help="The capture's result folder: its head becomes points.", exists=True, file_okay=False),
+        typer.Option(
+            help="The capture's result folder: head and FLAME parameters.",
+            exists=True,
+            file_okay=False,
+        ),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
     overwrite: Overwrite = False,
@@ -52,5 +56,10 @@ def export(
     for warning in made.warnings:
         warn(f"{warning.code}: {warning}")
     document = {"out": str(out), "as": form, "cameras": made.cameras, "left_out": made.left_out, "points": made.points}
-    seen = f"{len(made.cameras)} views" + (f", without {', '.join(made.left_out)}" if made.left_out else "")
+    document |= {"flame": made.flame}
+    seen = (
+        f"{len(made.cameras)} views"
+        + (", FLAME parameters" if made.flame else "")
+        + (f", without {', '.join(made.left_out)}" if made.left_out else "")
+    )
     answer(document, json_out, [f"{out}  {seen}"])

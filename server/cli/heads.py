@@ -148,7 +148,7 @@ def reconstruct(
     json_out: Json = False,
 ) -> None:
     """Reconstruct one capture without the service."""
-    from server.cli.reconstruct_local import reconstruct_locally
+    from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
     switches = {"obj": obj, "atlas": atlas, "delight": delight, "normal_map": normal_map}
@@ -164,7 +164,7 @@ def reconstruct(
         warn(f"{warning['code']}: {warning['message']}")
     names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
     made = [out / name for name in names if (out / name).is_file()]
-    answer(written, json_out, [str(path) for path in made])
+    answer(written, json_out, [*(str(path) for path in made), *flame_lines(written, out)])
 
 
 @app.command(epilog="Example: eigenhead check shots/anna.tar.gz --json")

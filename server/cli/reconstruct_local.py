@@ -72,6 +72,17 @@ def _reconstruct_folder(
     durations.learn(chosen, progress.finish())
 
 
+def flame_lines(document: "ReportDocument", out: Path) -> list[str]:
+    """Returns what is printed of a FLAME model's fit: its file, and what the model leaves of the head."""
+    from rig.formats.flame_param import FILE
+
+    figures = (document["template"] or {}).get("flame")
+    if figures is None:
+        return []
+    median, most = figures["residual_median_mm"], figures["residual_p95_mm"]
+    return [f"{out / FILE}  FLAME comes as near as {median:.2f} mm (median), {most:.2f} (95 %)"]
+
+
 def check_apart(out: Path, capture: Path, option: str = "--out") -> None:
     """Raises SpoilsCapture if a later run would read pictures of the result in ``out`` as pictures of the capture."""
     from server.tasks.photographs import photographs_alone

@@ -23,6 +23,10 @@ from rig.rig import Rig
 DatasetFormat = Literal["nerfstudio", "gaussian-avatars"]
 DATASET_FORMATS: tuple[DatasetFormat, ...] = get_args(DatasetFormat)
 MOMENT = 0  # a capture is one moment
+FLAME_MOMENT, FLAME_CANONICAL = (
+    f"flame_param/{MOMENT:05}.npz",
+    "canonical_flame_param.npz",
+)  # where there are parameters
 POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in ("red", "green", "blue")]
 )
@@ -50,9 +54,11 @@ def picture_names(rig: Rig, form: DatasetFormat) -> dict[str, str]:
     return {name: f"{MOMENT:05}_{index:02}.png" for index, name in enumerate(rig.names)}
 
 
-def dataset_documents(rig: Rig, form: DatasetFormat, *, with_points: bool) -> dict[str, bytes]:
+def dataset_documents(
+    rig: Rig, form: DatasetFormat, *, with_points: bool, with_flame: bool = False
+) -> dict[str, bytes]:
     """Returns the JSON files of a data set by name. ``rig``: the pinholes of its pictures. ``with_points``: there is a
-    point cloud beside them."""
+    point cloud beside them; ``with_flame``: so are FLAME parameters."""
     layout, names = LAYOUTS[form], picture_names(rig, form)
     head: dict[str, object] = {"camera_model": "OPENCV", "unit": "metre"}
     if with_points:
@@ -63,6 +69,7 @@ def dataset_documents(rig: Rig, form: DatasetFormat, *, with_points: bool) -> di
         frame = frame_document(camera, f"{layout.pictures}/{names[camera.name]}") | {"mask_path": mask_path}
         if form == "gaussian-avatars":
             frame |= _avatar_fields(camera, index, mask_path)
+            frame |= {"flame_param_path": FLAME_MOMENT} if with_flame else {}
         frames[camera.name] = frame
     if form == "nerfstudio":
         return {"transforms.json": _encoded(head, frames.values())}

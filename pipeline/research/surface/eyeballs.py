@@ -1,0 +1,118 @@
+"""Eyeballs behind the lids of a mesh with open eyes (``pipeline.templates.eyeballs``): what of them crosses lids.
+
+The mesh is ICT-FaceKit's own head, whose eyes are open, with the model's true shapes, on heads of its population. An
+eyeball's triangles that cross a lid are counted at rest and for each of Apple's shapes at half and at full weight, as
+the shapes come and once lids are lifted.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.evidence.expression import build_blendshape_rig
+from pipeline.fusion.crossings import crossing_faces
+from pipeline.head_model.model import HeadModel
+from pipeline.research import markdown
+from pipeline.research.outcome import Outcome, Row
+from pipeline.research.records import Records, key_of
+from pipeline.results.clay import clay
+from pipeline.templates import eyeballs as tested
+from pipeline.templates import pivots as placing
+from pipeline.templates.eyeballs import Eyeball, lifted, placed_eyeballs
+from pipeline.templates.pivots import pivots
+from rig.geometry import Similarity
+from rig.mesh import Mesh
+from rig.progress import Progress
+
+SEED, SPREAD = 38, 0.8
+HEADS = 5
+OPEN_TRIANGLES = 22288  # of ICT-FaceKit's face and head; what follows in the model closes eyes and mouth
+ABOUT_MM = 22.0  # of an eyeball's centre, in which lids are looked at
+FACE = (np.array([-75.0, -20.0, 40.0]), np.array([75.0, 70.0, 110.0]))  # head frame, mm
+SHOWN = ("eyeBlinkRight", "eyeBlinkLeft")
+
+
+def eyeballs(facekit: HeadModel, *, report: Progress, folder: Path | None = None) -> Outcome:
+    """Returns ``crossing_rest``, ``crossing_before`` and ``crossing_after`` (triangles of eyeballs over all heads,
+    shapes and weights), and ``lift_worst_mm``."""
+    records, rows = Records(folder, "eyeballs", key_of(facekit.sha256, tested, placing)), []
+    for number in range(HEADS):
+        report(f"head {number}", number / HEADS)
+        rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
+    report("done", 1.0)
+    figures = {
+        name: float(sum(float(row[name]) for row in rows))
+        for name in ("crossing_rest", "crossing_before", "crossing_after")
+    }
+    figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
+    pictures = {} if folder is None else {"eyes": _picture(facekit)}
+    return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}
+
+
+def _row(model: HeadModel, number: int) -> Row:
+    vertices, faces, moves, eyes = _case(model, number)
+    counts, lift = np.zeros(3, int), 0.0
+    for move in moves.values():
+        free = lifted(vertices, faces, move, eyes)
+        lift = max(lift, float(np.linalg.norm(free - move, axis=1).max()))
+        for eyeball in eyes.values():
+            counts[1] += sum(_crossing(vertices + weight * move, faces, eyeball) for weight in (0.5, 1.0))
+            counts[2] += sum(_crossing(vertices + weight * free, faces, eyeball) for weight in (0.5, 1.0))
+    counts[0] = sum(_crossing(vertices, faces, eyeball) for eyeball in eyes.values())
+    return {
+        "eyeballs": len(eyes),
+        "shapes": len(moves),
+        "crossing_rest": int(counts[0]),
+        "crossing_before": int(counts[1]),
+        "crossing_after": int(counts[2]),
+        "lift_mm": lift,
+    }
+
+
+def _case(
+    model: HeadModel, number: int
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], dict[str, Float[np.ndarray, "v 3"]], dict[str, Eyeball]]:
+    """Returns a head of the model (the first is its mean) with open eyes, its shapes that move something, and its
+    eyeballs."""
+    rng = np.random.default_rng((SEED, number))
+    z = SPREAD * rng.standard_normal(len(model.modes)) if number else np.zeros(0)
+    vertices, whole = model.vertices(z), model.levels["full"].faces
+    rig = build_blendshape_rig(model, Similarity.identity(), Mesh(vertices, whole), ())
+    moves = {name: shape for name, shape in rig.morphs.items() if np.abs(shape).max() > 0.0}
+    landmarks = {name: vertices[row] for name, row in model.landmarks.items()}
+    found = pivots(landmarks, vertices, moves, [])
+    centres = {name: found[name] for name in ("eye_right", "eye_left")}
+    faces = whole[:OPEN_TRIANGLES]
+    return vertices, faces, moves, placed_eyeballs(vertices, faces, landmarks, centres)
+
+
+def _crossing(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], eyeball: Eyeball) -> int:
+    """Returns how many triangles of an eyeball cross the head."""
+    ball = eyeball.mesh()
+    about = faces[(np.linalg.norm(vertices - eyeball.centre, axis=1) < ABOUT_MM)[faces].any(axis=1)]
+    joined = np.concatenate([about, ball.faces + len(vertices)])
+    return int(crossing_faces(np.concatenate([vertices, ball.vertices]), joined)[len(about) :].sum())
+
+
+def _picture(model: HeadModel) -> np.ndarray:
+    """Draws the eyes of each head as clay: at rest, half and fully closed."""
+    rows = []
+    for number in range(HEADS):
+        vertices, faces, moves, eyes = _case(model, number)
+        blink = sum(lifted(vertices, faces, moves[name], eyes) for name in SHOWN)
+        rows.append(np.hstack([_drawn(vertices + weight * blink, faces, eyes) for weight in (0.0, 0.5, 1.0)]))
+    return np.vstack(rows)
+
+
+def _drawn(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], eyes: dict[str, Eyeball]) -> np.ndarray:
+    for ball in (eyeball.mesh() for eyeball in eyes.values()):
+        faces = np.concatenate([faces, ball.faces + len(vertices)])
+        vertices = np.concatenate([vertices, ball.vertices])
+    return clay(Mesh(vertices, faces), azimuth_deg=25.0, box=FACE)
+
+
+def _table(rows: list[Row]) -> str:
+    names = ("head", "eyeballs", "shapes", "crossing_rest", "crossing_before", "crossing_after")
+    cells = [[*(row[name] for name in names), f"{row['lift_mm']:.2f}"] for row in rows]
+    return markdown.table((*names, "largest lift, mm"), cells)

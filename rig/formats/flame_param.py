@@ -1,0 +1,73 @@
+"""Parameters of a FLAME head in a file: flame_param.npz, as VHAP writes and GaussianAvatars reads it.
+
+A NumPy archive of float32 (https://github.com/ShenhanQian/VHAP, https://github.com/ShenhanQian/GaussianAvatars):
+lengths in metres, rotation vectors in radians, and moments along the first axis, of which there is one here.
+``static_offset`` is added to each vertex before any joint turns.
+"""
+
+import io
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from rig.errors import InputError
+from rig.messages.message import compose
+
+FILE = "flame_param.npz"
+POSES = {"rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
+CANONICAL_JAW_RAD = 0.3  # canonical_flame_param.npz opens the mouth, so that lips do not stick together
+FlameParam = Mapping[str, Float32[np.ndarray, "..."]]
+
+
+def flame_param(
+    shape: Float[np.ndarray, " s"],
+    expression: Float[np.ndarray, " e"],
+    pose: Float[np.ndarray, "5 3"],
+    translation: Float[np.ndarray, " 3"],
+    offsets: Float[np.ndarray, "v 3"],
+) -> FlameParam:
+    """Returns the arrays of the file for one moment. ``pose``: of root, neck, jaw and both eyes."""
+    parts = np.split(pose.ravel(), np.cumsum([*POSES.values()])[:-1])
+    arrays = {"shape": shape, "expr": expression[None]}
+    arrays |= {name: part[None] for name, part in zip(POSES, parts, strict=True)}
+    arrays |= {"translation": translation[None], "static_offset": offsets[None]}
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
+
+
+def canonical(parameters: FlameParam) -> FlameParam:
+    """Returns the head of the same person at the origin, looking along z, without expression, mouth open."""
+    out = {name: array if name in ("shape", "static_offset") else 0.0 * array for name, array in parameters.items()}
+    return out | {"jaw_pose": np.array([[CANONICAL_JAW_RAD, 0.0, 0.0]], np.float32)}
+
+
+def encoded(parameters: FlameParam) -> bytes:
+    """Encodes the arrays as the file's bytes."""
+    packed = io.BytesIO()
+    arrays: dict[str, Any] = dict(parameters)
+    np.savez(packed, **arrays)
+    return packed.getvalue()
+
+
+def read_flame_param(path: Path) -> FlameParam:
+    """Returns the arrays of a file of one moment. Raises InputError if it is damaged or holds other arrays."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name].astype(np.float32) for name in file}
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
+        raise InputError(str(path), [compose("file-incomplete", reason=str(fault))]) from None
+    wanted = POSES | {"translation": 3}
+    faults = [
+        compose("flame-array-unfit", name=name, shape=str(arrays[name].shape), wanted=f"(1, {size})")
+        for name, size in wanted.items()
+        if name in arrays and arrays[name].shape != (1, size)
+    ]
+    names = ("shape", "expr", *wanted, "static_offset")
+    faults += [compose("flame-array-missing", name=name) for name in names if name not in arrays]
+    if faults:
+        raise InputError(str(path), faults)
+    return {name: arrays[name] for name in names}

@@ -1,0 +1,183 @@
+"""Reads the arrays of a pickle without running anything that it names.
+
+A pickle is a program: the names in it are imported and called. Here no name is. NumPy's arrays and types, SciPy's
+sparse matrices and chumpy's arrays become inert stand-ins of this module, which decode plain numbers by themselves;
+any other name is refused. Pickles of Python 2 are read, too.
+"""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig.errors import InputError
+from rig.messages.message import compose
+
+MAX_BYTES = 512 << 20  # FLAME's models have 50 MB, SMPL-X's 550 before compression
+KINDS = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1")
+DAMAGE = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    TypeError,
+    ValueError,
+    pickle.PickleError,
+)
+
+
+def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Returns the arrays of a pickled dictionary by name; entries that are no arrays of numbers are left out, sparse
+    matrices are made dense. Raises InputError naming what is wrong, such as a name that is no array's."""
+    if path.stat().st_size > MAX_BYTES:
+        large = compose("mesh-file-large", size_mb=path.stat().st_size >> 20, most_mb=MAX_BYTES >> 20)
+        raise InputError(path.name, [large])
+    try:
+        with path.open("rb") as file:
+            content = _Reader(file, encoding="latin1").load()
+        entries = content.items() if isinstance(content, dict) else ()
+        arrays = {str(name): array for name, value in entries if (array := _array(value)) is not None}
+    except _Foreign as fault:
+        raise InputError(path.name, [compose("pickle-name-refused", name=str(fault))]) from None
+    except DAMAGE as fault:
+        raise InputError(path.name, [compose("file-incomplete", reason=str(fault))]) from None
+    if not arrays:
+        raise InputError(path.name, [compose("pickle-without-arrays")])
+    return arrays
+
+
+class _Foreign(Exception):
+    """Reports a name in a pickle that belongs to no array."""
+
+
+class _StandIn:
+    """Stands for anything in a pickle. Stand-ins are classes, never functions: a pickle can set attributes of what has
+    no ``__setstate__``."""
+
+    def __init__(self, *_: Any) -> None:
+        """Ignores what a pickle hands over before the state."""
+
+    def __setstate__(self, state: Any) -> None:
+        """Ignores the state."""
+
+
+class _Type(_StandIn):
+    """Stands for numpy.dtype: one of the plain kinds of numbers, and its byte order."""
+
+    def __init__(self, kind: Any = "", *_: Any) -> None:
+        self.kind, self.order = str(kind), "<"
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.order = ">" if state[1] == ">" else "<"
+
+    def decoded(self) -> np.dtype | None:
+        """Returns the type, or None of what is no plain number."""
+        kind = self.kind.lstrip("<>=|")
+        return np.dtype(self.order + kind) if kind in KINDS else None
+
+
+class _Array(_StandIn):
+    """Stands for numpy.ndarray, of which a pickle holds shape, type, order and bytes."""
+
+    value: np.ndarray | None = None
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, kind, columns_first, raw = state
+        self.value = _decoded(raw, kind, shape, "F" if columns_first else "C")
+
+
+def _decoded(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray | None:
+    of = kind.decoded() if isinstance(kind, _Type) else None
+    if of is None or isinstance(raw, list):
+        return None
+    data = raw.encode("latin1") if isinstance(raw, str) else bytes(raw)
+    sizes = tuple(int(size) for size in shape)
+    return np.frombuffer(data, of).reshape(sizes, order="F" if order == "F" else "C")
+
+
+class _Inert(_StandIn):
+    """Stands for an object of SciPy or chumpy: keeps its state."""
+
+    state: Any = None
+    kind = ""
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+class _Encoded(_StandIn):
+    """Stands for _codecs.encode, by which Python 3 writes bytes for Python 2."""
+
+    def __new__(cls, text: str = "", *_: Any) -> Any:
+        return text.encode("latin1")
+
+
+class _FromBuffer(_StandIn):
+    """Stands for what makes an array of a buffer."""
+
+    def __new__(cls, raw: Any = b"", kind: Any = None, shape: Any = (), order: Any = "C", *_: Any) -> Any:
+        array = _Array()
+        array.value = _decoded(raw, kind, shape, order)
+        return array
+
+
+class _Empty(_StandIn):
+    """Stands for what makes an empty object of a class: only stand-ins are made."""
+
+    def __new__(cls, kind: Any = None, *_: Any) -> Any:
+        return kind() if isinstance(kind, type) and issubclass(kind, _Array | _Inert) else _Inert()
+
+
+_BY_NAME: dict[tuple[str, str], type[_StandIn]] = {
+    ("ndarray", "numpy"): _Array,
+    ("dtype", "numpy"): _Type,
+    ("_reconstruct", "numpy"): _Empty,
+    ("_frombuffer", "numpy"): _FromBuffer,
+    ("encode", "_codecs"): _Encoded,
+    ("_reconstructor", "copy_reg"): _Empty,
+    ("_reconstructor", "copyreg"): _Empty,
+    ("object", "__builtin__"): _Inert,
+    ("object", "builtins"): _Inert,
+}
+_INERT = ("scipy", "chumpy")
+
+
+class _Reader(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> type[_StandIn]:
+        """Returns the stand-in of a name, and imports nothing. Raises _Foreign for names of other programs."""
+        package = module.partition(".")[0]
+        if (name, package) in _BY_NAME:
+            return _BY_NAME[name, package]
+        if package in _INERT:
+            return type("_Inert", (_Inert,), {"kind": name})
+        raise _Foreign(f"{module}.{name}"[:80])
+
+
+def _array(value: Any) -> np.ndarray | None:
+    """Returns the numbers of an entry as an array; None of what is none."""
+    if isinstance(value, _Array):
+        return value.value
+    if not isinstance(value, _Inert) or not isinstance(value.state, dict):
+        return None
+    state = {str(key): part for key, part in value.state.items()}
+    if "indptr" in state:
+        return _dense(value.kind, state)
+    return _array(state.get("x"))  # of a chumpy array: what it holds
+
+
+def _dense(kind: str, state: dict[str, Any]) -> np.ndarray | None:
+    """Returns a sparse matrix of compressed columns or rows as an array."""
+    data, at, ends = (_array(state.get(name)) for name in ("data", "indices", "indptr"))
+    shape = state.get("_shape", state.get("shape"))
+    if data is None or at is None or ends is None or shape is None:
+        return None
+    by_columns = kind.startswith("csc")
+    count = int(shape[1] if by_columns else shape[0])
+    if len(ends) != count + 1 or int(shape[0]) * int(shape[1]) > MAX_BYTES // 8:
+        return None
+    out = np.zeros((int(shape[0]), int(shape[1])))
+    line = np.repeat(np.arange(count), np.diff(ends))
+    np.add.at(out, (at, line) if by_columns else (line, at), data)
+    return out
