@@ -30,6 +30,7 @@ from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
+from pipeline.research.surface.pores import pores
 from pipeline.research.surface.relief import relief
 from pipeline.research.surface.repeat import repeat
 from pipeline.research.surface.shapes import shapes
@@ -311,6 +312,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "views": _drawn(views),
     "repeat": _drawn(repeat),
     "relief": _relief,
+    "pores": _drawn(pores),
     "span": _span,
     "detail": _detail,
     "hidden": _hidden,
