@@ -192,11 +192,12 @@ def _texture(texturing: Texturing) -> TextureReport:
         "gains": _plain(vertices.gains),
         "chart": None if texturing.chart is None else _chart(texturing.chart),
         "light": None if texturing.albedo is None else _light(texturing.albedo.light),
-        "skin": None if texturing.skin is None else _skin(texturing.skin),
+        "skin": None if texturing.skin is None else skin_document(texturing.skin),
     }
 
 
-def _skin(maps: SkinMaps) -> SkinReport:
+def skin_document(maps: SkinMaps) -> SkinReport:
+    """Describes the maps of the skin."""
     return {
         "size": len(maps.displacement),
         "mm_per_code": MM_PER_CODE,
@@ -205,7 +206,7 @@ def _skin(maps: SkinMaps) -> SkinReport:
         "normals": "glTF: x along the tangent, y up in the image, z along the normal",
         "longest_mm": LONGEST_MM,
         "shortest_mm": SHORTEST_MM,
-        "repeated": _numbers(maps.repeated),
+        "repeated": list(maps.repeated),
         "views": list(maps.views),
     }
 
