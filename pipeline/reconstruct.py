@@ -15,7 +15,7 @@ from pipeline.stages.recorder import Recorder
 from pipeline.stages.refined_head import refine_head
 from pipeline.stages.texturing import texture_head
 from pipeline.stages.views import Views, check_lenses, find_views
-from rig.formats.usdz import check_usd
+from rig.formats.meshes.usdz import check_usd
 
 
 def fit_shape(

@@ -20,11 +20,11 @@ from pipeline.results.skin_files import write_skin_maps
 from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from rig.atomic_write import write_atomically
-from rig.formats.glb import Skin, glb_bytes
-from rig.formats.obj import mtl_bytes, obj_bytes, textured_obj_bytes
-from rig.formats.ply import write_ply
-from rig.formats.printing import stl_bytes, threemf_bytes
-from rig.formats.usdz import usdz_bytes
+from rig.formats.meshes.glb import Skin, glb_bytes
+from rig.formats.meshes.obj import mtl_bytes, obj_bytes, textured_obj_bytes
+from rig.formats.meshes.ply import write_ply
+from rig.formats.meshes.printing import stl_bytes, threemf_bytes
+from rig.formats.meshes.usdz import usdz_bytes
 from rig.mesh import Mesh
 
 JPEG_OPTIONS = (

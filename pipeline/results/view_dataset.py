@@ -1,8 +1,8 @@
 """Writes a capture as a data set of views: undistorted pictures, masks, and the files that say where each was taken.
 
-Enters: a capture, its silhouettes and rig. Leaves: the folder described in ``rig.formats.dataset_json``, of the views
-that take part. For GaussianAvatars the pictures show the subject on white, by pinhole cameras with square pixels and
-the principal point in the middle; for nerfstudio they keep background and camera matrix.
+Enters: a capture, its silhouettes and rig. Leaves: the folder described in ``rig.formats.cameras.dataset_json``, of the
+views that take part. For GaussianAvatars the pictures show the subject on white, by pinhole cameras with square pixels
+and the principal point in the middle; for nerfstudio they keep background and camera matrix.
 """
 
 from collections.abc import Mapping
@@ -18,8 +18,8 @@ from pipeline.imaging.undistortion import pinhole_of, undistorted_picture, undis
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.capture import Capture
-from rig.formats.dataset_json import LAYOUTS, DatasetFormat, dataset_documents, picture_names, points_ply
-from rig.formats.images import write_image
+from rig.formats.cameras.dataset_json import LAYOUTS, DatasetFormat, dataset_documents, picture_names, points_ply
+from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.rig import Rig
 

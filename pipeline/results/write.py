@@ -34,9 +34,9 @@ from pipeline.stages.bust import Bust
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, reassign_images
-from rig.formats.glb import write_glb
-from rig.formats.images import write_image
-from rig.formats.ply import write_ply
+from rig.formats.meshes.glb import write_glb
+from rig.formats.meshes.ply import write_ply
+from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform, Similarity
 from rig.mesh import Mesh
 

@@ -18,8 +18,8 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.templates.template_file import Template
 from pipeline.texturing.template_texture import Tile, corner_tiles, skin_polygons, template_textures
 from rig.atomic_write import write_atomically
-from rig.formats.obj import MATERIAL
-from rig.formats.polygon_obj import PolygonMesh, polygon_obj_bytes
+from rig.formats.meshes.obj import MATERIAL
+from rig.formats.meshes.polygon_obj import PolygonMesh, polygon_obj_bytes
 from rig.mesh import vertex_normals
 
 NO_SKIN = 200  # grey of what no photograph shows

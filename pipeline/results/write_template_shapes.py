@@ -19,9 +19,9 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.templates.animated import AnimatedMesh, animated_mesh
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
-from rig.formats.glb import glb_bytes
-from rig.formats.morph_glb import with_morphs
-from rig.formats.pivot_glb import with_pivots
+from rig.formats.meshes.glb import glb_bytes
+from rig.formats.meshes.morph_glb import with_morphs
+from rig.formats.meshes.pivot_glb import with_pivots
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh, vertex_normals
 

@@ -11,7 +11,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.templates.names import template_path
 from pipeline.templates.registration import Registration, register
 from pipeline.templates.template_file import Template, read_template
-from rig.formats.polygon_obj import PolygonMesh, read_polygons
+from rig.formats.meshes.polygon_obj import PolygonMesh, read_polygons
 from rig.progress import Progress
 
 

@@ -23,7 +23,7 @@ from pipeline.templates.carrying import Attachment, SurfaceBinding, bind_vertice
 from pipeline.templates.likeness import CANDIDATES, Likeness, fit_model_to_mesh
 from pipeline.templates.placement import Surface, find_place, outward, place_by_landmarks
 from rig.errors import InputError
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges, vertex_normals
 from rig.messages.message import compose

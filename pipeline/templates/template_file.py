@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.templates.carrying import Attachment, SurfaceBinding
 from pipeline.templates.header import DAMAGE, FORMAT, WORDS, BadTemplate, TemplateHeader, header_words, read_meta
 from rig.atomic_write import write_atomically
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.messages.message import compose
 
 MESH = {"sizes": "i", "corners": "i", "uv": "f", "corner_uv": "i"}

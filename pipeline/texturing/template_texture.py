@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.templates.carrying import SurfaceBinding
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
-from rig.formats.polygon_obj import PolygonMesh, fan
+from rig.formats.meshes.polygon_obj import PolygonMesh, fan
 
 MAX_TILES = 10  # a row of UDIM
 MAX_TEXELS = 4096  # a side

@@ -1,6 +1,6 @@
 """Reads the pictures of a capture once more, one at a time, at the size of their files.
 
-Everything else works on reduced pictures (``rig.formats.work_size``). Pores need all pixels, and all pictures at once
+Everything else works on reduced pictures (``rig.formats.pictures.work_size``). Pores need all pixels, and all pictures at once
 would not fit into memory.
 """
 
@@ -9,9 +9,9 @@ from pathlib import Path
 
 from rig.capture import ReadImage
 from rig.errors import InputError
-from rig.formats.capture_folder import decode_picture
-from rig.formats.picture_samples import WHOLE_BITS, measure_samples
-from rig.formats.shot_files import find_files
+from rig.formats.captures.capture_folder import decode_picture
+from rig.formats.captures.shot_files import find_files
+from rig.formats.pictures.picture_samples import WHOLE_BITS, measure_samples
 from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig

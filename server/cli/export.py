@@ -11,7 +11,7 @@ app = typer.Typer(rich_markup_mode=None)
 
 
 def _dataset_formats() -> tuple[str, ...]:
-    from rig.formats.dataset_json import DATASET_FORMATS
+    from rig.formats.cameras.dataset_json import DATASET_FORMATS
 
     return DATASET_FORMATS
 
@@ -36,7 +36,7 @@ def export(
     from typing import cast
 
     from pipeline.settings import settings_from_document
-    from rig.formats.dataset_json import DatasetFormat
+    from rig.formats.cameras.dataset_json import DatasetFormat
     from server.cli.reconstruct_local import check_apart
     from server.tasks.export_dataset import export_folder
     from server.tasks.reconstruct_folder import folder_of

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.atomic_write import write_atomically
-from rig.formats.capture_folder import capture_root
-from rig.formats.shot_files import BESIDE_PICTURES, picture_folder
+from rig.formats.captures.capture_folder import capture_root
+from rig.formats.captures.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
 from server.cli.answers import CannotWrite, SpoilsCapture, prepare_file
 from server.processes import share_one_heap

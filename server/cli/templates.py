@@ -48,7 +48,7 @@ def template_add(
     from pipeline.results.template_picture import template_picture
     from pipeline.templates.load import make_template
     from pipeline.templates.template_file import save_template
-    from rig.formats.images import write_image
+    from rig.formats.pictures.images import write_image
 
     marked = landmarks or landmark_file(file)
     points = read_landmarks(marked) if marked else None

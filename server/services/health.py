@@ -9,7 +9,7 @@ import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import Settings, document_from_settings
-from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
+from rig.formats.cameras.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.messages.message import compose, verbatim
 from server.metrics import QueueFigures
 from server.services.service import Check, Service

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.errors import InputError
-from rig.formats.dataset_json import DatasetFormat
-from rig.formats.fault_groups import say_once
-from rig.formats.ply import read_head_ply
+from rig.formats.cameras.dataset_json import DatasetFormat
+from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
+from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 

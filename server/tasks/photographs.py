@@ -23,9 +23,11 @@ from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
 from rig.capture import Capture, ReadImage
 from rig.errors import InputError
-from rig.formats.cameras_file import find_rig_file, read_rig_file
-from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
-from rig.formats.capture_folder import (
+from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
+from rig.formats.cameras.cameras_json import CAMERAS_MOST, read_rig, write_rig
+from rig.formats.cameras.scale_json import read_scale
+from rig.formats.cameras.unread_programs import unread_programs
+from rig.formats.captures.capture_folder import (
     SCALE,
     capture_root,
     has_known_length,
@@ -34,13 +36,11 @@ from rig.formats.capture_folder import (
     read_shot,
     unread_pictures,
 )
-from rig.formats.fault_groups import say_once
+from rig.formats.captures.shot_files import find_files, picture_folder
 from rig.formats.full_size import full_size_reader
-from rig.formats.images import is_picture, picture_size, write_image
-from rig.formats.scale_json import read_scale
-from rig.formats.shot_files import find_files, picture_folder
-from rig.formats.unread_programs import unread_programs
-from rig.formats.work_size import WORK_PIXELS, work_rig
+from rig.formats.pictures.images import is_picture, picture_size, write_image
+from rig.formats.pictures.work_size import WORK_PIXELS, work_rig
+from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose, documents_of, read_message
 from rig.plausibility import rig_faults
 from rig.progress import Progress

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rig.formats.archive import extract_archive
+from rig.formats.captures.archive import extract_archive
 from rig.progress import Progress
 from server.processes import end_with_parent, share_one_heap
 from server.tasks.child import WorkerContext

@@ -9,7 +9,7 @@ from typing import Any
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.progress import Progress
 from server.tasks.child import WorkerContext
 from tests.support.pinned_work import picture_bytes, pinned_report

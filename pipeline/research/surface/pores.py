@@ -37,7 +37,7 @@ from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.texturing import Texturing, texture_head
 from pipeline.texturing.layout.uv_unwrap import Layout
 from pipeline.texturing.pores.skin_maps import heights_of
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform
 from rig.image import ImageRgb
 from rig.mesh import Mesh

@@ -13,10 +13,10 @@ import pytest
 from typer.testing import CliRunner
 
 from rig.capture import Capture
-from rig.formats.cameras_file import read_rig_file
-from rig.formats.capture_folder import read_capture, write_capture
-from rig.formats.images import write_image
-from rig.formats.ply import write_ply
+from rig.formats.cameras.cameras_file import read_rig_file
+from rig.formats.captures.capture_folder import read_capture, write_capture
+from rig.formats.meshes.ply import write_ply
+from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
