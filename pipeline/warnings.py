@@ -32,6 +32,7 @@ WARNING_CODES = (
     "no-bust",
     "no-chart",
     "no-face",
+    "no-pores",
     "no-texture",
     "no-texture-layout",
     "old-setting",

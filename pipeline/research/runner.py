@@ -32,6 +32,7 @@ from pipeline.research.speed.scaling import JobCommand, scaling
 from pipeline.research.surface.eyeballs import eyeballs
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
+from pipeline.research.surface.pores import pores
 from pipeline.research.surface.relief import relief
 from pipeline.research.surface.repeat import repeat
 from pipeline.research.surface.shapes import shapes
@@ -321,6 +322,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "views": _drawn(views),
     "repeat": _drawn(repeat),
     "relief": _relief,
+    "pores": _drawn(pores),
     "span": _span,
     "detail": _detail,
     "hidden": _hidden,

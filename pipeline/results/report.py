@@ -26,6 +26,7 @@ from pipeline.results.report_types import (
     PoseReport,
     Report,
     SimilarityReport,
+    SkinReport,
     TemplateReport,
     TextureReport,
     ViewReport,
@@ -37,6 +38,8 @@ from pipeline.stages.texturing import Texturing
 from pipeline.templates.header import TemplateHeader
 from pipeline.texturing.chart_colours import ChartColours
 from pipeline.texturing.light import HARMONICS, Light
+from pipeline.texturing.pores.relief import LONGEST_MM, SHORTEST_MM
+from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, SkinMaps
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges
 from rig.messages.message import documents_of, texts_of
@@ -194,6 +197,22 @@ def _texture(texturing: Texturing) -> TextureReport:
         "gains": _plain(vertices.gains),
         "chart": None if texturing.chart is None else _chart(texturing.chart),
         "light": None if texturing.albedo is None else _light(texturing.albedo.light),
+        "skin": None if texturing.skin is None else skin_document(texturing.skin),
+    }
+
+
+def skin_document(maps: SkinMaps) -> SkinReport:
+    """Describes the maps of the skin."""
+    return {
+        "size": len(maps.displacement),
+        "mm_per_code": MM_PER_CODE,
+        "mid_code": MID_CODE,
+        "direction": "along the interpolated normals of head.ply, outwards",
+        "normals": "glTF: x along the tangent, y up in the image, z along the normal",
+        "longest_mm": LONGEST_MM,
+        "shortest_mm": SHORTEST_MM,
+        "repeated": list(maps.repeated),
+        "views": list(maps.views),
     }
 
 

@@ -130,6 +130,22 @@ class BustReport(TypedDict):
     filled: int
 
 
+class SkinReport(TypedDict):
+    """Describes the maps in texture/. A code of the displacement map is ``mm_per_code`` along the normal of head.ply,
+    from ``mid_code`` on. ``repeated`` is the share of the shading's power that two disjoint sets of views both show, by
+    octave of wavelength from the longest."""
+
+    size: int
+    mm_per_code: float
+    mid_code: int
+    direction: str
+    normals: str
+    longest_mm: float
+    shortest_mm: float
+    repeated: list[float]
+    views: list[str]
+
+
 class TextureReport(TypedDict):
     """Describes the head's colours. ``filled`` counts the vertices that no photograph coloured; ``gains`` are factors
     of linear RGB, by camera."""
@@ -139,6 +155,7 @@ class TextureReport(TypedDict):
     gains: dict[str, object]
     chart: dict[str, object] | None
     light: dict[str, object] | None
+    skin: NotRequired[SkinReport | None]  # not in files of earlier versions
 
 
 class DetailReport(TypedDict):

@@ -187,7 +187,9 @@ def read_shot(
     bits, levels = _sample_bits(jobs, faults)
     with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
         decoded = list(
-            pool.map(lambda job: _decode(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]]), jobs)
+            pool.map(
+                lambda job: decode_picture(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]]), jobs
+            )
         )
     images: dict[str, np.ndarray] = {}
     masks: dict[str, tuple[str, np.ndarray]] = {}
@@ -308,9 +310,11 @@ def _in_read_pictures(features: Features, rig: Rig) -> Features:
     return {point: {name: moved(name, at) for name, at in views.items()} for point, views in features.items()}
 
 
-def _decode(
+def decode_picture(
     folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None, bits: int
 ) -> tuple[np.ndarray | None, str, Message | None]:
+    """Decodes a file of a camera, reduced and undistorted. Returns its pixels, the sha256 of the file, and a fault
+    (then there are no pixels). ``kind`` is images, background or masks."""
     camera = rig[name]
     wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
     where, whole = path.relative_to(folder).as_posix(), kind == "masks"

@@ -112,6 +112,7 @@ TEMPLATES = {
     "board-marker-beyond": "it shows marker {marker}, but {size} squares hold only {held}: correct rows",
     "both": "{first} and {second}",
     "picture-and-others": "{picture} and {others} other cameras",
+    "picture-gone": "{camera}: there is no picture any more",
     "no-picture-folder": "is no folder; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)",
     "camera-with-double-shot": "{camera} holds two pictures of one shot",
     "no-pictures": "holds no pictures; wanted IMAGES/<camera>/<shot>.png (or jpg, tif, webp)",

@@ -7,6 +7,7 @@ TEMPLATES = {
     "view-left-out": "{remark}",
     "mask-doubtful": "{camera}: {remark}",
     "no-texture-layout": "{reason}",
+    "no-pores": "there are no maps of the pores: they need a texture, and the pictures' files",
     "view-unused": "{remark}; the view is left out",
     "eyes-closed": "{eyes} closed: no white and no iris in the photographs, or lids that meet",
     "both-eyes-are": "both eyes are",

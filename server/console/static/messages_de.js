@@ -412,6 +412,8 @@ export default {
   "too-few-features-remarks": "die Merkmale bestimmen keine Lage: {why}. Nötig sind mindestens {needed} Landmarken des Modells, die nicht auf einer Linie liegen, jede in 2 Ansichten; brauchbar sind: {usable}; {remarks}. Mehr Punkte setzen, oder features.json entfernen und die Silhouetten entscheiden lassen",
   "no-chart": "kein Leerbild zeigt einen lesbaren ColorChecker Classic; die Farben sind deshalb die der Kameras: ein Bild mit der Tafel, näher, schärfer oder aus der Spiegelung einer Lampe gedreht, nach background/<Kamera>/ legen",
   "no-albedo": "{reason}",
+  "picture-gone": "{camera}: Es gibt kein Bild mehr",
+  "no-pores": "es gibt keine Karten der Poren: Sie brauchen eine Textur und die Dateien der Fotos",
   "pieces-apart": "Stücke von {share:.1%} der Fläche der Person stehen abseits und werden weggelassen: Hat sich seit dem Leerbild etwas bewegt, oder passt die Kleidung zum Hintergrund?",
   "outline-weak": "{share:.0%} der Kontur heben sich kaum vom Hintergrund ab: Hintergrund oder Kleidung wechseln",
   "no-subject-stands-out": "niemand hebt sich vom Leerbild ab; die Ansicht wird weggelassen",

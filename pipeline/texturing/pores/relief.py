@@ -1,0 +1,259 @@
+"""Estimates the skin's relief and its fine colours from two disjoint sets of full-size pictures.
+
+A furrow turns the skin towards the light or away from it: with a relief h, the logarithm of the diffuse light changes
+by ``-g . grad h``, where g is the tangential gradient of the light by the normal, over the light (Pentland, *Linear
+shape from shading*, IJCV 1990). In each patch of skin, a few millimetres wide, this is a multiplication of waves and is
+inverted there. Waves along whose direction the light does not change stay unknown, and are drawn to zero.
+
+Pictures have noise and highlights, and geometry and cameras are off by a pixel. Per patch and octave of wavelength only
+that share of the power is kept that repeats between two sets of views without a common view, after the shift between
+the two is taken out. What repeats and is colour rather than relief cannot be told apart by that; it counts as
+``COLOUR`` of a slope's shading.
+
+The texture gains in the same way what repeats of the difference between full size and work size.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import scipy.fft
+from jaxtyping import Complex, Float, Float16, Float32, Int
+
+from pipeline.compute.threads import in_threads
+from pipeline.texturing.paint_kernels import Choice, Pictures
+from pipeline.texturing.pores.strips import EMPTY, Strips
+from pipeline.texturing.pores.texel_frames import TexelFrames
+from rig.colour_space import linear_from_srgb
+
+SHORTEST_MM, LONGEST_MM = 0.3, 3.5  # of the waves that are kept; 0.1 mm a pixel resolve 0.3 mm
+PATCH_MM = 8.0  # two of the longest waves
+COLOUR = 0.1  # contrast of skin's own colour by that of a slope of 1 in light of full contrast
+OCTAVES = 4
+LUMINANCE = np.array([0.0722, 0.7152, 0.2126], np.float32)  # blue first
+MIN_LIGHT = 0.004  # linear; darker pixels are noise
+MAX_CONTRAST = 0.2  # rms of the shading in a patch beyond which it is lashes, brows or lips
+MAX_SHIFT_MM = 0.4  # between the two sets, for errors of the geometry and of the cameras
+MIN_SKIN = 0.05
+STRIP_ROWS = 128
+LINEAR = np.maximum(linear_from_srgb(np.arange(256) / 255.0), 0.0).astype(np.float32)
+
+Spectra = Complex[np.ndarray, "n p q"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinDetail:
+    """Holds what full-size pictures show of the skin, over a layout.
+
+    Attributes:
+        heights_mm: the relief, along the normals.
+        brightness: logarithm of the light that the pictures of work size do not show.
+        repeated: share of the shading's power that both sets of views show, by octave from the longest wave.
+    """
+
+    heights_mm: Float32[np.ndarray, "s s"]
+    brightness: Float16[np.ndarray, "s s"]
+    repeated: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HalfPictures:
+    """Holds two disjoint sets of views as the painter takes them, at full size and at work size."""
+
+    full: Pictures
+    work: Pictures
+    choices: tuple[Choice, Choice]
+
+
+def estimate_detail(strips: Strips, halves: HalfPictures, frames: TexelFrames) -> SkinDetail:
+    """Estimates relief and brightness over a layout, one row of patches after the other."""
+    size, side = strips.size, patch_side(strips.size, frames)
+    hop, figures = side // 2, np.zeros((OCTAVES, 2))
+    light = _painted(strips, halves)
+    heights, brightness = np.zeros((size, size), np.float32), np.zeros((size, size), np.float16)
+    rows = range(-hop, size, hop)
+    for parity in (0, 1):  # rows of patches overlap by half: every second one does not
+        chosen = rows[parity::2]
+        found = np.zeros((len(chosen), OCTAVES, 2))
+
+        def work(first: int, last: int, chosen: range = chosen, found: np.ndarray = found) -> None:
+            for k in range(first, last):
+                low, high = max(chosen[k], 0), min(chosen[k] + side, size)
+                missing = ((low - chosen[k], chosen[k] + side - high), (hop, hop))
+                cut = [[np.pad(image[low:high].astype(np.float32), missing) for image in pair] for pair in light]
+                parts = _row_of_patches(cut[0], cut[1], chosen[k], size, frames, found[k])
+                if parts is not None:
+                    inside = slice(low - chosen[k], high - chosen[k])
+                    heights[low:high] += parts[0][inside]
+                    brightness[low:high] += parts[1][inside].astype(np.float16)
+
+        in_threads(len(chosen), work)
+        figures += found.sum(axis=0)
+    return SkinDetail(heights, brightness, tuple((figures[:, 0] / np.maximum(figures[:, 1], 1e-12)).tolist()))
+
+
+def patch_side(size: int, frames: TexelFrames) -> int:
+    """Returns the texels of a patch's side, a power of two, for skin where the layout is of ordinary scale."""
+    return int(np.clip(2 ** round(np.log2(PATCH_MM * size / frames.image_mm())), 16, 256))
+
+
+def _painted(strips: Strips, halves: HalfPictures) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The logarithm of the light in both sets of full-size pictures, and by how much it differs from that in the
+    pictures of work size (float16: of the size of noise in the pictures' codes)."""
+    size = strips.size
+    full, added = (list(np.zeros((2, size, size), np.float16)) for _ in range(2))
+
+    def work(first: int, last: int) -> None:
+        for strip in range(first, last):
+            row = strip * STRIP_ROWS
+            rows = slice(row, min(row + STRIP_ROWS, size))
+            for half, choice in enumerate(halves.choices):
+                fine = log_light(strips.paint(row, rows.stop - row, halves.full, choice))
+                full[half][rows] = fine
+                added[half][rows] = fine - log_light(strips.paint(row, rows.stop - row, halves.work, choice))
+
+    in_threads(-(-size // STRIP_ROWS), work)
+    return full, added
+
+
+def log_light(codes: np.ndarray) -> Float32[np.ndarray, "r s"]:
+    """Returns the logarithm of the light in a painted strip, by that of middle grey."""
+    return np.log(np.maximum(LINEAR[codes] @ LUMINANCE, MIN_LIGHT) / LINEAR[EMPTY])
+
+
+def without_slow(light: Float32[np.ndarray, "r s"], side: int) -> Float32[np.ndarray, "r s"]:
+    """Returns a strip without what is wider than a third of a patch, whose edges would leak into all waves."""
+    return light - cv2.GaussianBlur(light, (0, 0), side / 6.0, borderType=cv2.BORDER_REFLECT)
+
+
+def _row_of_patches(
+    full: list[np.ndarray],
+    added: list[np.ndarray],
+    row: int,
+    size: int,
+    frames: TexelFrames,
+    figures: Float[np.ndarray, "o 2"],
+) -> tuple[Float32[np.ndarray, "r s"], Float32[np.ndarray, "r s"]] | None:
+    """Heights and brightness of one row of patches, windowed so that rows add up; None without skin. Powers are added
+    to ``figures``."""
+    side = len(full[0])
+    hop = side // 2
+    columns = np.arange(-hop, size, hop)
+    x = np.clip((columns + hop) / size, 0.0, 1.0)[None]
+    y = np.full(x.shape, np.clip((row + hop) / size, 0.0, 1.0))
+    skin = frames.at(frames.skin, x, y)[0]
+    which = np.flatnonzero(skin >= MIN_SKIN)
+    if not len(which):
+        return None
+    metric, slope = (frames.at(image, x, y)[0][which] for image in (frames.metric, frames.slope))
+    patches = Patches.of(side, metric / size**2, slope * size)
+    window = np.sin(np.pi * (np.arange(side, dtype=np.float32) + 0.5) / side)
+    window = window[:, None] * window[None, :]
+    cuts = [slice(columns[k] + hop, columns[k] + hop + side) for k in which]
+
+    def windowed(strip: np.ndarray) -> Float32[np.ndarray, "n q q"]:
+        band = without_slow(strip, side)
+        return np.stack([band[:, cut] for cut in cuts]) * window
+
+    shades = [windowed(strip) for strip in full]
+    first, second = (scipy.fft.rfft2(shade) for shade in shades)
+    turn = patches.shift_between(first, second)
+    relief, powers = patches.relief(first * turn, second * np.conj(turn))
+    figures += powers
+    contrast2 = np.mean((shades[0] + shades[1]) ** 2, axis=(1, 2))  # the window leaves a quarter of the power
+    share = np.minimum(skin[which], 1.0)
+    muted = share / (1.0 + (contrast2 / MAX_CONTRAST**2) ** 2)
+    pair = [scipy.fft.rfft2(windowed(strip)) for strip in added]
+    finer = patches.common(pair[0] * turn, pair[1] * np.conj(turn))
+    out = np.zeros((2, side, size + side), np.float32)
+    for image, waves, weight in zip(out, (relief, finer), (muted, share), strict=True):
+        drawn = scipy.fft.irfft2(waves, (side, side)) * window * weight[:, None, None].astype(np.float32)
+        for cut, patch in zip(cuts, drawn, strict=True):
+            image[:, cut] += patch
+    return out[0, :, hop : hop + size], out[1, :, hop : hop + size]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    """Holds the waves of patches of one side: cycles a mm, how much shading a wave of 1 mm makes, and the octave of
+    each wave (-1: not kept)."""
+
+    side: int
+    per_mm: Float32[np.ndarray, "n p q"]
+    shading: Spectra
+    octave: Int[np.ndarray, "n p q"]
+
+    @classmethod
+    def of(cls, side: int, metric: Float[np.ndarray, "n 3"], slope: Float[np.ndarray, "n 2"]) -> "Patches":
+        """Describes patches.
+
+        Args:
+            side: texels.
+            metric: uu, uv, vv of a step by one texel, mm2.
+            slope: the light's factors of dh/du and dh/dv for steps of one texel.
+        """
+        fu, fv = waves_by_texel(side)
+        uu, uv, vv = (metric[:, i, None, None].astype(np.float32) for i in range(3))
+        area2 = np.maximum(uu * vv - uv**2, 1e-12)
+        per_mm = np.sqrt(np.maximum(vv * fu**2 - 2 * uv * fu * fv + uu * fv**2, 0.0) / area2)
+        along, down = (slope[:, i, None, None].astype(np.float32) for i in range(2))
+        shading = np.complex64(-2j * np.pi) * (along * fu + down * fv)
+        octave = np.floor(np.log2(np.maximum(per_mm, 1e-9) * LONGEST_MM)).astype(np.int8)
+        octave[(octave < 0) | (per_mm > 1 / SHORTEST_MM) | (octave >= OCTAVES)] = -1
+        return cls(side, per_mm, shading, octave)
+
+    def shift_between(self, first: Spectra, second: Spectra) -> Spectra:
+        """Returns the turn of each wave that moves the first half-way to the second; its conjugate moves the second
+        half-way back. Shifts by more than ``MAX_SHIFT_MM`` are not looked for."""
+        cross = np.where(self.octave >= 0, np.conj(first) * second, np.complex64(0.0))
+        peaks = np.fft.fftshift(scipy.fft.irfft2(cross, (self.side, self.side)), axes=(1, 2))
+        fu, fv = waves_by_texel(self.side)
+        middle, shifts = self.side // 2, np.zeros((len(first), 2), np.float32)
+        for k, peak in enumerate(peaks):
+            texels = self.side * max(float(self.per_mm[k, 0, 1]), float(self.per_mm[k, 1, 0]))  # a mm
+            reach = int(np.clip(np.ceil(MAX_SHIFT_MM * texels) + 1, 2, self.side // 4))
+            box = peak[middle - reach : middle + reach + 1, middle - reach : middle + reach + 1]
+            row, column = divmod(int(box.argmax()), box.shape[1])
+            if 0 < row < 2 * reach and 0 < column < 2 * reach:
+                shifts[k, 0] = column - reach + _vertex(box[row, column - 1 : column + 2])
+                shifts[k, 1] = row - reach + _vertex(box[row - 1 : row + 2, column])
+        return np.exp(np.complex64(-1j * np.pi) * (fu * shifts[:, :1, None] + fv * shifts[:, 1:, None]))
+
+    def repeating(self, first: Spectra, second: Spectra) -> tuple[Float32[np.ndarray, "n p q"], np.ndarray]:
+        """Returns Wiener's weight of each wave in the mean of two sets of views, and the power that repeats and all
+        power, by octave."""
+        common = (first * np.conj(second)).real
+        either = first.real**2 + first.imag**2 + second.real**2 + second.imag**2
+        weight, powers = np.zeros(self.per_mm.shape, np.float32), np.zeros((OCTAVES, 2))
+        for octave in range(OCTAVES):
+            inside = self.octave == octave
+            repeats = np.maximum(np.sum(common, axis=(1, 2), where=inside), 0.0)
+            power = 0.5 * np.sum(either, axis=(1, 2), where=inside)
+            powers[octave] = repeats.sum(), power.sum()
+            share = np.minimum(2 * repeats / np.maximum(power + repeats, 1e-12), 1.0)  # of the mean's power
+            weight += np.where(inside, share[:, None, None], 0.0)
+        return weight, powers
+
+    def common(self, first: Spectra, second: Spectra) -> Spectra:
+        """Returns the waves that two sets of views share."""
+        return 0.5 * self.repeating(first, second)[0] * (first + second)
+
+    def relief(self, first: Spectra, second: Spectra) -> tuple[Spectra, Float[np.ndarray, "o 2"]]:
+        """Returns the waves of the relief from those of the shading in two sets of views, and ``repeating``'s
+        powers."""
+        weight, powers = self.repeating(first, second)
+        noise2 = np.maximum((2 * np.pi * COLOUR * self.per_mm) ** 2, 1e-12)
+        gain = weight * np.conj(self.shading) / (np.abs(self.shading) ** 2 + noise2)
+        return 0.5 * gain * (first + second), powers
+
+
+def waves_by_texel(side: int) -> tuple[Float32[np.ndarray, "p q"], Float32[np.ndarray, "p q"]]:
+    """Returns cycles by texel across and down of the waves of ``scipy.fft.rfft2``."""
+    down, across = np.meshgrid(np.fft.fftfreq(side), np.fft.rfftfreq(side), indexing="ij")
+    return across.astype(np.float32), down.astype(np.float32)
+
+
+def _vertex(three: Float32[np.ndarray, " 3"]) -> float:
+    """Where a parabola through three neighbouring values has its peak, from the middle one."""
+    bend = float(three[0] - 2 * three[1] + three[2])
+    return 0.0 if bend >= 0 else float(np.clip(0.5 * (three[0] - three[2]) / bend, -0.5, 0.5))
