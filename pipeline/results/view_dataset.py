@@ -27,7 +27,7 @@ from rig.formats.cameras.dataset_json import (
     picture_names,
     points_ply,
 )
-from rig.formats.flame_param import FlameParam, canonical, encoded
+from rig.formats.meshes.flame_param import FlameParam, canonical, encoded
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.rig import Rig

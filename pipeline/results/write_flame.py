@@ -12,7 +12,7 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.templates.flame_fit import FlameFit, fit_flame
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
-from rig.formats.flame_param import FILE, encoded, flame_param
+from rig.formats.meshes.flame_param import FILE, encoded, flame_param
 
 DEEP = 0.1  # how much a vertex off the skin counts
 

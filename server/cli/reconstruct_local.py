@@ -74,7 +74,7 @@ def _reconstruct_folder(
 
 def flame_lines(document: "ReportDocument", out: Path) -> list[str]:
     """Returns what is printed of a FLAME model's fit: its file, and what the model leaves of the head."""
-    from rig.formats.flame_param import FILE
+    from rig.formats.meshes.flame_param import FILE
 
     figures = (document["template"] or {}).get("flame")
     if figures is None:

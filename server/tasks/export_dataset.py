@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from rig.errors import InputError
 from rig.formats.cameras.dataset_json import DatasetFormat
-from rig.formats.flame_param import FILE, FlameParam, read_flame_param
+from rig.formats.meshes.flame_param import FILE, FlameParam, read_flame_param
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
 from rig.messages.fault_groups import say_once

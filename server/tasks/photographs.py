@@ -36,8 +36,8 @@ from rig.formats.captures.capture_folder import (
     read_shot,
     unread_pictures,
 )
+from rig.formats.captures.full_size import full_size_reader
 from rig.formats.captures.shot_files import find_files, picture_folder
-from rig.formats.full_size import full_size_reader
 from rig.formats.pictures.images import is_picture, picture_size, write_image
 from rig.formats.pictures.work_size import WORK_PIXELS, work_rig
 from rig.messages.fault_groups import say_once

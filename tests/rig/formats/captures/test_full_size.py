@@ -9,7 +9,7 @@ from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.captures.capture_folder import read_capture, write_capture
-from rig.formats.full_size import full_size_reader
+from rig.formats.captures.full_size import full_size_reader
 from rig.geometry import look_at
 from rig.rig import Rig
 
