@@ -36,13 +36,13 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
         else template_textures(result.texturing.atlas, template.mesh, surface_binding)
     )
     suffix, _, options = ENCODINGS["png" if result.settings.outputs.image == "png" else "jpeg"]
-    files = {tile: f"{name}{_tile_suffix(tile)}{suffix}" for tile in textures}
+    files = {tile: f"{name}{tile_suffix(tile)}{suffix}" for tile in textures}
     for tile, image in textures.items():
         _, data = cv2.imencode(suffix, np.ascontiguousarray(image[:, :, ::-1]), list(options))
         write_atomically(folder / files[tile], data.tobytes())
     mesh, library = template.mesh, None
     if textures:
-        mesh, materials = _materials(template, files)
+        mesh, materials = template_materials(template, files)
         library = f"{name}.mtl"
         write_atomically(folder / library, materials)
     comments = [
@@ -60,7 +60,7 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
     write_atomically(folder / f"{name}.obj", data)
 
 
-def _tile_suffix(tile: Tile) -> str:
+def tile_suffix(tile: Tile) -> str:
     """Returns the UDIM number of a tile as a suffix of file names; empty for the first tile."""
     return "" if tile == (0, 0) else f"-{1001 + tile[0] + 10 * tile[1]}"
 
@@ -74,7 +74,7 @@ def template_colours(result: Reconstruction, template: Template) -> UInt8[np.nda
     return out
 
 
-def _materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh, bytes]:
+def template_materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh, bytes]:
     """Returns the mesh with a material for each part that has one in its file, or else one for all of it, and the
     material library. Materials of the skin show the image of the tile that most of their skin lies in."""
     mesh = template.mesh

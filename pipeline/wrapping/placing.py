@@ -1,0 +1,99 @@
+"""Places a scan where the model's mean head lies: by its face, found on renders, or by landmarks that somebody marked."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.faces.landmark_map import landmark_map
+from pipeline.faces.networks import load_networks
+from pipeline.faces.points import RIGHT_EYE_OUTLINE, point_table
+from pipeline.geometry.procrustes import procrustes
+from pipeline.head_model.model import HeadModel
+from pipeline.templates.likeness import SurfaceMarks
+from pipeline.templates.placement import Surface, outward, place_by_landmarks
+from pipeline.wrapping.scan import RawScan
+from pipeline.wrapping.sighting import ScanSighting, nearest_axis, sight_scan, unit_of
+from rig.geometry import Similarity
+from rig.mesh import vertex_normals
+from rig.render.renderer import Renderer
+
+MARK_MM = 2.0  # deviation of a found point, an axis: the network's own is 1 to 2 mm
+LID_MM = 0.7  # the same of the eyes' network, whose lids follow the visible edge
+LIDS = np.r_[RIGHT_EYE_OUTLINE, point_table().mirror_images[list(RIGHT_EYE_OUTLINE)]]  # in the order of ``lids_mm``
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedScan:
+    """Holds a scan with its unit and axes, and how the mean head lies on it."""
+
+    scan: RawScan  # turned over where its triangles looked inwards
+    turned_over: bool
+    unit: str | None  # None where no unit makes it a head, and a mean adult's size was assumed
+    mm_per_unit: float
+    head_from_scan: Similarity  # into the frame and scale of the model's mean head
+    marks: SurfaceMarks  # in that frame
+    views: int  # renders that show the face; 0 where landmarks placed it
+
+    @property
+    def up(self) -> str:
+        """Returns the axis of the scan nearest to the head's up, as "+y"."""
+        return nearest_axis(self.head_from_scan.rotation[1])
+
+    @property
+    def front(self) -> str:
+        """Returns the axis of the scan nearest to where the face looks."""
+        return nearest_axis(self.head_from_scan.rotation[2])
+
+    def surface(self) -> Surface:
+        """Returns the scan's surface in the mean head's frame and scale."""
+        mesh = self.scan.mesh
+        vertices = self.head_from_scan.apply(mesh.vertices)
+        return Surface(vertices, mesh.faces, vertex_normals(vertices, mesh.faces))
+
+
+def place_scan(
+    scan: RawScan, model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None
+) -> PlacedScan:
+    """Places a scan by the face that is found on it, or by landmarks in the scan's own frame. Raises InputError if no
+    face is found, or too few landmarks are named."""
+    if not landmarks:
+        with Renderer.create() as renderer:
+            return place_on_face(model, sight_scan(scan, load_networks(), renderer))
+    head_from_scan = place_by_landmarks(model, landmarks, scan.name)
+    unit, factor = unit_of(1.0 / head_from_scan.scale)
+    inward = not np.array_equal(outward(scan.mesh.vertices, scan.mesh.faces).faces, scan.mesh.faces)
+    known = {name: head_from_scan.apply(point) for name, point in landmarks.items()}
+    return PlacedScan(
+        scan=scan.turned_over() if inward else scan,
+        turned_over=inward,
+        unit=unit,
+        mm_per_unit=factor,
+        head_from_scan=head_from_scan,
+        marks=SurfaceMarks.of_landmarks(model, known),
+        views=0,
+    )
+
+
+def place_on_face(model: HeadModel, sighting: ScanSighting) -> PlacedScan:
+    """Places a scan by its face, whatever that face's size: its points become marks, the lids' edges among them."""
+    places = landmark_map(model)
+    which, mean = np.flatnonzero(~places.slides), model.vertices(np.zeros(0))
+    found = sighting.face.points_world[which]
+    weights = 1.0 / (places.deviation_mm[which] ** 2).sum(axis=1)
+    head_from_mm = procrustes(found, places.expected(mean)[which], weights)
+    points, deviation = places.points(mean), np.full(len(places.rows), MARK_MM)
+    points[which] = head_from_mm.apply(found) - places.offset_mm[which]
+    if sighting.lids_mm is not None:
+        points[LIDS], deviation[LIDS] = head_from_mm.apply(sighting.lids_mm), LID_MM
+    mm_from_scan = Similarity(sighting.mm_per_unit, np.eye(3), np.zeros(3))
+    return PlacedScan(
+        scan=sighting.scan,
+        turned_over=sighting.turned_over,
+        unit=sighting.unit,
+        mm_per_unit=sighting.mm_per_unit,
+        head_from_scan=head_from_mm @ mm_from_scan,
+        marks=SurfaceMarks(places.rows[which], places.weights[which], points[which], deviation[which]),
+        views=len(sighting.face.detections),
+    )
