@@ -37,6 +37,7 @@ from pipeline.research.surface.surfaces import surfaces
 from pipeline.research.surface.templates import templates
 from pipeline.research.surface.texture import texture
 from pipeline.research.surface.visible import visible
+from pipeline.research.surface.wrapping import wrapping
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.pictures.images import write_image
@@ -67,7 +68,7 @@ class Options:
         captures: whether the captures of the shared folder are used besides the studio's heads.
         openmvs: folder of the programs of OpenMVS.
         folders: captures, of people and relief; of scaling, those to run a job on.
-        only: which rows of people and growth to run.
+        only: which rows of people, growth and wrap to run.
         detail: level of detail of people.
         job: command that scaling runs.
     """
@@ -288,6 +289,12 @@ def _shapes(task: Task) -> Outcome:
     return shapes(task.head, _facekit(task.shared), report=task.report, folder=task.folder)
 
 
+def _wrap(task: Task) -> Outcome:
+    only = task.options.only
+    scans = {name: path for name, path in _truths(task.shared).items() if not only or name in only}
+    return wrapping(_facekit(task.shared), scans, report=task.report, folder=task.folder)
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
@@ -323,6 +330,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "light": _drawn(light),
     "templates": _templates,
     "shapes": _shapes,
+    "wrap": _wrap,
     "scaling": _scaling,
     "growth": _growth,
 }

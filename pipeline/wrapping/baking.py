@@ -1,4 +1,4 @@
-"""Bakes a scan's colours into a template's texture: every texel is read where its place on the template meets the scan."""
+"""Bakes a scan's colours into a template's texture: a texel is read where its place on the template meets the scan."""
 
 import numpy as np
 from jaxtyping import Int, UInt8

@@ -1,4 +1,4 @@
-"""Places a scan where the model's mean head lies: by its face, found on renders, or by landmarks that somebody marked."""
+"""Places a scan where the model's mean head lies: by its face, found on renders, or by marked landmarks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
