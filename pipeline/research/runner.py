@@ -28,6 +28,7 @@ from pipeline.research.people.expressions import expressions
 from pipeline.research.people.people import people
 from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
+from pipeline.research.surface.hair_shells import hair_shells
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
 from pipeline.research.surface.relief import relief
@@ -43,6 +44,8 @@ from rig.errors import EigenheadError, InputError
 from rig.formats.pictures.images import write_image
 from rig.progress import Progress
 from rig.render.renderer import Renderer
+
+SHORT_HAIR = ("draw-b", "beard-smile")  # of the shared captures
 
 
 class UnknownExperiment(EigenheadError):
@@ -68,7 +71,7 @@ class Options:
         captures: whether the captures of the shared folder are used besides the studio's heads.
         openmvs: folder of the programs of OpenMVS.
         folders: captures, of people and relief; of scaling, those to run a job on.
-        only: which rows of people, growth and wrap to run.
+        only: which rows of people, growth, wrap and hair-shell to run.
         detail: level of detail of people.
         job: command that scaling runs.
     """
@@ -295,6 +298,15 @@ def _wrap(task: Task) -> Outcome:
     return wrapping(_facekit(task.shared), scans, report=task.report, folder=task.folder)
 
 
+def _hair_shell(task: Task) -> Outcome:
+    chosen = task.options.only or SHORT_HAIR
+    found = {name: path.with_suffix("") for name, path in _truths(task.shared).items() if name in chosen}
+    with Renderer.create() as renderer:
+        return hair_shells(
+            task.head, _facekit(task.shared), found, renderer=renderer, report=task.report, folder=task.folder
+        )
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
@@ -331,6 +343,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "templates": _templates,
     "shapes": _shapes,
     "wrap": _wrap,
+    "hair-shell": _hair_shell,
     "scaling": _scaling,
     "growth": _growth,
 }

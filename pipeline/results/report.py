@@ -22,6 +22,7 @@ from pipeline.results.report_types import (
     CameraReport,
     ExpressionReport,
     FaceReport,
+    HairReport,
     MorphsReport,
     PoseReport,
     Report,
@@ -31,7 +32,7 @@ from pipeline.results.report_types import (
     ViewReport,
 )
 from pipeline.settings import document_from_settings
-from pipeline.stages.bust import Bust
+from pipeline.stages.bust import Bust, HairyHead
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.texturing import Texturing
 from pipeline.templates.header import TemplateHeader
@@ -82,6 +83,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "quality": {"median": _finite(np.median(refined.deviation_mm)), "max": _finite(refined.deviation_mm.max())},
         "texture": _texture(result.texturing),
         "bust": None if result.bust is None else _bust(result.bust),
+        **({} if result.hair is None else {"hair": _hair(result.hair)}),
         "evaluations": head.fit.evaluations,
         "stopped_because": head.fit.termination_reason,
         "seconds": {"total": sum(result.seconds.values())} | dict(result.seconds),
@@ -210,6 +212,10 @@ def _light(light: Light) -> dict[str, object]:
         "residual": light.residual,
     }
     return _plain(document)
+
+
+def _hair(hair: HairyHead) -> HairReport:
+    return {"covered_share": hair.shell.covered, "highest_mm": float(hair.shell.height_mm.max())}
 
 
 def _bust(bust: Bust) -> BustReport:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 from pipeline.results.head_files import ENCODINGS
 from pipeline.results.metadata import ply_comments
@@ -67,8 +67,15 @@ def tile_suffix(tile: Tile) -> str:
 
 def template_colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
     """Returns the colours of the template's vertices: the head's on the skin, grey elsewhere."""
+    return carried_colours(result.texturing.vertices.colours, result.mesh_world.faces, template)
+
+
+def carried_colours(
+    colours: UInt8[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], template: Template
+) -> UInt8[np.ndarray, "t 3"]:
+    """Returns the colours of the template's vertices from those of the model's: grey where it has no skin."""
     attached = template.surface_binding.attachment
-    corners = result.texturing.vertices.colours[result.mesh_world.faces[attached.triangles]].astype(float)
+    corners = colours[faces[attached.triangles]].astype(float)
     out = np.full((len(template.surface_binding.rest), 3), NO_SKIN, np.uint8)
     out[template.surface_binding.skin] = np.clip(np.rint(np.einsum("nk,nkc->nc", attached.weights, corners)), 0, 255)
     return out

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
@@ -92,15 +91,15 @@ def _reversed(mesh: Mesh) -> Mesh:
 
 def _texels(image: ImageRgb, uv: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, "n 3"]:
     """Reads a texture at coordinates (v upwards) that repeat beyond the unit square, bilinearly."""
-    height, width = image.shape[:2]
+    size = np.array(image.shape[1::-1])
     shares = np.where((uv >= 0.0) & (uv <= 1.0), uv, uv % 1.0)
-    where = np.stack([shares[:, 0] * width - 0.5, (1.0 - shares[:, 1]) * height - 0.5], axis=1).astype(np.float32)
-    out = np.empty((len(where), 3), np.uint8)
-    for first in range(0, len(where), 30_000):  # OpenCV's pictures have at most 32767 rows
-        part = where[first : first + 30_000]
-        read = cv2.remap(image, part[:, None, :], np.empty(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        out[first : first + 30_000] = np.asarray(read).reshape(-1, 3)
-    return out
+    at = np.clip(np.stack([shares[:, 0], 1.0 - shares[:, 1]], axis=1) * size - 0.5, 0.0, size - 1.0)
+    first = np.minimum(at.astype(int), np.maximum(size - 2, 0))
+    (left, top), (right, bottom) = first.T, np.minimum(first + 1, size - 1).T
+    across, down = (at - first).T[:, :, None]
+    upper = (1.0 - across) * image[top, left] + across * image[top, right]
+    lower = (1.0 - across) * image[bottom, left] + across * image[bottom, right]
+    return np.rint((1.0 - down) * upper + down * lower).astype(np.uint8)
 
 
 def _quartered(

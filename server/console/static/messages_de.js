@@ -358,6 +358,7 @@ export default {
   "setting-refused": "{setting} {value} wurde nicht übernommen",
   "front-of-other-capture": "die Frontkamera {front} gehört nicht zur Aufnahme ({cameras})",
   "no-bust": "{reason}",
+  "hair-beyond-head": "die Punkte des Kopfes erreichen {share:.0%} des Haars auf 2 mm; der Rest hängt oder steht darüber hinaus: bust.ply zeigt es ganz",
   "features": "{remark}",
   "view": "{remark}",
   "view-left-out": "{remark}",
