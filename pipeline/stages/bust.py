@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import KDTree
 
-from pipeline.detail.hair_shell import COVERED_LEAST, HairShell, hair_shell
+from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import part_of
@@ -113,5 +113,5 @@ def push_out_hair(context: ReconstructionContext, refined: RefinedHead, bust: Bu
     shell = hair_shell(head, mesh, bust.surface.part)
     near = KDTree(mesh.vertices).query(shell.vertices_world)[1]
     made = HairyHead(shell, vertex_normals(shell.vertices_world, head.faces), bust.colours[near], bust.views[near])
-    beyond = shell.covered < COVERED_LEAST
+    beyond = shell.covered < MIN_COVERED
     return Staged(made, [compose("hair-beyond-head", share=shell.covered)] if beyond else [])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.detail.hair_shell import COVERED_LEAST, covered_share, hair_shell
+from pipeline.detail.hair_shell import MIN_COVERED, covered_share, hair_shell
 from pipeline.part_labels.codes import Part
 from rig.mesh import Mesh
 
@@ -53,7 +53,7 @@ def test_hair_that_hangs_beside_the_head_is_not_reached(capped: tuple[Mesh, Mesh
     hanging = np.asarray(curtain.vertices) + (110.0, -120.0, 0.0)
     both = Mesh(np.concatenate([bust.vertices, hanging]), np.concatenate([bust.faces, curtain.faces + len(part)]))
     made = hair_shell(head, both, np.concatenate([part, np.full(len(hanging), Part.HAIR, np.uint8)]))
-    assert made.covered < COVERED_LEAST
+    assert made.covered < MIN_COVERED
     assert np.linalg.norm(made.vertices_world, axis=1).max() < 1.1 * HAIR_MM
 
 
