@@ -56,7 +56,7 @@ class SurfaceMarks:
     rows: Int[np.ndarray, "p 3"]
     weights: Float[np.ndarray, "p 3"]
     points: Float[np.ndarray, "p 3"]
-    deviation_mm: Float[np.ndarray, " p"]  # to which each is known, an axis
+    deviation_mm: Float[np.ndarray, "p 3"]  # to which each is known along x, y, z
 
     @classmethod
     def of_landmarks(cls, model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> "SurfaceMarks":
@@ -67,7 +67,7 @@ class SurfaceMarks:
             rows,
             np.full(rows.shape, 1.0 / 3.0),
             np.array([*known.values(), np.zeros(3)])[:-1],
-            np.full(len(rows), MARK_MM),
+            np.full(rows.shape, MARK_MM),
         )
 
     def on(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "p 3"]:
@@ -105,7 +105,7 @@ def fit_model_to_mesh(
             head = place.apply(wide.vertices(z))
             normals = vertex_normals(head, full.faces)[rows]
             met, planes, _, weight = target.meet(head[rows], normals, stage)
-            known = np.repeat(marks.deviation_mm**-2, 3)
+            known = marks.deviation_mm.ravel() ** -2
             information = np.concatenate([weight * areas / 100.0 / stage.plane_mm**2, known])
             points = np.concatenate([head[rows], np.repeat(marks.on(head), 3, axis=0)])
             met = np.concatenate([met, np.repeat(marks.points, 3, axis=0)])

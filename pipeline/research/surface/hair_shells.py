@@ -3,6 +3,7 @@
 ``covered`` is the share of bust.ply's hair within 2 mm of the shell, ``bare`` of the head without it, ``carried`` of
 ICT-FaceKit's mesh as a template that the shell carries. ``truth`` and ``bust_truth`` are the shares of the true visible
 hair within 2 mm of the shell and of bust.ply: no shell can have more of it than the bust.
+``sunk_mm`` is how deep its deepest vertex lies inside the skin.
 """
 
 from collections.abc import Mapping
@@ -57,7 +58,7 @@ def hair_shells(
         report(name, number / len(captures))
         rows.append({"capture": name} | records.row(name, lambda n=name, p=path: one(n, p)))
     figures = {f"{row['capture']}_{name}": value for row in rows for name, value in row.items() if name != "capture"}
-    names = ("covered", "bare", "carried", "truth", "bust_truth", "highest_mm", "inside")
+    names = ("covered", "bare", "carried", "truth", "bust_truth", "highest_mm", "sunk_mm")
     table = markdown.table(("capture", *names), [[row["capture"], *(row[name] for name in names)] for row in rows])
     return {"figures": figures, "rows": rows, "markdown": table, "pictures": pictures}
 
@@ -81,7 +82,7 @@ def hair_row(path: Path, model: HeadModel, facekit: HeadModel, renderer: Rendere
         "truth": score_visible(known.visible, shell).recall["hair"]["within_2mm"],
         "bust_truth": score_visible(known.visible, bust).recall["hair"]["within_2mm"],
         "highest_mm": float(found.hair.shell.height_mm.max()),
-        "inside": int((np.einsum("nx,nx->n", shell.vertices - hits.points, hits.normals) < -1e-6).sum()),
+        "sunk_mm": float(np.maximum(-np.einsum("nx,nx->n", shell.vertices - hits.points, hits.normals), 0.0).max()),
     }
     in_head = found.head.fit.world_from_head.inverse()
     return row, _picture({"bust.ply": bust, "head_hair.ply": shell, "carried": carried, "head.ply": head}, in_head)

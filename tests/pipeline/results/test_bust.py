@@ -141,7 +141,7 @@ def test_a_head_is_written_pushed_out_to_the_hair(
     head = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32))
     refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", verbatim("planted")))
     settings = replace(SETTINGS, outputs=OutputSettings(surface="hair"))
-    context = ReconstructionContext(capture, scene([BALL], pinhole_fan()).rig, load_model(), settings, renderer)
+    context = ReconstructionContext(capture, pinhole_fan(), load_model(), settings, renderer)
     staged = push_out_hair(context, refined, bust)
     assert staged.product is not None
     assert list(staged.warnings) == []
