@@ -26,7 +26,7 @@ TRACE_STEPS, TRACED_MM = 40, 0.2  # of the search along a direction, and how nea
 INSIDE_MM = 0.3  # a vertex deeper than that below the bust is covered
 WEIGHTS = {Part.SKIN: 1.0, Part.HAIR: 1.0, Part.CLOTHES: 0.2, Part.UNSEEN: 0.02}  # of what the bust shows there
 STIFFNESS = 2.0  # of the field's bending, beside 1 of a vertex that meets hair
-PULLS = (3.0, 2.0, 2.0)  # stiffness of the steps that then draw the shell to the nearest hair: 0.1 folds more triangles
+PULLS = (3.0, 2.0, 2.0)  # stiffness of the steps that then draw the shell to the nearest hair
 MIN_WEIGHT = 1e-3  # of a vertex that nothing is known of: it stays, rather than swing out
 PULL_MM = 6.0  # hair nearer than that draws a vertex
 NEAR_MM = 2.0  # hair no farther from the shell is covered
@@ -142,9 +142,9 @@ def _bending(topology: Topology) -> sparse.csr_array:
 def _solved(
     bending: sparse.csr_array, stiffness: float, weights: Float[np.ndarray, " v"], wanted: Float[np.ndarray, "v k"]
 ) -> Float[np.ndarray, "v k"]:
-    """Returns the smooth field nearest to the wanted values by their weights. Conjugate gradients take a twentieth of
-    a factorisation's time, since the stiffness is low."""
+    """Returns the smooth field nearest to the wanted values by their weights, by conjugate gradients: a
+    factorisation of the default model's 53,000 vertices takes six seconds."""
     system = sparse.csr_array(sparse.diags_array(weights + MIN_WEIGHT) + stiffness * bending)
-    inverse = sparse.diags_array(1.0 / system.diagonal())
+    inverse = sparse.diags_array(1.0 / np.asarray(system.diagonal()))
     right = weights[:, None] * wanted
     return np.stack([cg(system, column, rtol=1e-5, maxiter=500, M=inverse)[0] for column in right.T], axis=1)

@@ -35,7 +35,8 @@ def test_a_template_lies_on_the_scan_it_was_drawn_to(model: HeadModel, template:
     mean, faces = model.vertices(np.zeros(0)), model.levels["full"].faces
     scan = surface_of(mean, faces)
     crown, cheek = mean[mean[:, 1].argmax()], mean[np.linalg.norm(mean - (45.0, -20.0, 60.0), axis=1).argmin()]
-    bump = sum(np.exp(-0.5 * ((mean - at) ** 2).sum(axis=1) / 20.0**2) for at in (crown, cheek))
+    squares = [((mean - at) ** 2).sum(axis=1) for at in (crown, cheek)]
+    bump = np.exp(-0.5 * np.array(squares) / 20.0**2).sum(axis=0)
     scan = surface_of(mean + 3.0 * bump[:, None] * scan.normals, faces)
     carried = template.surface_binding.on(mean, faces)
     drawn, met = drawn_onto(carried, template, model, scan)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
 
 from pipeline.wrapping.scan import RawScan, raw_scan, read_raw_scan
 from rig.errors import InputError
@@ -26,7 +27,7 @@ def textured_ball(path: Path) -> None:
     uv = np.stack([np.where(made.vertices[:, 0] < 0, 0.2, 0.8), 0.5 + 0.4 * made.vertices[:, 1]], axis=1)
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, :32], image[:, 32:] = RED, GREEN
-    visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.fromarray(image))
+    visual = TextureVisuals(uv=uv, image=Image.fromarray(image))
     trimesh.Trimesh(made.vertices, made.faces, visual=visual, process=False).export(path)
 
 
