@@ -20,8 +20,8 @@ from pipeline.templates.template_file import Template
 from rig.mesh import vertex_normals
 from rig.progress import Progress
 
-# Of each step of the drawing, and how far off (mm) a place of the scan still draws: from the fit's own error, 2 mm beside
-# the ears, to less than vertices lie apart.
+# Of each step of the drawing, and how far off (mm) a place of the scan still draws: from the fit's own error to less
+# than vertices lie apart.
 STIFFNESS = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.03, 0.01, 0.01)
 REACH_MM = (6.0, 5.0, 4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0)
 # The prior stays stronger than for a template: the template's own vertices follow the scan to the end.
@@ -32,6 +32,7 @@ STAGES = (
     Stage(6, None, 5.0, 0.0, 0.5),
 )
 CARRYING = 0.02  # stiffness of the template's own shape while the model's head carries it
+FOLLOWING = 0.1  # weight there of what follows the skin outside of the face, shoulders, beside 1 of skin
 FACE_MM = 20.0  # of the model's face: what is no skin of the template there lies inside
 
 
@@ -79,7 +80,8 @@ def drawn_onto(
     start, goal, skin = welded.vertices[rows], carried[first][rows], is_skin[rows]
     outside = skin | ~_near_face(start, model)
 
-    start = relaxed(start, faces, lambda shape: (goal, skin.astype(float)), (CARRYING,))
+    known = np.where(skin, 1.0, np.where(outside, FOLLOWING, 0.0))
+    start = relaxed(start, faces, lambda shape: (goal, known), (CARRYING,))
     weight = np.zeros(len(rows))
     reaches = iter(REACH_MM)
 
