@@ -11,9 +11,9 @@ from pipeline.results.write_template import carried_colours
 from pipeline.stages.bust import HairyHead
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
-from rig.formats.glb import write_glb
-from rig.formats.ply import write_ply
-from rig.formats.polygon_obj import polygon_obj_bytes
+from rig.formats.meshes.glb import write_glb
+from rig.formats.meshes.ply import write_ply
+from rig.formats.meshes.polygon_obj import polygon_obj_bytes
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh, vertex_normals
 

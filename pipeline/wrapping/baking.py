@@ -6,7 +6,7 @@ from jaxtyping import Int, UInt8
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.texturing.template_texture import MAX_TILES, Tile, corner_tiles, filled
 from pipeline.wrapping.wrap import Wrapped
-from rig.formats.polygon_obj import fan
+from rig.formats.meshes.polygon_obj import fan
 from rig.mesh import vertex_normals
 
 SIDES = (1024, 2048)  # of the texture: of a scan with colours of vertices, and of one with a texture

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from rig.errors import InputError
-from rig.formats.mesh_file import TexturedMesh, read_textured_mesh
+from rig.formats.meshes.mesh_file import TexturedMesh, read_textured_mesh
 from rig.image import ImageRgb
 from rig.mesh import Mesh
 from rig.messages.message import compose

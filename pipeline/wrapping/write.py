@@ -14,9 +14,9 @@ from pipeline.results.write_template import template_materials, tile_suffix
 from pipeline.wrapping.baking import baked_textures, vertex_colours
 from pipeline.wrapping.wrap import Wrapped, residual_colours, surface_in_head
 from rig.atomic_write import write_atomically
-from rig.formats.images import write_image
-from rig.formats.ply import ply_bytes
-from rig.formats.polygon_obj import polygon_obj_bytes
+from rig.formats.meshes.ply import ply_bytes
+from rig.formats.meshes.polygon_obj import polygon_obj_bytes
+from rig.formats.pictures.images import write_image
 from rig.image import ImageRgb
 from rig.mesh import Mesh, vertex_normals
 

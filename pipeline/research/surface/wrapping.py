@@ -23,7 +23,7 @@ from pipeline.wrapping import fitting, placing, scan, sighting
 from pipeline.wrapping.scan import read_raw_scan
 from pipeline.wrapping.wrap import wrap
 from pipeline.wrapping.write import wrap_picture
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.progress import Progress, discard_progress
 
 

@@ -26,7 +26,7 @@ from pipeline.warnings import Detail
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.errors import InputError
-from rig.formats.ply import read_head_ply
+from rig.formats.meshes.ply import read_head_ply
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import verbatim

@@ -14,7 +14,7 @@ from pipeline.wrapping.placing import PlacedScan, place_scan
 from pipeline.wrapping.scan import raw_scan
 from pipeline.wrapping.sighting import nearest_axis, unit_of
 from rig.errors import InputError
-from rig.formats.mesh_file import TexturedMesh
+from rig.formats.meshes.mesh_file import TexturedMesh
 from rig.geometry import rotation_from_vector
 from rig.mesh import Mesh
 from tests.support.ready_templates import EYE_CENTRE, ready_template

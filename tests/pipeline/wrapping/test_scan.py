@@ -10,7 +10,7 @@ from trimesh.visual import TextureVisuals
 
 from pipeline.wrapping.scan import RawScan, raw_scan, read_raw_scan
 from rig.errors import InputError
-from rig.formats.mesh_file import TexturedMesh
+from rig.formats.meshes.mesh_file import TexturedMesh
 from rig.mesh import Mesh
 
 RED, GREEN = (200, 0, 0), (0, 220, 0)

@@ -12,8 +12,8 @@ from pipeline.head_model.model import load_model
 from pipeline.wrapping.scan import read_raw_scan
 from pipeline.wrapping.wrap import residual_colours, wrap
 from pipeline.wrapping.write import write_wrapped
-from rig.formats.mesh_file import read_mesh
-from rig.formats.polygon_obj import read_polygons
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.meshes.polygon_obj import read_polygons
 from rig.geometry import rotation_from_vector
 from rig.progress import discard_progress
 from tests.support.ready_templates import ready_template
