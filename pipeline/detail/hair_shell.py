@@ -145,6 +145,6 @@ def _solved(
     """Returns the smooth field nearest to the wanted values by their weights, by conjugate gradients: a
     factorisation of the default model's 53,000 vertices takes six seconds."""
     system = sparse.csr_array(sparse.diags_array(weights + MIN_WEIGHT) + stiffness * bending)
-    inverse = sparse.diags_array(1.0 / np.asarray(system.diagonal()))
+    inverse = sparse.diags_array(1.0 / np.asarray(system.diagonal(), dtype=np.float64))
     right = weights[:, None] * wanted
     return np.stack([cg(system, column, rtol=1e-5, maxiter=500, M=inverse)[0] for column in right.T], axis=1)

@@ -49,7 +49,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
     """Returns the report as JSON types. Every number is finite; unknown ones are None. ``template`` is the template in
     whose vertex order the head was also written."""
     head, evidence, refined = result.head, result.evidence, result.refined
-    return {
+    document: Report = {
         "format": FORMAT,
         "version": version("eigenhead"),
         "model": {"name": result.model_name, "sha256": result.model_sha256},
@@ -83,7 +83,6 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "quality": {"median": _finite(np.median(refined.deviation_mm)), "max": _finite(refined.deviation_mm.max())},
         "texture": _texture(result.texturing),
         "bust": None if result.bust is None else _bust(result.bust),
-        **({} if result.hair is None else {"hair": _hair(result.hair)}),
         "evaluations": head.fit.evaluations,
         "stopped_because": head.fit.termination_reason,
         "seconds": {"total": sum(result.seconds.values())} | dict(result.seconds),
@@ -92,6 +91,9 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "inputs": dict(result.digests),
         "warnings": documents_of(result.warnings),
     }
+    if result.hair is not None:
+        document["hair"] = _hair(result.hair)
+    return document
 
 
 def _camera(
