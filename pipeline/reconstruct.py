@@ -3,7 +3,7 @@
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.stages.alignment import Alignment, align_head
-from pipeline.stages.bust import colour_bust, fuse_depth, shape_bust
+from pipeline.stages.bust import colour_bust, fuse_depth, push_out_hair, shape_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import measure_depth
 from pipeline.stages.evidence import judge_head
@@ -50,6 +50,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         pose = run(check_pose, context, faces, alignment, head, refined)
         evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
     bust = run(colour_bust, context, views, surface.product, texturing.capture)
+    hair = run(push_out_hair, context, refined, bust)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(
@@ -66,6 +67,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         refined,
         texturing,
         bust,
+        hair,
         pose,
         evidence,
         warnings=run.warnings,

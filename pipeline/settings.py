@@ -219,7 +219,7 @@ TEMPLATE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")  # it becomes part
 class OutputSettings:
     """Sets which surfaces are made, and which files beside those that every result has."""
 
-    surface: Literal["head", "bust", "both"] = "both"  # the model's head, all that the cameras see, or both
+    surface: Literal["head", "bust", "both", "hair"] = "both"  # head, bust, or both; hair: head_hair.ply, too
     formats: tuple[str, ...] = ("glb", "ply")  # of the head, of FORMATS; head.ply is always written
     image: Literal["jpeg", "webp", "png"] = "jpeg"  # of head.glb's texture
     texture_size: int | None = None  # texels; None: a texel is about a pixel at the face

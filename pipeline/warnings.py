@@ -18,6 +18,7 @@ WARNING_CODES = (
     "face-unseen",
     "features",
     "file-unread",
+    "hair-beyond-head",
     "lens-doubtful",
     "mask-contradicted",
     "mask-doubtful",

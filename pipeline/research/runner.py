@@ -30,6 +30,7 @@ from pipeline.research.speed.farm import scale
 from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
 from pipeline.research.surface.eyeballs import eyeballs
+from pipeline.research.surface.hair_shells import hair_shells
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
 from pipeline.research.surface.pores import pores
@@ -40,11 +41,14 @@ from pipeline.research.surface.surfaces import surfaces
 from pipeline.research.surface.templates import templates
 from pipeline.research.surface.texture import texture
 from pipeline.research.surface.visible import visible
+from pipeline.research.surface.wrapping import wrapping
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
 from rig.formats.pictures.images import write_image
 from rig.progress import Progress
 from rig.render.renderer import Renderer
+
+SHORT_HAIR = ("draw-b", "beard-smile")  # of the shared captures
 
 
 class UnknownExperiment(EigenheadError):
@@ -70,7 +74,7 @@ class Options:
         captures: whether the captures of the shared folder are used besides the studio's heads.
         openmvs: folder of the programs of OpenMVS.
         folders: captures, of people and relief; of scaling, those to run a job on.
-        only: which rows of people and growth to run.
+        only: which rows of people, growth, wrap and hair-shell to run.
         detail: level of detail of people.
         job: command that scaling runs.
     """
@@ -299,6 +303,21 @@ def _eyeballs(task: Task) -> Outcome:
     return eyeballs(_facekit(task.shared), report=task.report, folder=task.folder)
 
 
+def _wrap(task: Task) -> Outcome:
+    only = task.options.only
+    scans = {name: path for name, path in _truths(task.shared).items() if not only or name in only}
+    return wrapping(_facekit(task.shared), scans, report=task.report, folder=task.folder)
+
+
+def _hair_shell(task: Task) -> Outcome:
+    chosen = task.options.only or SHORT_HAIR
+    found = {name: path.with_suffix("") for name, path in _truths(task.shared).items() if name in chosen}
+    with Renderer.create() as renderer:
+        return hair_shells(
+            task.head, _facekit(task.shared), found, renderer=renderer, report=task.report, folder=task.folder
+        )
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
@@ -336,6 +355,8 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "templates": _templates,
     "shapes": _shapes,
     "eyeballs": _eyeballs,
+    "wrap": _wrap,
+    "hair-shell": _hair_shell,
     "scaling": _scaling,
     "growth": _growth,
     "scale": _scale,

@@ -22,6 +22,7 @@ from pipeline.results.report_types import (
     CameraReport,
     ExpressionReport,
     FaceReport,
+    HairReport,
     MorphsReport,
     PoseReport,
     Report,
@@ -32,7 +33,7 @@ from pipeline.results.report_types import (
     ViewReport,
 )
 from pipeline.settings import document_from_settings
-from pipeline.stages.bust import Bust
+from pipeline.stages.bust import Bust, HairyHead
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.texturing import Texturing
 from pipeline.templates.header import TemplateHeader
@@ -53,7 +54,7 @@ def report_document(
     """Returns the report as JSON types. Every number is finite; unknown ones are None. ``template`` is the template in
     whose vertex order the head was also written, ``flame`` the figures of its FLAME model's fit."""
     head, evidence, refined = result.head, result.evidence, result.refined
-    return {
+    document: Report = {
         "format": FORMAT,
         "version": version("eigenhead"),
         "model": {"name": result.model_name, "sha256": result.model_sha256},
@@ -95,6 +96,9 @@ def report_document(
         "inputs": dict(result.digests),
         "warnings": documents_of(result.warnings),
     }
+    if result.hair is not None:
+        document["hair"] = _hair(result.hair)
+    return document
 
 
 def _camera(
@@ -234,6 +238,10 @@ def _light(light: Light) -> dict[str, object]:
         "residual": light.residual,
     }
     return _plain(document)
+
+
+def _hair(hair: HairyHead) -> HairReport:
+    return {"covered_share": hair.shell.covered, "highest_mm": float(hair.shell.height_mm.max())}
 
 
 def _bust(bust: Bust) -> BustReport:

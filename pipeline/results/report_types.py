@@ -117,6 +117,14 @@ class SimilarityReport(TypedDict):
     translation: list[float]
 
 
+class HairReport(TypedDict):
+    """Describes head_hair.ply: the share of the bust's hair that it comes within 2 mm of, and its largest height above
+    the skin (mm)."""
+
+    covered_share: float
+    highest_mm: float
+
+
 class BustReport(TypedDict):
     """Describes the bust, the whole visible surface. ``closed`` says whether every edge has two faces."""
 
@@ -189,6 +197,7 @@ class Report(TypedDict):
     quality: dict[str, float | None]
     texture: TextureReport
     bust: BustReport | None
+    hair: NotRequired[HairReport]  # where head_hair.ply was asked for
     evaluations: int
     stopped_because: str
     seconds: dict[str, float]

@@ -2,6 +2,7 @@
 
     head.ply  head.glb  report.json  overlays/<camera>.png     fixed by docs/capture-format.md
     bust.ply  bust.glb  the whole visible surface; settings.outputs.surface says which of the two is written, or both
+    head_hair.ply  head_hair.glb    on request: the head's vertices pushed out to the hair; of a template, too
     contact_sheet.png   input, silhouette difference before and after the fit (section 5.4), the head from new views
     turntable.png       the head from the right to the left profile
     head.obj head.mtl head.png, head.usdz, head.stl, head.3mf     on request (settings.outputs.formats)
@@ -30,6 +31,7 @@ from pipeline.results.report import report_document
 from pipeline.results.slicer_landmarks import landmarks_document
 from pipeline.results.write_expression import write_expression
 from pipeline.results.write_flame import write_flame
+from pipeline.results.write_hair import write_hair
 from pipeline.results.write_template import template_colours, write_template
 from pipeline.results.write_template_shapes import write_template_shapes
 from pipeline.stages.bust import Bust
@@ -67,6 +69,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
             *([] if template is None else [pool.submit(write_template, folder, result, template)]),
             *_shape_jobs(pool, folder, result, template),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
+            *([] if result.hair is None else [pool.submit(write_hair, folder, result, result.hair, template)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
         ]
         for job in jobs:

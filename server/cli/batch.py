@@ -74,7 +74,7 @@ def batch(
     detail: Annotated[
         str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
     ] = None,
-    surface: Annotated[str | None, chosen("head, bust or both (the default).", of_output("surface"))] = None,
+    surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
     formats: Annotated[
         str | None,
         typer.Option(

@@ -27,8 +27,8 @@ def experiments(
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
             "exchanges, false-alarms, posterior, views, repeat, relief, pores, span, detail, hidden, expressions, "
-            "visible, people, planted, surfaces, texture, light, templates, shapes, eyeballs, scaling, growth, scale "
-            "or real."
+            "visible, people, planted, surfaces, texture, light, templates, shapes, eyeballs, wrap, hair-shell, "
+            "scaling, growth, scale or real."
         ),
     ],
     *,
@@ -50,7 +50,7 @@ def experiments(
         list[str] | None,
         typer.Option(
             help="people: rows of this rig (front-3, circle-24), evidence (plates, masks, neither) or subject alone; "
-            "or eyes. growth: views or pixels alone. May be repeated."
+            "or eyes. growth: views or pixels alone. wrap, hair-shell: this capture alone. May be repeated."
         ),
     ] = None,
     detail: Annotated[str | None, chosen("people: span, kernel, photo or fine (the default).", _detail_levels)] = None,
@@ -84,8 +84,8 @@ def experiments(
 def _check_options(name: str, folders: list[Path] | None, only: list[str] | None, detail: str | None) -> None:
     if folders and name not in ("people", "relief", "scaling"):
         raise typer.BadParameter("only real, people, relief and scaling take folders", param_hint="FOLDERS")
-    if only and name not in ("people", "growth"):
-        raise typer.BadParameter("only people and growth take it", param_hint="--only")
+    if only and name not in ("people", "growth", "wrap", "hair-shell"):
+        raise typer.BadParameter("only people, growth, wrap and hair-shell take it", param_hint="--only")
     if detail and name != "people":
         raise typer.BadParameter("only people takes it", param_hint="--detail")
 

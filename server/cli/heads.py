@@ -119,7 +119,7 @@ def reconstruct(
     detail: Annotated[
         str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
     ] = None,
-    surface: Annotated[str | None, chosen("head, bust or both (the default).", of_output("surface"))] = None,
+    surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
     formats: Formats = None,
     delight: Annotated[
         bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")

@@ -35,7 +35,7 @@ ROOMS = {  # page below docs/commands: its title, and its commands in the order 
     "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
     "rig": ("The rig", ("rig",)),
     "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),
-    "models": ("Models and templates", ("model", "template")),
+    "models": ("Models and templates", ("model", "template", "wrap")),
 }
 OF_EVERY_COMMAND = {
     "CACHE": (

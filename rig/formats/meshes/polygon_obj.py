@@ -182,6 +182,7 @@ def polygon_obj_bytes(
     colours: UInt8[np.ndarray, "v 3"] | None = None,
     comments: Iterable[str] = (),
     library: str | None = None,
+    decimals: int = 4,
 ) -> bytes:
     """Encodes an OBJ with other vertex positions; order, polygons, texture coordinates, groups and materials are kept.
 
@@ -192,16 +193,18 @@ def polygon_obj_bytes(
         colours: sRGB, written after the position as MeshLab and Blender read it.
         comments: lines at the top.
         library: name of an .mtl file beside it.
+        decimals: of the positions.
     """
     text = io.StringIO()
     text.writelines(f"# {line}\n" for line in comments)
+    position = " ".join([f"%.{decimals}f"] * 3)
     if library:
         text.write(f"mtllib {library}\n")
     if colours is None:
-        np.savetxt(text, vertices, fmt="v %.4f %.4f %.4f")
+        np.savetxt(text, vertices, fmt=f"v {position}")
     else:
         rows = np.concatenate([vertices, colours / 255.0], axis=1)
-        np.savetxt(text, rows, fmt="v %.4f %.4f %.4f %.4f %.4f %.4f")
+        np.savetxt(text, rows, fmt=f"v {position} %.4f %.4f %.4f")
     np.savetxt(text, mesh.uv, fmt="vt %.6f %.6f")
     np.savetxt(text, normals, fmt="vn %.4f %.4f %.4f")
     _write_faces(text, mesh)

@@ -2,6 +2,7 @@
 
 TEMPLATES = {
     "no-bust": "{reason}",
+    "hair-beyond-head": "the head's vertices reach {share:.0%} of the hair to 2 mm; the rest hangs or stands beyond them: bust.ply shows it whole",
     "features": "{remark}",
     "view": "{remark}",
     "view-left-out": "{remark}",

@@ -56,7 +56,7 @@ def test_wrong_usage_is_told_before_anything_is_loaded(tmp_path: Path) -> None:
     other = run(app, ["experiments", "views", str(folder)])
     assert other.exit_code == 2
     for option, value, takes in (
-        ("--only", "front-3", "only people and growth take it"),
+        ("--only", "front-3", "only people, growth, wrap and hair-shell take it"),
         ("--detail", "span", "only people takes it"),
     ):
         elsewhere = run(app, ["experiments", "views", option, value])

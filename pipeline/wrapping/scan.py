@@ -1,0 +1,115 @@
+"""The scan: a triangle mesh in its own unit and axes, whose vertices are joined along seams, and its colours."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from rig.errors import InputError
+from rig.formats.meshes.mesh_file import TexturedMesh, read_textured_mesh
+from rig.image import ImageRgb
+from rig.mesh import Mesh
+from rig.messages.message import compose
+
+MIN_TRIANGLES = 1000  # of a head; scan_checks asks the same of scans
+MAX_TRIANGLES = 4_000_000  # about 4 GB while closest points are searched
+DRAWN_TRIANGLES = 100_000  # with fewer, a texture read at the vertices would be too coarse for the face finder
+GREY = 190  # of a scan without colours
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawScan:
+    """Holds a scan in the unit and axes of its file. Triangles of ``mesh`` and ``painted`` correspond."""
+
+    name: str
+    mesh: Mesh  # vertices joined along seams, no colours
+    painted: TexturedMesh  # as the file has it
+
+    @property
+    def is_coloured(self) -> bool:
+        """Tells whether the file holds a texture or colours of vertices."""
+        return self.painted.image is not None or self.painted.mesh.colours is not None
+
+    def turned_over(self) -> "RawScan":
+        """Returns the scan with all triangles turned over."""
+        painted = replace(self.painted, mesh=_reversed(self.painted.mesh))
+        return RawScan(self.name, _reversed(self.mesh), painted)
+
+    def colours_at(
+        self, triangles: Int[np.ndarray, " n"], weights: Float[np.ndarray, "n 3"]
+    ) -> UInt8[np.ndarray, "n 3"]:
+        """Returns the sRGB colours of points on the surface, given by triangle and barycentric weights; grey where the
+        file holds none."""
+        rows = self.painted.mesh.faces[triangles]
+        if self.painted.image is not None and self.painted.uv is not None:
+            return _texels(self.painted.image, np.einsum("nk,nkx->nx", weights, self.painted.uv[rows]))
+        if self.painted.mesh.colours is None:
+            return np.full((len(triangles), 3), GREY, np.uint8)
+        mixed = np.einsum("nk,nkc->nc", weights, self.painted.mesh.colours[rows].astype(float))
+        return np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
+
+    def drawable(self) -> Mesh:
+        """Returns the scan with colours at its vertices, its triangles divided until a texture is not blurred by
+        that."""
+        mesh = self.painted.mesh
+        if self.painted.image is None or self.painted.uv is None:
+            return mesh
+        vertices, faces = np.concatenate([mesh.vertices, self.painted.uv], axis=1), mesh.faces
+        while len(faces) < DRAWN_TRIANGLES:
+            vertices, faces = _quartered(vertices, faces)
+        return Mesh(vertices[:, :3], faces, _texels(self.painted.image, vertices[:, 3:]))
+
+
+def read_raw_scan(path: Path) -> RawScan:
+    """Reads a scan with its colours. Raises InputError that says what is wrong with the file."""
+    painted = read_textured_mesh(path)
+    count = len(painted.mesh.faces)
+    if count < MIN_TRIANGLES:
+        raise InputError(path.name, [compose("scan-coarse", count=count, least=MIN_TRIANGLES)])
+    if count > MAX_TRIANGLES:
+        raise InputError(path.name, [compose("scan-huge", count=count, most=MAX_TRIANGLES)])
+    if not np.ptp(painted.mesh.vertices[painted.mesh.faces], axis=(0, 1)).min() > 0.0:
+        raise InputError(path.name, [compose("scan-flat")])
+    return raw_scan(painted, path.name)
+
+
+def raw_scan(painted: TexturedMesh, name: str) -> RawScan:
+    """Joins the vertices of a mesh that lie at the same position, and drops its degenerate triangles."""
+    mesh = painted.mesh
+    _, first, joined = np.unique(mesh.vertices + 0.0, axis=0, return_index=True, return_inverse=True)
+    corners = joined.ravel()[mesh.faces]
+    proper: Bool[np.ndarray, " f"] = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    used, faces = np.unique(corners[proper], return_inverse=True)
+    whole = Mesh(mesh.vertices[first[used]], faces.reshape(-1, 3).astype(np.int32))
+    return RawScan(name, whole, replace(painted, mesh=Mesh(mesh.vertices, mesh.faces[proper], mesh.colours)))
+
+
+def _reversed(mesh: Mesh) -> Mesh:
+    return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.colours)
+
+
+def _texels(image: ImageRgb, uv: Float[np.ndarray, "n 2"]) -> UInt8[np.ndarray, "n 3"]:
+    """Reads a texture at coordinates (v upwards) that repeat beyond the unit square, bilinearly."""
+    size = np.array(image.shape[1::-1])
+    shares = np.where((uv >= 0.0) & (uv <= 1.0), uv, uv % 1.0)
+    at = np.clip(np.stack([shares[:, 0], 1.0 - shares[:, 1]], axis=1) * size - 0.5, 0.0, size - 1.0)
+    first = np.minimum(at.astype(int), np.maximum(size - 2, 0))
+    (left, top), (right, bottom) = first.T, np.minimum(first + 1, size - 1).T
+    across, down = (at - first).T[:, :, None]
+    upper = (1.0 - across) * image[top, left] + across * image[top, right]
+    lower = (1.0 - across) * image[bottom, left] + across * image[bottom, right]
+    return np.rint((1.0 - down) * upper + down * lower).astype(np.uint8)
+
+
+def _quartered(
+    vertices: Float[np.ndarray, "v k"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "w k"], Int[np.ndarray, "g 3"]]:
+    """Splits every triangle into four at the middles of its edges."""
+    edges = np.sort(np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]]), axis=1)
+    ends, which = np.unique(edges, axis=0, return_inverse=True)
+    opposite = len(vertices) + which.reshape(3, -1).T
+    (a, b, c), (x, y, z) = faces.T, opposite.T
+    quarters = [(a, z, y), (b, x, z), (c, y, x), (x, y, z)]
+    parts = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters]).astype(np.int32)
+    return np.concatenate([vertices, vertices[ends].mean(axis=1)]), parts
