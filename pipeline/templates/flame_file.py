@@ -1,7 +1,7 @@
 """Reads a FLAME model from the file that its licence gives: .pkl as it is published, or an .npz of the same arrays.
 
-Nothing that a pickle names is run (``rig.formats.meshes.pickled_arrays``). ``shapedirs`` holds the modes of shape first;
-there are 300 of them in every published version, and the others are of expression.
+Nothing that a pickle names is run (``rig.formats.meshes.pickled_arrays``). ``shapedirs`` holds the modes of shape
+first; there are 300 of them in every published version, and the others are of expression.
 """
 
 from collections.abc import Iterable, Mapping

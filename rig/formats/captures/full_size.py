@@ -1,7 +1,7 @@
 """Reads the pictures of a capture once more, one at a time, at the size of their files.
 
-Everything else works on reduced pictures (``rig.formats.pictures.work_size``). Pores need all pixels, and all pictures at
-once would not fit into memory.
+Everything else works on reduced pictures (``rig.formats.pictures.work_size``). Pores need all pixels, and all pictures
+at once would not fit into memory.
 """
 
 from collections.abc import Sequence
