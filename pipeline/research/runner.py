@@ -30,6 +30,7 @@ from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
+from pipeline.research.surface.meshes import meshes
 from pipeline.research.surface.relief import relief
 from pipeline.research.surface.repeat import repeat
 from pipeline.research.surface.shapes import shapes
@@ -66,7 +67,7 @@ class Options:
         simplex: how many subjects of a table the simplex fits too.
         captures: whether the captures of the shared folder are used besides the studio's heads.
         openmvs: folder of the programs of OpenMVS.
-        folders: captures, of people and relief; of scaling, those to run a job on.
+        folders: captures, of people and relief; of scaling, those to run a job on; of meshes, results.
         only: which rows of people and growth to run.
         detail: level of detail of people.
         job: command that scaling runs.
@@ -288,6 +289,12 @@ def _shapes(task: Task) -> Outcome:
     return shapes(task.head, _facekit(task.shared), report=task.report, folder=task.folder)
 
 
+def _meshes(task: Task) -> Outcome:
+    models = {"default": task.head, "ict": _facekit(task.shared)}
+    count = {"subjects": task.subjects} if task.subjects else {}
+    return meshes(models, task.options.folders, report=task.report, folder=task.folder, **count)
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
@@ -323,6 +330,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "light": _drawn(light),
     "templates": _templates,
     "shapes": _shapes,
+    "meshes": _meshes,
     "scaling": _scaling,
     "growth": _growth,
 }
