@@ -21,7 +21,7 @@ from calibration.quality.verdict import CameraEvidence, Verdict, Word, judge
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import EigenheadError
-from rig.formats.cameras_json import CamerasDocument, document_from_rig
+from rig.formats.cameras.cameras_json import CamerasDocument, document_from_rig
 from rig.messages.message import Message, MessageDocument, compose, documents_of, message_of, texts_of
 from rig.rig import Rig
 

@@ -3,7 +3,7 @@
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.stages.alignment import Alignment, align_head
-from pipeline.stages.bust import colour_bust, fuse_depth, shape_bust
+from pipeline.stages.bust import colour_bust, fuse_depth, push_out_hair, shape_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import measure_depth
 from pipeline.stages.evidence import judge_head
@@ -15,7 +15,7 @@ from pipeline.stages.recorder import Recorder
 from pipeline.stages.refined_head import refine_head
 from pipeline.stages.texturing import texture_head
 from pipeline.stages.views import Views, check_lenses, find_views
-from rig.formats.usdz import check_usd
+from rig.formats.meshes.usdz import check_usd
 
 
 def fit_shape(
@@ -46,10 +46,11 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     with run.beside(fuse_depth, context, views, head.mesh_world, depth) as fused:
         refined = run(refine_head, context, views, faces, head, labels, depth)
     with run.beside(shape_bust, context, depth, refined, fused.product) as surface:
-        texturing = run(texture_head, context, views, head, refined)
+        texturing = run(texture_head, context, views, head, refined, labels)
         pose = run(check_pose, context, faces, alignment, head, refined)
         evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
     bust = run(colour_bust, context, views, surface.product, texturing.capture)
+    hair = run(push_out_hair, context, refined, bust)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(
@@ -66,6 +67,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         refined,
         texturing,
         bust,
+        hair,
         pose,
         evidence,
         warnings=run.warnings,

@@ -18,8 +18,8 @@ T = TypeVar("T")
 
 CLICK_NOISE_PX = 1.5  # a person's click; measured on captures rendered by another program
 LANDMARK_NOISE_MM = 2.0  # a landmark's place against the same landmark of another head
-PHOTO_LEVELS = (None, "photo", "fine")  # of detail: those that look inside the outline
-FINE_LEVELS = (None, "fine")  # and those that draw the head to the dense surface
+PHOTO_LEVELS = (None, "photo", "fine", "pores")  # of detail: those that look inside the outline
+FINE_LEVELS = (None, "fine", "pores")  # and those that draw the head to the dense surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +219,7 @@ TEMPLATE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")  # it becomes part
 class OutputSettings:
     """Sets which surfaces are made, and which files beside those that every result has."""
 
-    surface: Literal["head", "bust", "both"] = "both"  # the model's head, all that the cameras see, or both
+    surface: Literal["head", "bust", "both", "hair"] = "both"  # head, bust, or both; hair: head_hair.ply, too
     formats: tuple[str, ...] = ("glb", "ply")  # of the head, of FORMATS; head.ply is always written
     image: Literal["jpeg", "webp", "png"] = "jpeg"  # of head.glb's texture
     texture_size: int | None = None  # texels; None: a texel is about a pixel at the face
@@ -256,7 +256,8 @@ class Settings:
     """Holds all settings of one reconstruction."""
 
     method: Literal["contour", "simplex"] = "contour"
-    detail: Literal["span", "kernel", "photo", "fine"] | None = None  # None: fine where the photographs carry it
+    detail: Literal["span", "kernel", "photo", "fine", "pores"] | None = None  # None: fine where the photographs carry
+    # it; pores: so, too, and maps of the skin's relief
     front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
     unexplained_outlines: Literal["refuse", "warn"] = "refuse"  # of a head that explains hardly any of them

@@ -100,7 +100,10 @@ class Intrinsics:
     def scaled(self, factor: float) -> "Intrinsics":
         """Returns the intrinsics for an image scaled by ``factor``: ``u' = (u + 1/2) factor - 1/2``, since pixel
         centres shift."""
-        width, height = round(self.width * factor), round(self.height * factor)
+        return self.at_size(round(self.width * factor), round(self.height * factor))
+
+    def at_size(self, width: int, height: int) -> "Intrinsics":
+        """Returns the intrinsics for the same image with another number of pixels."""
         sx, sy = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, cx, cy, self.distortion)

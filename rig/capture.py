@@ -1,6 +1,6 @@
 """Defines a capture: one synchronised shot of every camera, in memory."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from types import MappingProxyType
@@ -14,6 +14,9 @@ from rig.messages.message import Message
 
 Content = TypeVar("Content")
 
+
+ReadImage = Callable[[str], ImageRgb]
+"""Reads once more, at the size of its file, the picture that is filed under a camera's name. Raises InputError."""
 
 Features = Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]]
 

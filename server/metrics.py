@@ -22,6 +22,16 @@ class QueueFigures:
     slots: int
 
 
+@dataclass(frozen=True, slots=True)
+class StoreFigures:
+    """Holds whether the store of results answered when it was last asked, and what this process asked of it: the number
+    of operations by name and outcome, and their seconds by name."""
+
+    answers: bool
+    operations: Mapping[tuple[str, str], int]
+    seconds: Mapping[str, float]
+
+
 class Metrics:
     """Holds the metrics of one app. Each has a registry of its own, so that two apps in one process do not mix."""
 
@@ -44,6 +54,13 @@ class Metrics:
         at_once = "Jobs that the live workers of a queue run at once"
         self.slots = Gauge("eigenhead_worker_slots", at_once, queue, registry=registry)
         self.failures = Gauge("eigenhead_failures", "Jobs that failed, by kind", ("kind",), registry=self.registry)
+        does, by_end = "What the service asked of the store of results", ("operation", "outcome")
+        self.store_operations = Gauge("eigenhead_store_operations", does, by_end, registry=registry)
+        took = "How long that took, in all"
+        self.store_seconds = Gauge("eigenhead_store_seconds", took, ("operation",), registry=registry)
+        self.store_up = Gauge(
+            "eigenhead_store_up", "Whether the store of results answers", ("store",), registry=registry
+        )
         self.captures = Gauge("eigenhead_captures", "Captures kept", registry=self.registry)
         self.free = Gauge("eigenhead_disk_free_bytes", "Free space of the data folder", registry=self.registry)
         self.memory = Gauge("eigenhead_peak_memory_bytes", "Peak memory of the service process", registry=self.registry)
@@ -69,9 +86,10 @@ class Metrics:
         damaged: int,
         queues: Mapping[str, QueueFigures],
         failures: Mapping[str, int],
+        store: StoreFigures | None,
     ) -> bytes:
         """Returns all metrics in Prometheus' text format. ``jobs``: number by state; ``free``: bytes; ``failures``:
-        number by kind."""
+        number by kind; ``store``: None without one."""
         for gauge in (self.queued, self.oldest, self.slots):
             gauge.clear()  # of queues that nobody uses any more
         for name, figures in queues.items():
@@ -82,6 +100,12 @@ class Metrics:
             self.failures.labels(kind).set(count)
         for state, count in jobs.items():
             self.jobs.labels(state).set(count)
+        if store is not None:
+            self.store_up.labels("results").set(store.answers)
+            for labels, count in store.operations.items():
+                self.store_operations.labels(*labels).set(count)
+            for operation, seconds in store.seconds.items():
+                self.store_seconds.labels(operation).set(seconds)
         self.captures.set(captures)
         self.free.set(free)
         self.memory.set(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)

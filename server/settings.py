@@ -59,6 +59,9 @@ class ServiceSettings(BaseSettings):
     results_bytes: int = Field(
         default=64 << 30, ge=0, description="the most that large files of results in that store take in the data folder"
     )
+    keep_unclaimed_days: float | None = Field(
+        default=30.0, gt=0, description="age at which results in that store go that no job claims; None keeps them"
+    )
     store_endpoint: str | None = Field(
         default=None,
         pattern=r"^https?://[^?#\s]+$",

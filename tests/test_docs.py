@@ -18,8 +18,8 @@ from pipeline.head_model.data_folder import models_folder
 from pipeline.templates.names import templates_folder
 from rig.camera import Camera, Intrinsics
 from rig.errors import InputError
-from rig.formats.cameras_json import document_from_rig, rig_from_document
-from rig.formats.features_json import document_from_features, features_from_document
+from rig.formats.cameras.cameras_json import document_from_rig, rig_from_document
+from rig.formats.captures.features_json import document_from_features, features_from_document
 from rig.geometry import RigidTransform
 from rig.messages.message import Message
 from rig.rig import Rig

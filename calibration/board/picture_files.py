@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rig.errors import InputError
-from rig.formats.cameras_json import name_fault
-from rig.formats.fault_groups import say_once
-from rig.formats.picture_names import PLAIN_SUFFIXES, WORD
+from rig.formats.cameras.cameras_json import name_fault
+from rig.formats.pictures.picture_names import PLAIN_SUFFIXES, WORD
+from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", *PLAIN_SUFFIXES)

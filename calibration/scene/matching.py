@@ -17,7 +17,7 @@ import numpy as np
 
 from calibration.scene.photographs import ONE_SHOT, Photographs
 from rig.errors import InputError
-from rig.formats.images import decode_image_file, write_image
+from rig.formats.pictures.images import decode_image_file, write_image
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 

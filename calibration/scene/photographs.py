@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from rig.errors import InputError
-from rig.formats.cameras_json import CAMERAS_LEAST, name_fault
-from rig.formats.capture_folder import capture_root, size_fault
-from rig.formats.capture_masks import mask_subjects
-from rig.formats.fault_groups import say_once
-from rig.formats.images import decode_image_file, is_picture
-from rig.formats.shot_files import BESIDE_PICTURES, find_files
+from rig.formats.cameras.cameras_json import CAMERAS_LEAST, name_fault
+from rig.formats.captures.capture_folder import capture_root, size_fault
+from rig.formats.captures.capture_masks import mask_subjects
+from rig.formats.captures.shot_files import BESIDE_PICTURES, find_files
+from rig.formats.pictures.images import decode_image_file, is_picture
+from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

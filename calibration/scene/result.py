@@ -9,7 +9,7 @@ import numpy as np
 from calibration.scene.covariance import Uncertainty
 from calibration.scene.scale import Scale
 from calibration.scene.structure import Structure
-from rig.formats.cameras_json import CamerasDocument, document_from_rig
+from rig.formats.cameras.cameras_json import CamerasDocument, document_from_rig
 from rig.messages.message import Message, MessageDocument, compose, documents_of, texts_of
 from rig.rig import Rig
 

@@ -17,8 +17,8 @@ from calibration.scene.scale import (
     scale_from_tags,
 )
 from rig.capture import Capture
-from rig.formats.scale_json import CameraDistance, KnownLength, PointDistance
-from rig.formats.work_size import work_features
+from rig.formats.cameras.scale_json import CameraDistance, KnownLength, PointDistance
+from rig.formats.pictures.work_size import work_features
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

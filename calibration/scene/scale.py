@@ -17,8 +17,8 @@ from calibration.scene.photographs import Photographs
 from calibration.scene.structure import Structure
 from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, triangulate
 from rig.errors import InputError
-from rig.formats.images import decode_image_file
-from rig.formats.scale_json import CameraDistance, KnownLength, PointDistance, TagSize, dictionaries
+from rig.formats.cameras.scale_json import CameraDistance, KnownLength, PointDistance, TagSize, dictionaries
+from rig.formats.pictures.images import decode_image_file
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

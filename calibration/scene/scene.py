@@ -26,9 +26,9 @@ from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
-from rig.formats.scale_json import read_scale
-from rig.formats.serials import with_serials
+from rig.formats.cameras.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
+from rig.formats.cameras.scale_json import read_scale
+from rig.formats.captures.serials import with_serials
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig

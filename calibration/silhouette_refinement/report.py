@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from calibration.report import STYLE, listed, table
 from calibration.silhouette_refinement.refine import Refinement, robust_rms
-from rig.formats.cameras_json import CamerasDocument, document_from_rig
+from rig.formats.cameras.cameras_json import CamerasDocument, document_from_rig
 from rig.geometry import vector_from_rotation
 from rig.messages.message import Message, MessageDocument, documents_of, texts_of
 from rig.rig import Rig

@@ -30,8 +30,8 @@ from pipeline.multiview.triangulation import TriangulatedPoint
 from pipeline.settings import AlignmentSettings
 from rig.capture import Features
 from rig.errors import EigenheadError
-from rig.formats.fault_groups import some_of
 from rig.geometry import RigidTransform, Similarity
+from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

@@ -40,7 +40,7 @@ from pipeline.research.surface.texture import texture
 from pipeline.research.surface.visible import visible
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError, InputError
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from rig.progress import Progress
 from rig.render.renderer import Renderer
 

@@ -6,6 +6,7 @@ vertices of head.glb are those of head.ply in the same order; the vertices on th
 a normal map it has only some of them (``rows_of_ply``).
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,14 +16,15 @@ from jaxtyping import UInt8
 from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.texturing.layout.normal_map import normal_mapped, png
+from pipeline.results.skin_files import write_skin_maps
+from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from rig.atomic_write import write_atomically
-from rig.formats.glb import Skin, glb_bytes
-from rig.formats.obj import mtl_bytes, obj_bytes, textured_obj_bytes
-from rig.formats.ply import write_ply
-from rig.formats.printing import stl_bytes, threemf_bytes
-from rig.formats.usdz import usdz_bytes
+from rig.formats.meshes.glb import Skin, glb_bytes
+from rig.formats.meshes.obj import mtl_bytes, obj_bytes, textured_obj_bytes
+from rig.formats.meshes.ply import write_ply
+from rig.formats.meshes.printing import stl_bytes, threemf_bytes
+from rig.formats.meshes.usdz import usdz_bytes
 from rig.mesh import Mesh
 
 JPEG_OPTIONS = (
@@ -61,6 +63,8 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         write_atomically(folder / "head.png", encoded(atlas, "png"))
     if result.texturing.albedo is not None:
         write_atomically(folder / "texture" / "albedo.png", encoded(result.texturing.albedo.atlas, "png"))
+    if atlas is not None and result.texturing.skin is not None:
+        write_skin_maps(folder / "texture", atlas, result.texturing.skin)
     normals = result.texturing.normals @ result.head.fit.world_from_head.rotation
     if "glb" in formats:
         write_atomically(folder / "head.glb", _glb(result, head, normals))
@@ -95,6 +99,9 @@ def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
     extras["repeated_vertices"] = source[len(head.vertices) :].tolist()
     opened = Mesh(head.vertices[source], atlas.layout.faces)
     skin = Skin(atlas.layout.uv, encoded(atlas, kind), ENCODINGS[kind][1])
+    if result.texturing.skin is not None:
+        tangents = vertex_tangents(opened.vertices, normals[source], atlas.layout.uv, atlas.layout.faces)
+        skin = replace(skin, normal_map=png(result.texturing.skin.normals), tangents=tangents)
     return glb_bytes(opened, normals=normals[source], skin=skin, extras=extras)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.settings import Settings
 from pipeline.stages.alignment import Alignment
-from pipeline.stages.bust import Bust
+from pipeline.stages.bust import Bust, HairyHead
 from pipeline.stages.evidence import Evidence
 from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
@@ -40,6 +40,7 @@ class Reconstruction:
     refined: RefinedHead
     texturing: Texturing
     bust: Bust | None
+    hair: HairyHead | None
     pose: PoseEvidence
     evidence: Evidence
     warnings: tuple[ReportWarning, ...]

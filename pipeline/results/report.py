@@ -22,21 +22,25 @@ from pipeline.results.report_types import (
     CameraReport,
     ExpressionReport,
     FaceReport,
+    HairReport,
     MorphsReport,
     PoseReport,
     Report,
     SimilarityReport,
+    SkinReport,
     TemplateReport,
     TextureReport,
     ViewReport,
 )
 from pipeline.settings import document_from_settings
-from pipeline.stages.bust import Bust
+from pipeline.stages.bust import Bust, HairyHead
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.texturing import Texturing
 from pipeline.templates.header import TemplateHeader
 from pipeline.texturing.chart_colours import ChartColours
 from pipeline.texturing.light import HARMONICS, Light
+from pipeline.texturing.pores.relief import LONGEST_MM, SHORTEST_MM
+from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, SkinMaps
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges
 from rig.messages.message import documents_of, texts_of
@@ -44,11 +48,13 @@ from rig.messages.message import documents_of, texts_of
 ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 1 in each channel"
 
 
-def report_document(result: Reconstruction, template: TemplateHeader | None = None) -> Report:
+def report_document(
+    result: Reconstruction, template: TemplateHeader | None = None, flame: Mapping[str, float] | None = None
+) -> Report:
     """Returns the report as JSON types. Every number is finite; unknown ones are None. ``template`` is the template in
-    whose vertex order the head was also written."""
+    whose vertex order the head was also written, ``flame`` the figures of its FLAME model's fit."""
     head, evidence, refined = result.head, result.evidence, result.refined
-    return {
+    document: Report = {
         "format": FORMAT,
         "version": version("eigenhead"),
         "model": {"name": result.model_name, "sha256": result.model_sha256},
@@ -69,7 +75,7 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "coefficients": _shape_coefficients(head),
         "expression": [_expression(found) for found in evidence.expression],
         "morphs": None if evidence.blendshape_rig is None else _morphs(evidence.blendshape_rig),
-        "template": None if template is None else _template(template),
+        "template": None if template is None else _template(template, flame),
         "world_from_head": similarity_document(head.fit.world_from_head),
         "landmarks": {
             name: {"position": _numbers(mark.position_mm), "std": _optional_numbers(mark.std_mm)}
@@ -90,6 +96,9 @@ def report_document(result: Reconstruction, template: TemplateHeader | None = No
         "inputs": dict(result.digests),
         "warnings": documents_of(result.warnings),
     }
+    if result.hair is not None:
+        document["hair"] = _hair(result.hair)
+    return document
 
 
 def _camera(
@@ -161,13 +170,16 @@ def _morphs(blendshape_rig: BlendshapeRig) -> MorphsReport:
     return {"weights": used, "without_counterpart": list(blendshape_rig.missing)}
 
 
-def _template(template: TemplateHeader) -> TemplateReport:
-    return {
+def _template(template: TemplateHeader, flame: Mapping[str, float] | None) -> TemplateReport:
+    figures: TemplateReport = {
         "name": template.name,
         "source": template.source,
         "sha256": template.source_sha256,
         "registration": dict(template.figures),
     }
+    if flame is not None:
+        figures["flame"] = dict(flame)
+    return figures
 
 
 def similarity_document(transform: Similarity) -> SimilarityReport:
@@ -189,6 +201,22 @@ def _texture(texturing: Texturing) -> TextureReport:
         "gains": _plain(vertices.gains),
         "chart": None if texturing.chart is None else _chart(texturing.chart),
         "light": None if texturing.albedo is None else _light(texturing.albedo.light),
+        "skin": None if texturing.skin is None else skin_document(texturing.skin),
+    }
+
+
+def skin_document(maps: SkinMaps) -> SkinReport:
+    """Describes the maps of the skin."""
+    return {
+        "size": len(maps.displacement),
+        "mm_per_code": MM_PER_CODE,
+        "mid_code": MID_CODE,
+        "direction": "along the interpolated normals of head.ply, outwards",
+        "normals": "glTF: x along the tangent, y up in the image, z along the normal",
+        "longest_mm": LONGEST_MM,
+        "shortest_mm": SHORTEST_MM,
+        "repeated": list(maps.repeated),
+        "views": list(maps.views),
     }
 
 
@@ -210,6 +238,10 @@ def _light(light: Light) -> dict[str, object]:
         "residual": light.residual,
     }
     return _plain(document)
+
+
+def _hair(hair: HairyHead) -> HairReport:
+    return {"covered_share": hair.shell.covered, "highest_mm": float(hair.shell.height_mm.max())}
 
 
 def _bust(bust: Bust) -> BustReport:

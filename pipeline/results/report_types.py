@@ -98,12 +98,14 @@ class MorphsReport(TypedDict):
 
 class TemplateReport(TypedDict):
     """Describes the template in whose vertex order head-NAME.obj is. ``sha256`` is that of its mesh's file;
-    ``registration`` has the figures that ``eigenhead template add`` printed."""
+    ``registration`` has the figures that ``eigenhead template add`` printed, ``flame`` those of its FLAME
+    model's fit, where it has one."""
 
     name: str
     source: str
     sha256: str
     registration: dict[str, float]
+    flame: NotRequired[dict[str, float]]
 
 
 class SimilarityReport(TypedDict):
@@ -113,6 +115,14 @@ class SimilarityReport(TypedDict):
     scale: float
     rotation: list[list[float]]
     translation: list[float]
+
+
+class HairReport(TypedDict):
+    """Describes head_hair.ply: the share of the bust's hair that it comes within 2 mm of, and its largest height above
+    the skin (mm)."""
+
+    covered_share: float
+    highest_mm: float
 
 
 class BustReport(TypedDict):
@@ -128,6 +138,22 @@ class BustReport(TypedDict):
     filled: int
 
 
+class SkinReport(TypedDict):
+    """Describes the maps in texture/. A code of the displacement map is ``mm_per_code`` along the normal of head.ply,
+    from ``mid_code`` on. ``repeated`` is the share of the shading's power that two disjoint sets of views both show, by
+    octave of wavelength from the longest."""
+
+    size: int
+    mm_per_code: float
+    mid_code: int
+    direction: str
+    normals: str
+    longest_mm: float
+    shortest_mm: float
+    repeated: list[float]
+    views: list[str]
+
+
 class TextureReport(TypedDict):
     """Describes the head's colours. ``filled`` counts the vertices that no photograph coloured; ``gains`` are factors
     of linear RGB, by camera."""
@@ -137,6 +163,7 @@ class TextureReport(TypedDict):
     gains: dict[str, object]
     chart: dict[str, object] | None
     light: dict[str, object] | None
+    skin: NotRequired[SkinReport | None]  # not in files of earlier versions
 
 
 class DetailReport(TypedDict):
@@ -170,6 +197,7 @@ class Report(TypedDict):
     quality: dict[str, float | None]
     texture: TextureReport
     bust: BustReport | None
+    hair: NotRequired[HairReport]  # where head_hair.ply was asked for
     evaluations: int
     stopped_because: str
     seconds: dict[str, float]

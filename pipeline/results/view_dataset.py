@@ -1,8 +1,8 @@
 """Writes a capture as a data set of views: undistorted pictures, masks, and the files that say where each was taken.
 
-Enters: a capture, its silhouettes and rig. Leaves: the folder described in ``rig.formats.dataset_json``, of the views
-that take part. For GaussianAvatars the pictures show the subject on white, by pinhole cameras with square pixels and
-the principal point in the middle; for nerfstudio they keep background and camera matrix.
+Enters: a capture, its silhouettes and rig. Leaves: the folder described in ``rig.formats.cameras.dataset_json``, of the
+views that take part. For GaussianAvatars the pictures show the subject on white, by pinhole cameras with square pixels
+and the principal point in the middle; for nerfstudio they keep background and camera matrix.
 """
 
 from collections.abc import Mapping
@@ -18,8 +18,17 @@ from pipeline.imaging.undistortion import pinhole_of, undistorted_picture, undis
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.capture import Capture
-from rig.formats.dataset_json import LAYOUTS, DatasetFormat, dataset_documents, picture_names, points_ply
-from rig.formats.images import write_image
+from rig.formats.cameras.dataset_json import (
+    FLAME_CANONICAL,
+    FLAME_MOMENT,
+    LAYOUTS,
+    DatasetFormat,
+    dataset_documents,
+    picture_names,
+    points_ply,
+)
+from rig.formats.meshes.flame_param import FlameParam, canonical, encoded
+from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.rig import Rig
 
@@ -29,12 +38,13 @@ THREADS = 4  # a view of four megapixels takes half a gigabyte while it is resam
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewDataset:
     """Holds what a data set is made of. ``head_world`` is a surface in the capture's world frame (mm) from which
-    training may start."""
+    training may start, ``flame`` its parameters there."""
 
     capture: Capture
     rig: Rig
     silhouettes: Mapping[str, Silhouette]
     head_world: Mesh | None = None
+    flame: FlameParam | None = None
 
     @property
     def rig_used(self) -> Rig:
@@ -60,7 +70,11 @@ def write_view_dataset(folder: Path, dataset: ViewDataset, form: DatasetFormat) 
         colours = np.full(head.vertices.shape, 128, np.uint8) if head.colours is None else head.colours
         points = points_ply(head.vertices / 1000.0, head.normals(), np.asarray(colours, np.uint8))
         write_atomically(folder / LAYOUTS[form].points, points)
-    for name, document in dataset_documents(pinholes, form, with_points=head is not None).items():
+    if dataset.flame is not None:
+        write_atomically(folder / FLAME_MOMENT, encoded(dataset.flame))
+        write_atomically(folder / FLAME_CANONICAL, encoded(canonical(dataset.flame)))
+    documents = dataset_documents(pinholes, form, with_points=head is not None, with_flame=dataset.flame is not None)
+    for name, document in documents.items():
         write_atomically(folder / name, document)
 
 

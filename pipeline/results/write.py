@@ -2,13 +2,16 @@
 
     head.ply  head.glb  report.json  overlays/<camera>.png     fixed by docs/capture-format.md
     bust.ply  bust.glb  the whole visible surface; settings.outputs.surface says which of the two is written, or both
+    head_hair.ply  head_hair.glb    on request: the head's vertices pushed out to the hair; of a template, too
     contact_sheet.png   input, silhouette difference before and after the fit (section 5.4), the head from new views
     turntable.png       the head from the right to the left profile
     head.obj head.mtl head.png, head.usdz, head.stl, head.3mf     on request (settings.outputs.formats)
     neutral.glb         on request: the head without its expression; posed.glb, with morphs to make others
+    texture/            on request: albedo.png; with pores colour.png, normals.png and displacement.png
     landmarks.mrk.json  on request: the landmarks as a point list of 3D Slicer
     head-NAME.obj       on request: the head in the vertex order of the template NAME, with its texture
     head-NAME.glb, head-NAME-shapes.npz     with morphs: that mesh without expression, with shapes and pivots
+    flame_param.npz     where NAME was made of a FLAME model: its parameters for this head
 
 Files of the same input, model, settings and version are the same bytes, report.json's seconds excepted.
 """
@@ -27,15 +30,17 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.slicer_landmarks import landmarks_document
 from pipeline.results.write_expression import write_expression
+from pipeline.results.write_flame import write_flame
+from pipeline.results.write_hair import write_hair
 from pipeline.results.write_template import template_colours, write_template
 from pipeline.results.write_template_shapes import write_template_shapes
 from pipeline.stages.bust import Bust
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, reassign_images
-from rig.formats.glb import write_glb
-from rig.formats.images import write_image
-from rig.formats.ply import write_ply
+from rig.formats.meshes.glb import write_glb
+from rig.formats.meshes.ply import write_ply
+from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform, Similarity
 from rig.mesh import Mesh
 
@@ -56,6 +61,7 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
     capture = reassign_images(capture, pictures=result.views.assignment)
     head, blendshape_rig = head_mesh(result), result.evidence.blendshape_rig
     with task_pool(THREADS) as pool:
+        fitted = None if template is None else pool.submit(write_flame, folder, result, template)
         jobs = [
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),
@@ -63,14 +69,16 @@ def write_result(folder: Path, result: Reconstruction, capture: Capture, templat
             *([] if template is None else [pool.submit(write_template, folder, result, template)]),
             *_shape_jobs(pool, folder, result, template),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
+            *([] if result.hair is None else [pool.submit(write_hair, folder, result, result.hair, template)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
         ]
         for job in jobs:
             job.result()
+        flame = None if fitted is None else fitted.result()
     if result.settings.outputs.slicer:
         points = json.dumps(landmarks_document(result), indent=1, allow_nan=False)
         write_atomically(folder / "landmarks.mrk.json", points.encode())
-    text = json.dumps(report_document(result, template), indent=1, allow_nan=False)
+    text = json.dumps(report_document(result, template, flame), indent=1, allow_nan=False)
     write_atomically(folder / "report.json", text.encode())
 
 

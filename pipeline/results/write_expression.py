@@ -8,8 +8,8 @@ import numpy as np
 from pipeline.evidence.expression import BlendshapeRig
 from pipeline.results.reconstruction import Reconstruction
 from rig.atomic_write import write_atomically
-from rig.formats.glb import glb_bytes
-from rig.formats.morph_glb import with_morphs
+from rig.formats.meshes.glb import glb_bytes
+from rig.formats.meshes.morph_glb import with_morphs
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 

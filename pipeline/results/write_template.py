@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 
 from pipeline.results.head_files import ENCODINGS
 from pipeline.results.metadata import ply_comments
@@ -18,8 +18,8 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.templates.template_file import Template
 from pipeline.texturing.template_texture import Tile, corner_tiles, skin_polygons, template_textures
 from rig.atomic_write import write_atomically
-from rig.formats.obj import MATERIAL
-from rig.formats.polygon_obj import PolygonMesh, polygon_obj_bytes
+from rig.formats.meshes.obj import MATERIAL
+from rig.formats.meshes.polygon_obj import PolygonMesh, polygon_obj_bytes
 from rig.mesh import vertex_normals
 
 NO_SKIN = 200  # grey of what no photograph shows
@@ -36,13 +36,13 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
         else template_textures(result.texturing.atlas, template.mesh, surface_binding)
     )
     suffix, _, options = ENCODINGS["png" if result.settings.outputs.image == "png" else "jpeg"]
-    files = {tile: f"{name}{_tile_suffix(tile)}{suffix}" for tile in textures}
+    files = {tile: f"{name}{tile_suffix(tile)}{suffix}" for tile in textures}
     for tile, image in textures.items():
         _, data = cv2.imencode(suffix, np.ascontiguousarray(image[:, :, ::-1]), list(options))
         write_atomically(folder / files[tile], data.tobytes())
     mesh, library = template.mesh, None
     if textures:
-        mesh, materials = _materials(template, files)
+        mesh, materials = template_materials(template, files)
         library = f"{name}.mtl"
         write_atomically(folder / library, materials)
     comments = [
@@ -60,21 +60,28 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
     write_atomically(folder / f"{name}.obj", data)
 
 
-def _tile_suffix(tile: Tile) -> str:
+def tile_suffix(tile: Tile) -> str:
     """Returns the UDIM number of a tile as a suffix of file names; empty for the first tile."""
     return "" if tile == (0, 0) else f"-{1001 + tile[0] + 10 * tile[1]}"
 
 
 def template_colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
     """Returns the colours of the template's vertices: the head's on the skin, grey elsewhere."""
+    return carried_colours(result.texturing.vertices.colours, result.mesh_world.faces, template)
+
+
+def carried_colours(
+    colours: UInt8[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], template: Template
+) -> UInt8[np.ndarray, "t 3"]:
+    """Returns the colours of the template's vertices from those of the model's: grey where it has no skin."""
     attached = template.surface_binding.attachment
-    corners = result.texturing.vertices.colours[result.mesh_world.faces[attached.triangles]].astype(float)
+    corners = colours[faces[attached.triangles]].astype(float)
     out = np.full((len(template.surface_binding.rest), 3), NO_SKIN, np.uint8)
     out[template.surface_binding.skin] = np.clip(np.rint(np.einsum("nk,nkc->nc", attached.weights, corners)), 0, 255)
     return out
 
 
-def _materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh, bytes]:
+def template_materials(template: Template, files: dict[Tile, str]) -> tuple[PolygonMesh, bytes]:
     """Returns the mesh with a material for each part that has one in its file, or else one for all of it, and the
     material library. Materials of the skin show the image of the tile that most of their skin lies in."""
     mesh = template.mesh

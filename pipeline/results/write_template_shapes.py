@@ -1,7 +1,7 @@
 """``head-NAME.glb`` and ``head-NAME-shapes.npz`` of a result: the template's mesh without expression, with shapes.
 
 Head frame; the GLB in metres, the archive in mm. Vertices keep the template's order; in the GLB, eyeballs are parts of
-their own (``extras.rows`` of a node says which vertices it has).
+their own (``extras.rows`` of a node says which vertices it has; eyeballs that the mesh lacks are added and have none).
 """
 
 import io
@@ -19,9 +19,9 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.templates.animated import AnimatedMesh, animated_mesh
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
-from rig.formats.glb import glb_bytes
-from rig.formats.morph_glb import with_morphs
-from rig.formats.pivot_glb import with_pivots
+from rig.formats.meshes.glb import glb_bytes
+from rig.formats.meshes.morph_glb import with_morphs
+from rig.formats.meshes.pivot_glb import with_pivots
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh, vertex_normals
 
@@ -74,6 +74,7 @@ def animated_glb(
     glb = with_morphs(glb, head.vertices, head.faces, morphs, weights)
     parts = {name: _part(animated, triangles, colours, part) for name, part in animated.eyeballs.items()}
     named = {"head": rows.tolist()} | {name: part.tolist() for name, part in animated.eyeballs.items()}
+    parts |= {name: eyeball.mesh() for name, eyeball in animated.added.items()}
     return with_pivots(glb, animated.pivots, parts, named if turning.any() else {})
 
 
@@ -101,6 +102,10 @@ def _archive(animated: AnimatedMesh, template: Template, blendshape_rig: Blendsh
         "without_counterpart": list(blendshape_rig.missing),
         "visemes": {name: dict(mixture) for name, mixture in VISEMES.items()},
         "pivots": {name: pivot.tolist() for name, pivot in animated.pivots.items()},
+        "eyeballs": {
+            name: {"radius_mm": eyeball.radius_mm, "gaze": eyeball.gaze.tolist()}
+            for name, eyeball in animated.added.items()
+        },
     }
     packed = io.BytesIO()
     np.savez_compressed(

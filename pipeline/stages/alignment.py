@@ -17,8 +17,8 @@ from pipeline.stages.faces import Faces
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
 from rig.errors import EigenheadError
-from rig.formats.fault_groups import say_once
 from rig.geometry import Similarity
+from rig.messages.fault_groups import say_once
 from rig.messages.message import compose
 from rig.progress import Progress
 from rig.rig import Rig

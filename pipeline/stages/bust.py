@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.spatial import KDTree
 
+from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import part_of
@@ -16,7 +18,7 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
-from rig.mesh import Mesh
+from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose
 
 
@@ -89,3 +91,27 @@ def colour_bust(
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
     colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
     return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HairyHead:
+    """Holds the head pushed out to its hair, with the bust's colours (sRGB) and views."""
+
+    shell: HairShell
+    normals: Float[np.ndarray, "v 3"]
+    colours: UInt8[np.ndarray, "v 3"]
+    views: UInt8[np.ndarray, " v"]
+
+
+@stage("bust")
+def push_out_hair(context: ReconstructionContext, refined: RefinedHead, bust: Bust | None) -> Staged[HairyHead | None]:
+    """Pushes the delivered head out to the bust's hair, if the settings ask for it. Returns None otherwise, and without
+    a bust. Warns ``hair-beyond-head`` where the head's vertices do not reach the hair."""
+    if bust is None or context.settings.outputs.surface != "hair":
+        return Staged(None)
+    head, mesh = refined.mesh_world, bust.mesh_world
+    shell = hair_shell(head, mesh, bust.surface.part)
+    near = KDTree(mesh.vertices).query(shell.vertices_world)[1]
+    made = HairyHead(shell, vertex_normals(shell.vertices_world, head.faces), bust.colours[near], bust.views[near])
+    beyond = shell.covered < MIN_COVERED
+    return Staged(made, [compose("hair-beyond-head", share=shell.covered)] if beyond else [])

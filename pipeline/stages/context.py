@@ -9,7 +9,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
-from rig.capture import Capture
+from rig.capture import Capture, ReadImage
 from rig.progress import Progress, discard_progress
 from rig.render.compute import ComputeDevice
 from rig.render.renderer import Renderer
@@ -31,6 +31,7 @@ class ReconstructionContext:
         progress: called with a stage's name and the share of it that is done; raises Cancelled to stop.
         segment: computes the silhouettes of a capture; a caller that caches them passes its own function.
         networks: neural networks that find faces; a caller of many jobs loads them once.
+        read_original: reads a picture at the size of its file, for the detail ``pores``; None where there are no files.
         device: GPU that compares the photographs; None uses the processor.
     """
 
@@ -43,6 +44,7 @@ class ReconstructionContext:
     segment: Segment = field(default=segment)
     networks: FaceNetworks = field(default_factory=load_networks)
     device: ComputeDevice | None = None
+    read_original: ReadImage | None = None
 
     def within_stage(self, name: str) -> "ReconstructionContext":
         """Returns the context with all progress reported under the stage ``name``, whatever name the called code

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
+from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
@@ -17,8 +18,13 @@ from pipeline.texturing.chart_colours import ChartColours, chart_colours, with_t
 from pipeline.texturing.head_texture import find_layout, paint_head
 from pipeline.texturing.layout.reduced_layout import ReducedLayout, reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.pores.close_views import CloseViews, read_close_views
+from pipeline.texturing.pores.skin_maps import SkinMaps, skin_maps, skin_share
 from pipeline.texturing.vertex_colours import Texture, texture
+from pipeline.warnings import ReportWarning
 from rig.capture import Capture
+from rig.mesh import Mesh
+from rig.messages.message import compose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,13 +39,14 @@ class Texturing:
     reduced: ReducedLayout | None = None  # of the atlas, where the settings ask for a normal map
     chart: ChartColours | None = None  # where the settings ask for it and a plate shows one
     albedo: Albedo | None = None  # where the settings ask for it and the light can be estimated
+    skin: SkinMaps | None = None  # where the settings ask for pores and the pictures' files are at hand
 
 
 @stage("texture")
 def texture_head(
-    context: ReconstructionContext, views: Views, head: HeadFit, refined: RefinedHead
+    context: ReconstructionContext, views: Views, head: HeadFit, refined: RefinedHead, labels: PartLabels
 ) -> Staged[Texturing]:
-    """Colours the delivered head from the photographs, and paints its textures."""
+    """Colours the delivered head from the photographs, and paints its textures and maps."""
     settings, rig, model, mesh = context.settings, context.rig, head.model, refined.mesh_world
     normals, depths, face = mesh.normals(), depth_maps(rig, mesh), model.levels["full"].face_region
     layout, layout_warnings = find_layout(model, settings)
@@ -57,10 +64,49 @@ def texture_head(
         around=around,
         dim_share=DIM_SHARE if settings.outputs.delit else None,
     )
-    atlas = paint_head(layout, mesh, vertices, face, settings)
+    close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
+    atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.for_texels())
+    skin = None
+    if close is not None and layout is not None and atlas is not None:
+        skin, atlas = skin_maps(
+            layout,
+            atlas,
+            mesh,
+            normals,
+            vertices,
+            close,
+            face=face,
+            skin=skin_share(close.decision, mesh, labels.skin_probability()),
+            world_from_head=head.fit.world_from_head,
+        )
     reduced = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
     albedo, albedo_warnings = None, []
     if settings.outputs.delit:
         albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)
-    warnings = (*chart_warnings, *vertices.warnings, *layout_warnings, *albedo_warnings)
-    return Staged(Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo), warnings)
+    warnings = (*chart_warnings, *vertices.warnings, *layout_warnings, *albedo_warnings, *pores_warnings)
+    return Staged(Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo, skin), warnings)
+
+
+def _read_pores(
+    context: ReconstructionContext,
+    views: Views,
+    mesh: Mesh,
+    coloured: Texture,
+    face: Bool[np.ndarray, " v"],
+    chart: ChartColours | None,
+) -> tuple[CloseViews | None, list[ReportWarning]]:
+    """The full-size pictures, if the settings ask for pores. None and a warning if there is no file or no texture."""
+    if context.settings.detail != "pores":
+        return None, []
+    if context.read_original is None or coloured.decision is None:
+        return None, [compose("no-pores")]
+    close = read_close_views(
+        context.read_original,
+        mesh,
+        coloured,
+        face,
+        footprint_px=context.settings.texture.footprint_px,
+        sources=views.assignment,
+        chart=chart,
+    )
+    return close, []

@@ -1,7 +1,8 @@
-"""A registered mesh that can be animated: Apple's 52 shapes and the visemes on it, without crossing, and its pivots."""
+"""A registered mesh that can be animated: Apple's 52 shapes and the visemes on it, without crossing, its pivots, and
+eyeballs where its eyes are open and it has none."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,6 +10,7 @@ from jaxtyping import Float, Int
 from pipeline.head_model.visemes import VISEMES, mixed
 from pipeline.templates.carrying import SurfaceBinding
 from pipeline.templates.contact import RestSurface, kept_apart, rest_surface
+from pipeline.templates.eyeballs import Eyeball, lifted, placed_eyeballs
 from pipeline.templates.pivots import EYE_REACH_MM, Points, pivots
 from pipeline.templates.shape_carrying import Neutral, carried_shapes
 
@@ -23,6 +25,7 @@ class AnimatedMesh:
     shapes: Mapping[str, Float[np.ndarray, "t 3"]]  # displacements at weight 1: Apple's, others of the head, visemes
     pivots: Mapping[str, Float[np.ndarray, " 3"]]
     eyeballs: Mapping[str, Int[np.ndarray, " b"]]  # rows of the mesh, by pivot
+    added: Mapping[str, Eyeball] = field(default_factory=dict)  # eyeballs that the mesh lacks, by pivot
 
 
 def animated_mesh(
@@ -33,7 +36,7 @@ def animated_mesh(
     shapes: Mapping[str, Float[np.ndarray, "v 3"]],
     landmark_rows: Mapping[str, int],
 ) -> AnimatedMesh:
-    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes and pivots.
+    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots and eyeballs.
 
     Args:
         surface_binding: how the model carries the mesh.
@@ -56,7 +59,13 @@ def animated_mesh(
         for rows in balls
         if name.startswith("eye_") and np.linalg.norm(mesh[rows].mean(axis=0) - pivot) < 0.5 * EYE_REACH_MM
     }
-    return AnimatedMesh(mesh, parted_shapes(rest_surface(mesh, triangles), carried), found, eyes)
+    lacking = {name: pivot for name, pivot in found.items() if name.startswith("eye_") and name not in eyes}
+    added = placed_eyeballs(mesh, triangles, landmarks, lacking)
+    found |= {name: eyeball.centre for name, eyeball in added.items()}
+    shapes_of_mesh = parted_shapes(rest_surface(mesh, triangles), carried)
+    if added:
+        shapes_of_mesh = {name: lifted(mesh, triangles, shape, added) for name, shape in shapes_of_mesh.items()}
+    return AnimatedMesh(mesh, shapes_of_mesh, found, eyes, added)
 
 
 def parted_shapes(

@@ -77,8 +77,12 @@ class SurfaceBinding:
     def on(self, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "t 3"]:
         """Returns the template's vertices deformed with a head. ``vertices`` are those of the model's full level, in
         any frame, mm."""
+        return self.with_skin(self.attachment.on(vertices, faces))
+
+    def with_skin(self, skin: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "t 3"]:
+        """Returns the template's vertices where its skin lies at ``skin``; all others follow it."""
         out = np.empty_like(self.rest)
-        out[self.skin] = self.attachment.on(vertices, faces)
+        out[self.skin] = skin
         deep = self.wholes < 0
         deep[self.skin] = False
         if deep.any():

@@ -6,12 +6,11 @@ the search of section 3.2 with a scale and without landmarks. Distances go from 
 the mesh, such as shoulders, have no effect.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from pipeline.geometry.surface_index import SurfaceIndex
@@ -51,6 +50,32 @@ ROWS = 6000  # vertices of the model that look for the mesh
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SurfaceMarks:
+    """Holds points of a model's surface, each a mean of three vertices (full level), and where a mesh has them, mm."""
+
+    rows: Int[np.ndarray, "p 3"]
+    weights: Float[np.ndarray, "p 3"]
+    points: Float[np.ndarray, "p 3"]
+    deviation_mm: Float[np.ndarray, "p 3"]  # to which each is known along x, y, z
+
+    @classmethod
+    def of_landmarks(cls, model: HeadModel, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> "SurfaceMarks":
+        """Returns marks for landmarks that people marked; names that the model lacks are ignored."""
+        known = {model.landmarks[name]: point for name, point in landmarks.items() if name in model.landmarks}
+        rows = np.repeat(np.array(list(known), int)[:, None], 3, axis=1)
+        return cls(
+            rows,
+            np.full(rows.shape, 1.0 / 3.0),
+            np.array([*known.values(), np.zeros(3)])[:-1],
+            np.full(rows.shape, MARK_MM),
+        )
+
+    def on(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "p 3"]:
+        """Returns the points on a head of the model."""
+        return np.einsum("pk,pkx->px", self.weights, vertices[self.rows])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Likeness:
     """Holds the model fitted to a mesh, and the distances that remain."""
 
@@ -62,32 +87,30 @@ class Likeness:
 
 
 def fit_model_to_mesh(
-    model: HeadModel, mesh: Surface, landmarks: Mapping[str, Float[np.ndarray, " 3"]] = MappingProxyType({})
+    model: HeadModel, mesh: Surface, marks: SurfaceMarks | None = None, stages: Sequence[Stage] = STAGES
 ) -> Likeness:
-    """Fits shape and pose of the model to a mesh and to landmarks of that mesh (mm). The mesh must already lie
-    approximately where the mean head lies."""
+    """Fits shape and pose of the model to a mesh and to marks of that mesh. The mesh must already lie approximately
+    where the mean head lies."""
     wide = with_kernel(model, len(model.modes))
     full, count = model.levels["full"], len(model.modes)
+    marks = marks or SurfaceMarks.of_landmarks(model, {})
     rows = np.arange(0, len(model.mean), max(1, len(model.mean) // ROWS))  # of the cage: even over the surface
-    marked = np.array([model.landmarks[name] for name in landmarks], int)
-    marks = np.array([*landmarks.values(), np.zeros(3)])[:-1]
-    every = np.concatenate([rows, np.repeat(marked, 3)])
-    modes = np.ascontiguousarray(wide.basis("full", len(wide.modes), every).transpose(1, 2, 0))
+    modes = np.concatenate([_modes_at(wide, rows), np.repeat(_modes_on(wide, marks), 3, axis=0)])
     areas = vertex_areas(model.vertices(np.zeros(0)), full.faces)[rows]
     areas *= vertex_areas(model.vertices(np.zeros(0)), full.faces).sum() / areas.sum()
-    target, z, place = _Mesh(mesh), np.zeros(len(wide.modes)), Similarity.identity()
-    for stage in STAGES:
+    target, z, place = MetSurface(mesh), np.zeros(len(wide.modes)), Similarity.identity()
+    for stage in stages:
         active = min(count, stage.modes) if stage.modes else len(z)
         for _ in range(stage.steps):
             head = place.apply(wide.vertices(z))
             normals = vertex_normals(head, full.faces)[rows]
             met, planes, _, weight = target.meet(head[rows], normals, stage)
-            information = np.concatenate(
-                [weight * areas / 100.0 / stage.plane_mm**2, np.full(3 * len(marked), MARK_MM**-2)]
-            )
-            met = np.concatenate([met, np.repeat(marks, 3, axis=0)])
-            planes = np.concatenate([planes, np.tile(np.eye(3), (len(marked), 1))])  # a landmark is three planes
-            z, place = _gauss_newton_step(modes[:, :, :active], head[every], met, planes, information, z=z, place=place)
+            known = marks.deviation_mm.ravel() ** -2
+            information = np.concatenate([weight * areas / 100.0 / stage.plane_mm**2, known])
+            points = np.concatenate([head[rows], np.repeat(marks.on(head), 3, axis=0)])
+            met = np.concatenate([met, np.repeat(marks.points, 3, axis=0)])
+            planes = np.concatenate([planes, np.tile(np.eye(3), (len(marks.points), 1))])  # a mark is three planes
+            z, place = _gauss_newton_step(modes[:, :, :active], points, met, planes, information, z=z, place=place)
     head = place.apply(wide.vertices(z))
     normals = vertex_normals(head, full.faces)[rows]
     _, _, off, weight = target.meet(head[rows], normals, replace(STAGES[-1], reach_mm=MET_MM))
@@ -95,7 +118,18 @@ def fit_model_to_mesh(
     return Likeness(head, np.where(weight > 0, off, np.inf), areas, full.face_region[rows], deviation)
 
 
-class _Mesh:
+def _modes_at(model: HeadModel, rows: Int[np.ndarray, " r"]) -> Float[np.ndarray, "r 3 m"]:
+    return np.ascontiguousarray(model.basis("full", len(model.modes), rows).transpose(1, 2, 0))
+
+
+def _modes_on(model: HeadModel, marks: SurfaceMarks) -> Float[np.ndarray, "p 3 m"]:
+    if not len(marks.rows):
+        return np.zeros((0, 3, len(model.modes)), np.float32)
+    at = _modes_at(model, marks.rows.ravel()).reshape(*marks.rows.shape, 3, len(model.modes))
+    return np.einsum("pk,pkxm->pxm", marks.weights.astype(np.float32), at, optimize=True)
+
+
+class MetSurface:
     """Holds the mesh that the model is fitted to, with search trees of its surface and of its points by position and
     normal."""
 

@@ -20,10 +20,10 @@ from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
 from pipeline.model_building.correspondence.correspondence import Search, Target, refined
 from pipeline.templates.carrying import Attachment, SurfaceBinding, bind_vertices, surface_binding
-from pipeline.templates.likeness import CANDIDATES, Likeness, fit_model_to_mesh
+from pipeline.templates.likeness import CANDIDATES, Likeness, SurfaceMarks, fit_model_to_mesh
 from pipeline.templates.placement import Surface, find_place, outward, place_by_landmarks
 from rig.errors import InputError
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges, vertex_normals
 from rig.messages.message import compose
@@ -102,7 +102,7 @@ def register(
     skin = skin_parts(welded, parts, _head(model, model.vertices(np.zeros(0))))
     report("likeness", 0.2)
     marks = {mark: place.apply(point) for mark, point in (landmarks or {}).items() if mark in model.landmarks}
-    like = fit_model_to_mesh(model, welded, marks)
+    like = fit_model_to_mesh(model, welded, SurfaceMarks.of_landmarks(model, marks))
     covered = _check(like, name, marked=bool(landmarks))
     head, faces = _head(model, like.vertices), model.levels["full"].faces
     report("drawing", 0.7)

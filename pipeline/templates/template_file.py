@@ -10,22 +10,35 @@ from typing import Any
 import numpy as np
 
 from pipeline.templates.carrying import Attachment, SurfaceBinding
+from pipeline.templates.flame_model import FlameModel
 from pipeline.templates.header import DAMAGE, FORMAT, WORDS, BadTemplate, TemplateHeader, header_words, read_meta
 from rig.atomic_write import write_atomically
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.messages.message import compose
 
 MESH = {"sizes": "i", "corners": "i", "uv": "f", "corner_uv": "i"}
 ATTACHMENT = {"triangles": "i", "weights": "f", "offsets": "f"}
+FLAME = {
+    "template": "f",
+    "shape_modes": "f",
+    "expression_modes": "f",
+    "pose_modes": "f",
+    "joint_regressor": "f",
+    "weights": "f",
+    "parents": "i",
+    "faces": "i",
+}
 CARRIER = {"rest": "f", "skin": "i", "anchors": "i", "wholes": "i", "whole_anchors": "i"}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Template(TemplateHeader):
-    """Holds a mesh registered to a head model. ``mesh.vertices`` is ``surface_binding.rest``."""
+    """Holds a mesh registered to a head model. ``mesh.vertices`` is ``surface_binding.rest``; ``flame`` is the model
+    whose mesh it is, if its file was one."""
 
     mesh: PolygonMesh
     surface_binding: SurfaceBinding
+    flame: FlameModel | None = None
 
 
 def save_template(path: Path, template: Template) -> None:
@@ -44,6 +57,10 @@ def save_template(path: Path, template: Template) -> None:
     )
     for part, kinds in parts:
         arrays |= {name: np.asarray(getattr(part, name), _stored(kind)) for name, kind in kinds.items()}
+    if template.flame is not None:
+        arrays |= {
+            f"flame_{name}": np.asarray(getattr(template.flame, name), _stored(kind)) for name, kind in FLAME.items()
+        }
     packed = io.BytesIO()
     np.savez_compressed(packed, **arrays)
     write_atomically(path, packed.getvalue())
@@ -60,7 +77,8 @@ def read_template(path: Path) -> Template:
             meta = read_meta(path, file)
             kinds = MESH | ATTACHMENT | CARRIER
             arrays = {name: np.asarray(file[name], int if kinds[name] == "i" else float) for name in kinds}
-        template = _template(meta, arrays)
+            flame = _flame(file)
+        template = _template(meta, arrays, flame)
     except OSError as error:
         raise BadTemplate(path, error.strerror or compose("file-unreadable")) from None
     except DAMAGE as fault:
@@ -69,7 +87,15 @@ def read_template(path: Path) -> Template:
     return template
 
 
-def _template(meta: dict, arrays: Mapping[str, np.ndarray]) -> Template:
+def _flame(file: Mapping[str, np.ndarray]) -> FlameModel | None:
+    if "flame_template" not in file:
+        return None
+    return FlameModel(
+        **{name: np.asarray(file[f"flame_{name}"], int if kind == "i" else float) for name, kind in FLAME.items()}
+    )
+
+
+def _template(meta: dict, arrays: Mapping[str, np.ndarray], flame: FlameModel | None) -> Template:
     statements = tuple((int(before), str(line)) for before, line in meta["statements"])
     mesh = PolygonMesh(
         arrays["rest"], arrays["sizes"], arrays["corners"], arrays["uv"], arrays["corner_uv"], statements
@@ -82,7 +108,9 @@ def _template(meta: dict, arrays: Mapping[str, np.ndarray]) -> Template:
         wholes=arrays["wholes"],
         whole_anchors=arrays["whole_anchors"],
     )
-    return Template(**header_words(meta), mesh=mesh, surface_binding=surface_binding, figures=meta["figures"])
+    return Template(
+        **header_words(meta), mesh=mesh, surface_binding=surface_binding, figures=meta["figures"], flame=flame
+    )
 
 
 def _check(path: Path, template: Template) -> None:
@@ -103,3 +131,5 @@ def _check(path: Path, template: Template) -> None:
     numbers = (surface_binding.rest, surface_binding.attachment.weights, surface_binding.attachment.offsets, mesh.uv)
     if not all(np.isfinite(part).all() for part in numbers):
         raise BadTemplate(path, compose("template-not-finite"))
+    if template.flame is not None and len(template.flame.template) != count:
+        raise BadTemplate(path, compose("template-arrays-unfit"))

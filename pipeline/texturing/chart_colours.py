@@ -36,6 +36,13 @@ class ChartColours:
     cameras: Mapping[str, ChartCorrection]
     normal_world: Float[np.ndarray, " 3"]
 
+    def matrix_of(self, name: str) -> Float[np.ndarray, "3 3"]:
+        """Returns the correction of a camera; the mean of all for one that saw no chart."""
+        correction = self.cameras.get(name)
+        if correction is not None:
+            return correction.matrix
+        return np.mean([each.matrix for each in self.cameras.values()], axis=0)
+
 
 def chart_colours(capture: Capture, rig: Rig) -> tuple[ChartColours | None, list[ReportWarning]]:
     """Finds the charts in all clean plates, and computes the colour correction of each camera. Returns None and a
@@ -59,11 +66,9 @@ def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[Char
 def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
     """Returns the capture with the colours of its photographs corrected; its clean plates are unchanged. A camera that
     saw no chart gets the mean correction."""
-    mean = np.mean([correction.matrix for correction in colours.cameras.values()], axis=0)
 
     def corrected(name: str) -> UInt8[np.ndarray, "h w 3"]:
-        correction = colours.cameras.get(name)
-        return in_true_colours(capture.images[name], mean if correction is None else correction.matrix)
+        return in_true_colours(capture.images[name], colours.matrix_of(name))
 
     names = list(capture.images)
     images = map_in_threads(lambda k: corrected(names[k]), len(names))

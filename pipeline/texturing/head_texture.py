@@ -13,6 +13,7 @@ from pipeline.texturing.vertex_colours import Texture
 from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh
 from rig.messages.message import compose
+from rig.rig import Rig
 
 
 def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
@@ -31,12 +32,18 @@ def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | Non
 
 @traced
 def paint_head(
-    layout: ModelLayout | None, mesh: Mesh, coloured: Texture, face_region: Bool[np.ndarray, " v"], settings: Settings
+    layout: ModelLayout | None,
+    mesh: Mesh,
+    coloured: Texture,
+    face_region: Bool[np.ndarray, " v"],
+    settings: Settings,
+    full_size: Rig | None = None,
 ) -> Atlas | None:
-    """Paints the texture of the head. Returns None if there is no layout or no camera saw the head."""
+    """Paints the texture of the head, as fine as the pictures, or as those of the cameras ``full_size``. Returns None
+    if there is no layout or no camera saw the head."""
     if layout is None or coloured.decision is None:
         return None
     region = np.flatnonzero(face_region)
     wanted = settings.outputs.texture_size
-    size = texture_size(layout.layout, mesh, coloured.decision.views, region, wanted=wanted)
+    size = texture_size(layout.layout, mesh, full_size or coloured.decision.views, region, wanted=wanted)
     return paint_texture(layout.layout, mesh, coloured.colours, coloured.decision, size)

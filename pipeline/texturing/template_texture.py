@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.templates.carrying import SurfaceBinding
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
-from rig.formats.polygon_obj import PolygonMesh, fan
+from rig.formats.meshes.polygon_obj import PolygonMesh, fan
 
 MAX_TILES = 10  # a row of UDIM
 MAX_TEXELS = 4096  # a side
@@ -91,12 +91,12 @@ def _tile(
     image = np.asarray(
         cv2.remap(atlas.image, read[..., 0], read[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
     )
-    return _filled(image, shown >= 0)
+    return filled(image, shown >= 0)
 
 
-def _filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s 3"]:
-    """The nearest known texel where none is, a margin for blurred reading and the cut; farther off, shoulders say, the
-    mean colour. What fills is coarse; known texels stay."""
+def filled(image: UInt8[np.ndarray, "s s 3"], known: Bool[np.ndarray, "s s"]) -> UInt8[np.ndarray, "s s 3"]:
+    """Returns the image with the nearest known texel where none is, a margin for blurred reading and the cut; farther
+    off, shoulders say, the mean colour. What fills is coarse; known texels stay."""
     step = max(1, len(image) // COARSE)
     if not known[::step, ::step].any():
         return image

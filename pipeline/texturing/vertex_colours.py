@@ -37,8 +37,8 @@ from pipeline.warnings import ReportWarning
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
-from rig.formats.fault_groups import some_of
 from rig.mesh import Mesh
+from rig.messages.fault_groups import some_of
 from rig.messages.message import compose
 from rig.rig import Rig
 

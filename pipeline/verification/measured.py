@@ -13,7 +13,7 @@ from pipeline.head_model.regions import head_regions
 from pipeline.head_model.subdivision import vertex_areas
 from pipeline.results.report_types import Report as ReportDocument
 from rig.errors import InputError
-from rig.formats.ply import read_head_ply
+from rig.formats.meshes.ply import read_head_ply
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 

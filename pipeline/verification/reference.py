@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
 from pipeline.model_building.correspondence.scans import landmark_file, read_landmarks, welded
 from rig.errors import InputError
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh, boundary_edges
 
 MIN_TRIANGLES = 1000  # of a head; scan_checks asks the same of scans

@@ -12,7 +12,7 @@ from pipeline.verification.pictures import draw
 from pipeline.verification.reference import Reference
 from pipeline.verification.report import Occasion, VerificationReport, report_document
 from rig.atomic_write import write_atomically
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 
 
 def write_verification(

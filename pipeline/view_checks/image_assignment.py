@@ -29,7 +29,7 @@ from pipeline.view_checks.rig_agreement import loose_outlines, wrong_rig
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture, Features, reassign_images
 from rig.errors import EigenheadError
-from rig.formats.fault_groups import some_of
+from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

@@ -19,7 +19,7 @@ from pipeline.view_checks.rig_agreement import misplaced_camera
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
 from rig.errors import EigenheadError
-from rig.formats.fault_groups import say_once
+from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 

@@ -24,8 +24,8 @@ from rig.atomic_write import write_atomically
 from rig.capture import Capture
 from rig.drivers.registry import driver_for
 from rig.errors import EigenheadError, InputError
-from rig.formats.capture_folder import write_capture
-from rig.formats.images import write_image
+from rig.formats.captures.capture_folder import write_capture
+from rig.formats.pictures.images import write_image
 from rig.formats.rig_toml import RigConfig
 from rig.image import ImageRgb
 from rig.messages.message import compose

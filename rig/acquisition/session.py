@@ -25,7 +25,7 @@ from rig.acquisition.trigger import Fired, TriggerBox, TriggerError
 from rig.drivers.base import Driver, DriverError, Frame
 from rig.drivers.feed import CameraFeed, FeedState
 from rig.drivers.registry import driver_for
-from rig.formats.cameras_json import read_rig
+from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.rig_toml import CameraConfig, RigConfig
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose

@@ -10,7 +10,7 @@ from pathlib import Path
 from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, GrabTimeout
 from rig.drivers.frame_clock import Pace
 from rig.errors import InputError
-from rig.formats.images import IMAGE_SUFFIXES, read_image
+from rig.formats.pictures.images import IMAGE_SUFFIXES, read_image
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rig.errors import InputError
-from rig.formats.cameras_json import name_fault
-from rig.formats.shot_files import PLATES_MOST
+from rig.formats.cameras.cameras_json import name_fault
+from rig.formats.captures.shot_files import PLATES_MOST
 from rig.messages.message import Message, compose
 from rig.text import suggest
 

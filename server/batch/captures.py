@@ -12,9 +12,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 from rig.errors import InputError
-from rig.formats.cameras_file import find_rig_file
-from rig.formats.picture_names import is_junk
-from rig.formats.shot_files import BESIDE_PICTURES, listed_pictures
+from rig.formats.cameras.cameras_file import find_rig_file
+from rig.formats.captures.shot_files import BESIDE_PICTURES, listed_pictures
+from rig.formats.pictures.picture_names import is_junk
 from rig.messages.message import Message, compose
 from rig.text import suggest
 from server.tasks.settings_file import read_settings_file, reason_of

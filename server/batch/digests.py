@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from rig.formats.picture_names import is_junk
+from rig.formats.pictures.picture_names import is_junk
 
 
 def capture_sha256(path: Path) -> str:

@@ -71,8 +71,10 @@ def batch(
         str | None,
         typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
     ] = None,
-    detail: Annotated[str | None, chosen("span, kernel, photo or fine (the default).", of_setting("detail"))] = None,
-    surface: Annotated[str | None, chosen("head, bust or both (the default).", of_output("surface"))] = None,
+    detail: Annotated[
+        str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
+    ] = None,
+    surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
     formats: Annotated[
         str | None,
         typer.Option(

@@ -30,7 +30,7 @@ def _lenses() -> tuple[str, ...]:
 
 
 def _formats() -> tuple[str, ...]:
-    from rig.formats.cameras_file import FORMATS
+    from rig.formats.cameras.cameras_file import FORMATS
 
     return FORMATS
 
@@ -120,7 +120,7 @@ def _calibrate_board(
     from calibration.calibrate import calibrate as run
     from calibration.report import write_report
     from calibration.result import CalibrationRefused, write_calibration
-    from rig.formats.cameras_json import read_rig
+    from rig.formats.cameras.cameras_json import read_rig
 
     known = None if previous is None else read_rig(previous)
     page = out.with_suffix(".html")
@@ -149,7 +149,7 @@ def _calibrate_scene(
 ) -> None:
     from calibration.scene.report import write_scene_report
     from calibration.scene.scene import calibrate_scene
-    from rig.formats.cameras_json import write_rig
+    from rig.formats.cameras.cameras_json import write_rig
 
     page = out.with_suffix(".html")
     one_lens = None if lenses is None else lenses == "one"
@@ -185,7 +185,7 @@ def refine(
     prepare_file(out)
     from calibration.silhouette_refinement.report import refinement_page
     from rig.atomic_write import write_atomically
-    from rig.formats.cameras_json import write_rig
+    from rig.formats.cameras.cameras_json import write_rig
     from server.cli.refine import refine_locally
 
     page = out.with_suffix(".html")
@@ -220,7 +220,7 @@ def convert(
 ) -> None:
     """Convert calibrations to and from other programs."""
     from rig.errors import InputError
-    from rig.formats.cameras_file import FOLDER_FORMATS, NO_RIG, find_rig_file, read_cameras, write_rig_file
+    from rig.formats.cameras.cameras_file import FOLDER_FORMATS, NO_RIG, find_rig_file, read_cameras, write_rig_file
 
     file = find_rig_file(source) if source.is_dir() else source
     if file is None:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, TypedDict
 
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError, WrongVariable
-from rig.formats.cameras_file import read_cameras, rig_files
-from rig.formats.capture_folder import SCALE, capture_root, unread_files, unread_pictures
-from rig.formats.images import decode_image_file
-from rig.formats.shot_files import BESIDE_PICTURES, find_files, listed_pictures
+from rig.formats.cameras.cameras_file import read_cameras, rig_files
+from rig.formats.captures.capture_folder import SCALE, capture_root, unread_files, unread_pictures
+from rig.formats.captures.shot_files import BESIDE_PICTURES, find_files, listed_pictures
+from rig.formats.pictures.images import decode_image_file
 from rig.messages.message import MessageDocument, compose, documents_of, texts_of
 from rig.progress import Progress
 from server.cli.answers import service_settings
@@ -102,7 +102,7 @@ def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], li
 
     Raises InputError for photographs, or a scale.json, that cannot be used."""
     from calibration.scene.photographs import find_photographs
-    from rig.formats.scale_json import read_scale
+    from rig.formats.cameras.scale_json import read_scale
 
     root = capture_root(folder)
     photographs = find_photographs(root)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, cast
 import httpx
 
 from rig.errors import EigenheadError
-from rig.formats.archive import is_archive, pack_folder
+from rig.formats.captures.archive import is_archive, pack_folder
 from rig.progress import Progress
 from server.services.documents import CaptureDocument, ErrorDocument, JobDocument
 from server.storage.result_folder import fresh_folder

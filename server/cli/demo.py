@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.results.overlays import PANEL
 from pipeline.settings import settings_from_document
 from rig.errors import EigenheadError
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from rig.progress import Progress
 from server.address import listen
 from server.cli.client import Client, Unreachable

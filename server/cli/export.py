@@ -11,7 +11,7 @@ app = typer.Typer(rich_markup_mode=None)
 
 
 def _dataset_formats() -> tuple[str, ...]:
-    from rig.formats.dataset_json import DATASET_FORMATS
+    from rig.formats.cameras.dataset_json import DATASET_FORMATS
 
     return DATASET_FORMATS
 
@@ -24,7 +24,11 @@ def export(
     *,
     result: Annotated[
         Path | None,
-        typer.Option(help="The capture's result folder: its head becomes points.", exists=True, file_okay=False),
+        typer.Option(
+            help="The capture's result folder: head and FLAME parameters.",
+            exists=True,
+            file_okay=False,
+        ),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
     overwrite: Overwrite = False,
@@ -36,7 +40,7 @@ def export(
     from typing import cast
 
     from pipeline.settings import settings_from_document
-    from rig.formats.dataset_json import DatasetFormat
+    from rig.formats.cameras.dataset_json import DatasetFormat
     from server.cli.reconstruct_local import check_apart
     from server.tasks.export_dataset import export_folder
     from server.tasks.reconstruct_folder import folder_of
@@ -52,5 +56,10 @@ def export(
     for warning in made.warnings:
         warn(f"{warning.code}: {warning}")
     document = {"out": str(out), "as": form, "cameras": made.cameras, "left_out": made.left_out, "points": made.points}
-    seen = f"{len(made.cameras)} views" + (f", without {', '.join(made.left_out)}" if made.left_out else "")
+    document |= {"flame": made.flame}
+    seen = (
+        f"{len(made.cameras)} views"
+        + (", FLAME parameters" if made.flame else "")
+        + (f", without {', '.join(made.left_out)}" if made.left_out else "")
+    )
     answer(document, json_out, [f"{out}  {seen}"])

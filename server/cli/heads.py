@@ -116,8 +116,10 @@ def reconstruct(
         typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
     ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
-    detail: Annotated[str | None, chosen("span, kernel, photo or fine (the default).", of_setting("detail"))] = None,
-    surface: Annotated[str | None, chosen("head, bust or both (the default).", of_output("surface"))] = None,
+    detail: Annotated[
+        str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
+    ] = None,
+    surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
     formats: Formats = None,
     delight: Annotated[
         bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
@@ -148,7 +150,7 @@ def reconstruct(
     json_out: Json = False,
 ) -> None:
     """Reconstruct one capture without the service."""
-    from server.cli.reconstruct_local import reconstruct_locally
+    from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
     switches = {"obj": obj, "atlas": atlas, "delight": delight, "normal_map": normal_map}
@@ -164,7 +166,7 @@ def reconstruct(
         warn(f"{warning['code']}: {warning['message']}")
     names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
     made = [out / name for name in names if (out / name).is_file()]
-    answer(written, json_out, [str(path) for path in made])
+    answer(written, json_out, [*(str(path) for path in made), *flame_lines(written, out)])
 
 
 @app.command(epilog="Example: eigenhead check shots/anna.tar.gz --json")

@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from rig.errors import InputError
-from rig.formats.capture_folder import capture_root
-from rig.formats.outlines_json import read_outlines
+from rig.formats.captures.capture_folder import capture_root
+from rig.formats.captures.outlines_json import read_outlines
 from rig.progress import Progress
 from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels

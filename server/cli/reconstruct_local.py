@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.atomic_write import write_atomically
-from rig.formats.capture_folder import capture_root
-from rig.formats.shot_files import BESIDE_PICTURES, picture_folder
+from rig.formats.captures.capture_folder import capture_root
+from rig.formats.captures.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
 from server.cli.answers import CannotWrite, SpoilsCapture, prepare_file
 from server.processes import share_one_heap
@@ -70,6 +70,17 @@ def _reconstruct_folder(
             context, tell, folder=folder, out=out, kept=kept, model=model, chosen=chosen, preparation=report
         )  # fmt: skip
     durations.learn(chosen, progress.finish())
+
+
+def flame_lines(document: "ReportDocument", out: Path) -> list[str]:
+    """Returns what is printed of a FLAME model's fit: its file, and what the model leaves of the head."""
+    from rig.formats.meshes.flame_param import FILE
+
+    figures = (document["template"] or {}).get("flame")
+    if figures is None:
+        return []
+    median, most = figures["residual_median_mm"], figures["residual_p95_mm"]
+    return [f"{out / FILE}  FLAME comes as near as {median:.2f} mm (median), {most:.2f} (95 %)"]
 
 
 def check_apart(out: Path, capture: Path, option: str = "--out") -> None:

@@ -16,7 +16,7 @@ from pipeline.stages.alignment import align_to_views
 from pipeline.stages.views import Views
 from pipeline.view_checks.usable_views import without_moved_cameras
 from rig.errors import InputError
-from rig.formats.cameras_json import read_rig
+from rig.formats.cameras.cameras_json import read_rig
 from rig.geometry import RigidTransform, Similarity
 from rig.messages.message import compose
 from rig.progress import Progress, discard_progress

@@ -16,7 +16,10 @@ template_app = typer.Typer(
 
 @template_app.command("add", epilog="Example: eigenhead template add flame.obj --name flame --model default")
 def template_add(
-    file: Annotated[Path, typer.Argument(help="The mesh, an OBJ file of a human head.", exists=True, dir_okay=False)],
+    file: Annotated[
+        Path,
+        typer.Argument(help="An OBJ file of a human head, or a FLAME model (.pkl, .npz).", exists=True, dir_okay=False),
+    ],
     name: Annotated[str | None, typer.Option(help="What to call it; by default the file's name.")] = None,
     model: Annotated[str, typer.Option(help="The head model that carries it, a name or file.")] = "default",
     *,
@@ -36,7 +39,7 @@ def template_add(
 
     Its unit and axes are found, or told by landmarks. Look at the picture that is written beside it: skin must lie on
     skin. `reconstruct --template NAME` then writes heads in its vertex order, with its polygons and texture
-    coordinates. The file stays under its own licence."""
+    coordinates; of a FLAME model it writes the parameters, too. The file stays under its own licence."""
     from pipeline.templates.names import new_path
 
     path = new_path(name or file.stem)
@@ -48,7 +51,7 @@ def template_add(
     from pipeline.results.template_picture import template_picture
     from pipeline.templates.load import make_template
     from pipeline.templates.template_file import save_template
-    from rig.formats.images import write_image
+    from rig.formats.pictures.images import write_image
 
     marked = landmarks or landmark_file(file)
     points = read_landmarks(marked) if marked else None

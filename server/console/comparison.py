@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh
 from rig.messages.message import compose
 from server.errors import NotFound

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.geometry.raster import picture
 from rig.camera import Camera, Intrinsics
-from rig.formats.ply import read_head_ply
+from rig.formats.meshes.ply import read_head_ply
 from rig.geometry import look_at
 from rig.mesh import Mesh, vertex_normals
 from server.console.portrait import placed

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 
 from rig.errors import EigenheadError
-from rig.formats.images import write_image
-from rig.formats.ply import write_ply
+from rig.formats.meshes.ply import write_ply
+from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.messages.message import compose
 from server.console.first_view import first_view

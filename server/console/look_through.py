@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.results.report_types import Report
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras_file import find_rig_file, read_rig_file
+from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.geometry import RigidTransform
 from rig.image import ImageRgb
 from rig.messages.message import compose

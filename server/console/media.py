@@ -18,7 +18,7 @@ from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from nicegui import app as pages
 
 from rig.errors import EigenheadError, InputError
-from rig.formats.images import open_picture, read_image, write_image
+from rig.formats.pictures.images import open_picture, read_image, write_image
 from rig.messages.message import compose
 from server.console import comparison
 from server.console.found_faces import found_faces

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipeline.results.clay import clay
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 from server.console.comparison import ply_property

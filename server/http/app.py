@@ -17,7 +17,7 @@ from server.http.linger import DrainRequestBody
 from server.http.openapi import describe, operation_name
 from server.http.routes import batches, calibrations, captures, jobs, operations, rig, sessions, storage, uploads
 from server.metrics import Metrics
-from server.services.health import check_egl
+from server.services.health import check_egl, check_store
 from server.services.retention import sweep
 from server.services.service import Service, open_service
 from server.settings import ServiceSettings
@@ -26,6 +26,7 @@ from server.wire import problems
 
 LAG_EVERY_S = 0.02
 BATCHES_AGAIN_S = 5.0
+STORE_AGAIN_S = 10.0
 EXPOSED = ("Location", "ETag", "Upload-Offset", "Upload-Length", "Upload-Expires", "Tus-Resumable", "X-Request-Id")
 
 MODULES = (captures, calibrations, jobs, batches, sessions, uploads, rig, storage, operations)
@@ -43,7 +44,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
         app.state.service = service = await asyncio.to_thread(open_service, settings, metrics)
         tasks = [asyncio.create_task(_look_around(service))]
         tasks += [asyncio.create_task(_sweep_forever(service)), asyncio.create_task(_measure_lag(metrics))]
-        tasks += [asyncio.create_task(_serve_batches(service))]
+        tasks += [asyncio.create_task(_serve_batches(service)), asyncio.create_task(_watch_store(service))]
         try:
             yield
         finally:
@@ -118,6 +119,13 @@ class Watch:
 
 async def _look_around(service: Service) -> None:
     await service.threads.disk(check_egl, service)
+
+
+async def _watch_store(service: Service) -> None:
+    """Asks the store of results every ``STORE_AGAIN_S`` seconds whether it answers, where there is one."""
+    while service.jobs.results.elsewhere:
+        await service.threads.disk(check_store, service)
+        await asyncio.sleep(min(STORE_AGAIN_S, service.settings.sweep_s))
 
 
 async def _sweep_forever(service: Service) -> None:

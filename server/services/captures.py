@@ -17,7 +17,7 @@ from rig.acquisition.shot import Fault, ShotDocument, read_fault
 from rig.acquisition.verdict import ViewDocument, verdict_of, without_consequences
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.archive import ArchiveLimits
+from rig.formats.captures.archive import ArchiveLimits
 from rig.messages.message import compose
 from server.errors import Conflict, NotFound
 from server.services.erasure import Holdings, erase_captures, holdings

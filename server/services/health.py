@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from importlib.metadata import version
 
 import sqlalchemy as sa
+import structlog
 from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.settings import Settings, document_from_settings
-from rig.formats.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
+from rig.formats.cameras.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.messages.message import compose, verbatim
-from server.metrics import QueueFigures
+from server.errors import Refused
+from server.metrics import QueueFigures, StoreFigures
 from server.services.service import Check, Service
 from server.storage.database import alive_workers, slots_by_queue
 from server.storage.failure_counts import failure_counts
@@ -19,6 +21,10 @@ from server.storage.job_index import Queued
 from server.storage.records import JsonObject
 from server.tasks.child import WorkFailed
 from server.tasks.egl import try_egl
+
+STORE_UNKNOWN = Check(ok=True, detail=compose("not-examined"))
+
+log = structlog.get_logger()
 
 
 def readiness(service: Service) -> dict[str, Check]:
@@ -32,6 +38,7 @@ def readiness(service: Service) -> dict[str, Check]:
         "egl": _egl(service),
         "rig": _rig(service),
         "records": _records(service),
+        "store": _store(service),
         "results": service.known.get("results") or Check(ok=True, detail=compose("not-examined")),
     }
 
@@ -105,6 +112,36 @@ def _records(service: Service) -> Check:
     return Check(ok=True, detail=detail)
 
 
+def check_store(service: Service) -> None:
+    """Asks the store of results whether it answers, and keeps the finding for ``readiness``. Blocks while it is
+    silent. Jobs wait for a store that is away, so that this is no reason to send the service none."""
+    place = service.settings.results_store
+    if place is None:
+        return
+    try:
+        service.jobs.results.probe()
+    except Refused as error:
+        if service.known.get("store", STORE_UNKNOWN).detail.code == "store-answers":
+            log.warning("the store of results is away", reason=error.detail.text)
+        service.known["store"] = Check(ok=True, detail=error.detail)
+    else:
+        service.known["store"] = Check(ok=True, detail=compose("store-answers", place=place))
+
+
+def _store(service: Service) -> Check:
+    if service.settings.results_store is None:
+        return Check(ok=True, detail=compose("store-none"))
+    return service.known.get("store", STORE_UNKNOWN)
+
+
+def _store_figures(service: Service) -> StoreFigures | None:
+    tally = service.jobs.results.tally
+    if tally is None:
+        return None
+    answers = _store(service).detail.code == "store-answers"
+    return StoreFigures(answers, tally.operations(), tally.seconds())
+
+
 def exposition(service: Service) -> bytes:
     """Returns the current metrics in Prometheus' text format."""
     captures, damaged = len(service.store.ids("captures")), len(service.store.list_quarantined())
@@ -122,6 +159,7 @@ def exposition(service: Service) -> bytes:
         damaged=damaged,
         queues=queues,
         failures=failure_counts(service.engine) | {"worker-died": died},
+        store=_store_figures(service),
     )
 
 

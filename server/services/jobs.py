@@ -321,9 +321,10 @@ class Jobs:
 
     def _jobs(self, rows: Sequence[WorkflowStatus]) -> list[Job]:
         latest = self.events.latest([row.workflow_id for row in rows])
-        places = self.index.places() if any(STATES[row.status] == "queued" for row in rows) else {}
+        idle = {name: self.queue_notice(name) for name in {r.queue_name for r in rows if STATES[r.status] == "queued"}}
+        places = self.index.places() if idle else {}
         begun = self.deliveries.of([row.workflow_id for row in rows if STATES[row.status] == "succeeded"])
-        return [self._job(row, latest.get(row.workflow_id), places, begun) for row in rows]
+        return [self._job(row, latest.get(row.workflow_id), places, begun, idle) for row in rows]
 
     def _check_count(self, key: str) -> None:
         active = len(self.active(key=key))
@@ -331,11 +332,10 @@ class Jobs:
             detail = compose("too-many-jobs", count=active)
             raise TooMany("too-many-jobs", detail, retry_after_s=10)
 
-    def _notice(self, job_id: str, state: str, queue: str | None) -> Message | None:
-        """What keeps a queued job from beginning, or that the files of one that succeeded are gone."""
-        if state == "succeeded" and not self.results.elsewhere and not self._result(job_id).is_dir():
-            return compose("result-missing")
-        return self.queue_notice(queue) if state == "queued" else None
+    def _lost(self, job_id: str, state: str) -> Message | None:
+        """That the files of a job that succeeded are gone."""
+        lost = state == "succeeded" and not self.results.elsewhere and not self._result(job_id).is_dir()
+        return compose("result-missing") if lost else None
 
     def queue_notice(self, queue: str | None) -> Message | None:
         """Returns a message if no live worker serves a queue, so that its jobs cannot begin. Returns None if one
@@ -369,6 +369,7 @@ class Jobs:
         event: JobEvent | None,
         places: Mapping[str, int],
         begun: Mapping[str, Delivery],
+        idle: Mapping[str | None, Message | None],
     ) -> Job:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
@@ -382,7 +383,7 @@ class Jobs:
             progress=1.0 if state == "succeeded" else progress.get("progress", 0.0),
             eta_s=progress.get("eta_s"),
             error=failure(row) if state == "failed" else None,
-            notice=self._notice(row.workflow_id, state, row.queue_name),
+            notice=idle[row.queue_name] if state == "queued" else self._lost(row.workflow_id, state),
             capture_id=None if request is None else request["capture_id"],
             session=attributes.get("session"),
             model=None if request is None else request.get("model"),

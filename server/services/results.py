@@ -8,7 +8,7 @@ tables and sheets) stay. Without a store everything lies in the data folder, as 
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +18,17 @@ import structlog
 from rig.errors import Cancelled, EigenheadError
 from rig.messages.message import compose
 from server.errors import Conflict, Refused
+from server.services.unclaimed_results import DAY_S, collect
 from server.settings import ServiceSettings
 from server.storage.object_places import open_objects
 from server.storage.objects import ObjectMissing, StoreDenied, StoreUnavailable
 from server.storage.records import FileEntry
 from server.storage.store import Store, StoredFile
+from server.storage.watched_objects import StoreTally, WatchedObjects
 
 LARGE_BYTES = 1 << 20
+LINK_S = 300
+COLLECT_S = 6 * 3600.0
 UNUSED_S = 900.0  # a file that is being sent is not that old
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 
@@ -45,15 +49,33 @@ class Results:
     def __init__(self, store: Store, settings: ServiceSettings) -> None:
         place = settings.results_store
         self._store, self._spare = store, settings.free_bytes
-        self._objects = None if place is None else open_objects(place, settings)
+        self._objects = None if place is None else WatchedObjects(open_objects(place, settings))
+        self._collected = float("-inf")
 
     @property
     def elsewhere(self) -> bool:
         """Tells whether results lie in a store, whatever lies in the data folder."""
         return self._objects is not None
 
-    def keep(self, job_id: str, files: Mapping[str, FileEntry], wanted: Callable[[], bool]) -> None:
-        """Stores a result, and waits for a store that is away. Raises Cancelled once the job is not ``wanted``."""
+    @property
+    def tally(self) -> StoreTally | None:
+        """Returns what this process asked of the store; None without one."""
+        return None if self._objects is None else self._objects.tally
+
+    def probe(self) -> None:
+        """Asks the store for a list of nothing. Raises StoreUnavailable and StoreDenied."""
+        if self._objects is not None:
+            next(self._objects.entries("none/"), None)
+
+    def keep(
+        self,
+        job_id: str,
+        files: Mapping[str, FileEntry],
+        wanted: Callable[[], bool],
+        pause: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """Stores a result, and waits for a store that is away. Raises Cancelled once the job is not ``wanted``,
+        and what ``pause`` raises."""
         if self._objects is None:
             return
         pause_s = FIRST_PAUSE_S
@@ -66,7 +88,7 @@ class Results:
                     break
                 except (StoreUnavailable, StoreDenied) as error:  # the head is made: it waits for its operator, too
                     log.warning("a result waits for the store", reason=error.detail.text)
-                time.sleep(pause_s)
+                pause(pause_s)
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
     def file(self, job_id: str, name: str, entry: FileEntry) -> StoredFile:
@@ -80,6 +102,14 @@ class Results:
             if self._objects is not None:
                 self._fetch(job_id, name, entry, path)
         return StoredFile(path, entry["sha256"])
+
+    def link(self, job_id: str, name: str) -> str | None:
+        """Returns a signed address of a file of a result, for ``LINK_S`` seconds; None where the store has no such
+        addresses, or does not have the file yet. Raises Unavailable."""
+        if self._objects is None:
+            return None
+        with suppress(ObjectMissing):
+            return self._objects.link(f"{job_id}/{name}", Path(name).name, LINK_S)
 
     def folder(self, job_id: str, files: Mapping[str, FileEntry]) -> Path:
         """Returns the folder of a result with all its files. Raises what ``file`` raises."""
@@ -120,6 +150,17 @@ class Results:
             file.path.unlink(missing_ok=True)
             total, removed = total - file.bytes, removed + 1
         return removed
+
+    def collect(self, owner: str, known: Callable[[Collection[str]], set[str]], days: float | None) -> int:
+        """Removes results from the store that no job claims, as in ``unclaimed_results``, a few times a day. Returns of
+        how many jobs."""
+        if self._objects is None or days is None:
+            return 0
+        if time.monotonic() - self._collected < min(COLLECT_S, days * DAY_S):
+            return 0
+        self._collected = time.monotonic()
+        with self._store.incoming() as scratch:
+            return collect(self._objects, owner, known, days, scratch)
 
     def _path(self, job_id: str, name: str) -> Path:
         return self._store.folder("jobs", job_id) / "result" / name

@@ -17,6 +17,7 @@ from server.errors import NotFound
 from server.services.deliveries import UNDER_WAY
 from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
+from server.storage.database import database_identity
 from server.storage.job_index import JobQuery
 from server.storage.library import CaptureQuery
 from server.storage.store import folder_bytes, newest
@@ -47,6 +48,10 @@ def sweep(service: Service) -> dict[str, int]:
     gone["captures"] = _captures(service)
     gone["caches"] = _caches(service)
     gone["results"] = service.jobs.results.bound(service.settings.results_bytes, service.jobs.files)
+    unclaimed = service.settings.keep_unclaimed_days
+    gone["unclaimed"] = service.jobs.results.collect(
+        database_identity(service.engine), service.jobs.index.known, unclaimed
+    )
     gone["orphans"] = _orphans(service)
     gone["deliveries"] = _deliveries(service)
     _find_missing(service)

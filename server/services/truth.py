@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh, face_normals
 
 NEAREST = 8  # vertices whose triangles are looked at; on an even mesh the nearest point lies on a triangle of the first

@@ -5,13 +5,15 @@ agree on which worker is silent.
 """
 
 import os
+import secrets
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import event
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import IntegrityError, SQLAlchemyError
 
 from rig.errors import EigenheadError
 from server.settings import ServiceSettings
@@ -160,6 +162,13 @@ webhooks = sa.Table(
     sa.Column("created", sa.Float, nullable=False),
 )
 
+identities = sa.Table(  # one row: what a store of results knows the database by
+    "eigenhead_identity",
+    metadata,
+    sa.Column("row", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("name", sa.String(64), nullable=False),
+)
+
 
 def open_database(settings: ServiceSettings) -> sa.Engine:
     """Opens the service's database, creates missing tables and columns, and returns the engine. Raises
@@ -199,14 +208,26 @@ def _add_columns(engine: sa.Engine) -> None:
                 connection.execute(sa.text(f"ALTER TABLE {table.name} ADD COLUMN {name} TEXT"))
 
 
+def database_identity(engine: sa.Engine) -> str:
+    """Returns the name that a database gave to itself, the same to all who call."""
+    with suppress(IntegrityError), engine.begin() as connection:  # another process was first
+        if connection.scalar(sa.select(identities.c.name)) is None:
+            connection.execute(sa.insert(identities).values(row=1, name=secrets.token_hex(16)))
+    with engine.connect() as connection:
+        return connection.scalars(sa.select(identities.c.name)).one()
+
+
 def scrub(engine: sa.Engine) -> None:
     """Overwrites what deleted rows left in the database's files, names of people included. Pages that another
     connection is reading stay until the next call."""
-    with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-        if engine.dialect.name != "sqlite":
-            tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
+    if engine.dialect.name != "sqlite":
+        tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
+        with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.execute(sa.text(f"VACUUM {tables}"))
-            return
+        return
+    with (
+        engine.connect() as connection
+    ):  # the driver begins no transaction before a pragma; AUTOCOMMIT would outlast it
         for _ in range(SCRUB_TRIES):
             busy, _, _ = connection.execute(sa.text("PRAGMA wal_checkpoint(TRUNCATE)")).one()
             if not busy:

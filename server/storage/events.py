@@ -20,24 +20,32 @@ class JobEvent:
 
 
 class EventLog:
-    """Reads and writes the events of jobs. Within a job they are numbered from 1, also if another worker takes the job
-    over."""
+    """Reads and writes the events of jobs. Within a job their numbers grow, from 1, also if another worker takes the
+    job over. A number is missing where its event was superseded."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
-    def append(self, job_id: str, document: EventDocument) -> None:
-        """Adds an event to a job under the next number. If another writer takes that number first, it tries the next,
-        twenty times; after that the event is dropped."""
+    def append(self, job_id: str, document: EventDocument, instead_of: int | None = None) -> int | None:
+        """Adds an event to a job under the next number, which it returns. ``instead_of``: the number of an event that
+        the new one supersedes. If another writer takes the next number first, it tries again, twenty times; after that
+        the event is dropped and it returns None."""
+        event, text = events.c, json.dumps(document)
+        following = sa.select(sa.func.coalesce(sa.func.max(event.seq), 0) + 1).where(event.job_id == job_id)
+        row = {"job_id": job_id, "seq": following.scalar_subquery(), "document": text, "at": now_sql(self._engine)}
+        changes: list[sa.UpdateBase] = [sa.insert(events).values(**row).returning(event.seq)]
+        if instead_of is not None:
+            superseded = sa.and_(event.job_id == job_id, event.seq == instead_of)
+            changes.insert(0, sa.update(events).where(superseded).values(**row).returning(event.seq))
         for _ in range(20):  # a taken-over job has two writers for a moment
             try:
                 with self._engine.begin() as connection:
-                    last = connection.scalar(sa.select(sa.func.max(events.c.seq)).where(events.c.job_id == job_id)) or 0
-                    row = {"job_id": job_id, "seq": last + 1, "document": json.dumps(document)}
-                    connection.execute(sa.insert(events).values(**row, at=now_sql(connection)))
-                return
+                    for change in changes:
+                        if (seq := connection.scalar(change)) is not None:
+                            return seq
             except IntegrityError:
                 continue
+        return None
 
     def since(self, job_id: str, seq: int, limit: int = 1000) -> list[JobEvent]:
         """Returns the events of a job with numbers above ``seq``, in order, ``limit`` at most."""

@@ -162,6 +162,13 @@ class JobIndex:
                     found[row.capture_id].append(JobOfCapture(row.job_id, row.status))
         return found
 
+    def known(self, ids: Collection[str]) -> set[str]:
+        """Returns those of the ids that are jobs."""
+        status = self._status.c
+        query = sa.select(status.workflow_uuid).where(status.name == self._workflow, status.workflow_uuid.in_(ids))
+        with self._engine.connect() as connection:
+            return {*connection.scalars(query)}
+
     def ids_of(self, capture: str | None, session: str | None) -> list[str]:
         """Lists the ids of the jobs of a capture, of a session, or of both if both are not None."""
         with self._engine.connect() as connection:

@@ -53,10 +53,11 @@ def any_size(size: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class StoredObject:
-    """Holds the key of an object and its size."""
+    """Holds the key of an object, its size, and when it was written (s since 1970)."""
 
     key: str
     bytes: int
+    written: float
 
 
 class ObjectStore(Protocol):
@@ -77,6 +78,15 @@ class ObjectStore(Protocol):
 
     def entries(self, prefix: str) -> Iterator[StoredObject]:
         """Yields the objects whose keys begin with ``prefix``, which ends with a slash or is empty."""
+        ...
+
+    def folders(self) -> Iterator[str]:
+        """Yields the parts before the first slash of all keys that have one, each once."""
+        ...
+
+    def link(self, key: str, name: str, seconds: int) -> str | None:
+        """Returns an address at which whoever has it gets the object for so long, as a file of this name. None where
+        the store has no such addresses. Raises ObjectMissing."""
         ...
 
     def erase(self, prefix: str) -> int:
@@ -139,7 +149,18 @@ class FolderObjects:
         with self._asking(prefix) as folder:
             for path in sorted(folder.rglob("*")):
                 if path.is_file() and not path.is_symlink() and not path.name.endswith(".part"):
-                    yield StoredObject(path.relative_to(self._root).as_posix(), path.stat().st_size)
+                    yield StoredObject(
+                        path.relative_to(self._root).as_posix(), path.stat().st_size, path.stat().st_mtime
+                    )
+
+    def folders(self) -> Iterator[str]:
+        """Yields the names of folders, as in ``ObjectStore``."""
+        with self._asking("") as root:
+            yield from sorted(path.name for path in root.iterdir() if path.is_dir() and not path.is_symlink())
+
+    def link(self, key: str, name: str, seconds: int) -> str | None:
+        """Returns None: the service itself sends what lies in a folder."""
+        return None
 
     def erase(self, prefix: str) -> int:
         """Removes all objects below a key and returns how many, as in ``ObjectStore``."""

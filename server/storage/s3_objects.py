@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from rig.messages.message import compose
 from server.settings import ServiceSettings
@@ -55,6 +56,7 @@ def _client(endpoint: str | None, region: str | None, timeout_s: float) -> Any:
     config = Config(
         connect_timeout=min(CONNECT_S, timeout_s),
         read_timeout=timeout_s,
+        signature_version="s3v4",  # signed addresses take an older one by default, which newer stores refuse
         retries={"mode": "standard", "total_max_attempts": TRIES},
         s3={"addressing_style": "auto" if endpoint is None else "path"},
         request_checksum_calculation="when_required",  # each request brings its own SHA-256
@@ -102,7 +104,24 @@ class S3Objects:
             for page in pages.paginate(Bucket=self._bucket, Prefix=self._prefix + prefix):
                 for entry in page.get("Contents", ()):
                     if not entry["Key"].endswith("/"):  # what consoles make to show an empty folder
-                        yield StoredObject(entry["Key"].removeprefix(self._prefix), entry["Size"])
+                        yield StoredObject(
+                            entry["Key"].removeprefix(self._prefix), entry["Size"], entry["LastModified"].timestamp()
+                        )
+
+    def folders(self) -> Iterator[str]:
+        """Yields the first parts of keys, as in ``ObjectStore``."""
+        with self._asking(""):
+            pages = self._client.get_paginator("list_objects_v2")
+            for page in pages.paginate(Bucket=self._bucket, Prefix=self._prefix, Delimiter="/"):
+                for entry in page.get("CommonPrefixes", ()):
+                    yield entry["Prefix"].removeprefix(self._prefix).removesuffix("/")
+
+    def link(self, key: str, name: str, seconds: int) -> str | None:
+        """Returns a signed address of an object, as in ``ObjectStore``."""
+        with self._asking(key):
+            self._client.head_object(**self._at(key))
+            wanted = self._at(key) | {"ResponseContentDisposition": f"attachment; filename*=UTF-8''{quote(name)}"}
+            return self._client.generate_presigned_url("get_object", Params=wanted, ExpiresIn=seconds)
 
     def erase(self, prefix: str) -> int:
         """Removes all objects below a key and returns how many, as in ``ObjectStore``."""

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.capture_folder import capture_root
+from rig.formats.captures.archive import ArchiveLimits, extract_archive
+from rig.formats.captures.capture_folder import capture_root
 from rig.messages.message import compose, documents_of, texts_of
 from rig.progress import Progress
 from server.storage.records import CalibrationOutcome
@@ -73,7 +73,7 @@ def forget_scene(folder: Path) -> None:
 
 def check_scale(folder: Path) -> None:
     """Raises InputError for a scale.json that does not fit the photographs beside it. Does nothing without one."""
-    from rig.formats.scale_json import read_scale
+    from rig.formats.cameras.scale_json import read_scale
 
     if (folder / SCALE).is_file():
         read_scale(folder / SCALE, [path.name for path in (folder / "images").iterdir()])
@@ -126,7 +126,7 @@ def calibrate_folder(
     from calibration.calibrate import calibrate
     from calibration.report import write_report
     from calibration.result import CalibrationRefused, write_calibration
-    from rig.formats.cameras_json import read_rig
+    from rig.formats.cameras.cameras_json import read_rig
 
     known = None if previous is None else read_rig(Path(previous))
     try:
@@ -163,7 +163,7 @@ def _calibrate_scene(report: Progress, folder: Path, result: Path, front: str | 
     from calibration.scene.report import write_scene_report
     from calibration.scene.scene import calibrate_scene
     from calibration.scene.verdict import judge_scene
-    from rig.formats.cameras_json import write_rig
+    from rig.formats.cameras.cameras_json import write_rig
 
     scale = folder / SCALE
     try:

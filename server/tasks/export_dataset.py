@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.errors import InputError
-from rig.formats.dataset_json import DatasetFormat
-from rig.formats.fault_groups import say_once
-from rig.formats.ply import read_head_ply
+from rig.formats.cameras.dataset_json import DatasetFormat
+from rig.formats.meshes.flame_param import FILE, FlameParam, read_flame_param
+from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
+from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 
@@ -25,18 +26,20 @@ if TYPE_CHECKING:
     from pipeline.warnings import ReportWarning
 
 FOUND = "found"  # cameras and masks that the capture did not have, below the data set's folder
-DATASET_FILES = ("images", "masks", "fg_masks", "sparse_pc.ply", "points3d.ply")
+FLAME_FILES = ("flame_param", "canonical_flame_param.npz")
+DATASET_FILES = ("images", "masks", "fg_masks", "sparse_pc.ply", "points3d.ply", *FLAME_FILES)
 NOT_OF_CAMERAS = ("masks/", "background/", "features.json")  # inputs that may differ where cameras and pictures do not
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """Holds what a data set contains: its cameras, those left out, the number of points, and the warnings about the
-    capture."""
+    """Holds what a data set contains: its cameras, those left out, the number of points, whether there are FLAME
+    parameters, and the warnings about the capture."""
 
     cameras: tuple[str, ...]
     left_out: tuple[str, ...]
     points: int
+    flame: bool
     warnings: "tuple[ReportWarning, ...]"
 
 
@@ -55,10 +58,11 @@ def export_folder(
     from server.tasks.photographs import keep_masks, photographs_alone, read_or_calibrate
     from server.tasks.prepare import prepare_kernels
 
-    kept, front, head = out / FOUND, chosen.front, None
+    kept, front, head, flame = out / FOUND, chosen.front, None, None
     inputs: Mapping[str, str] = {}
     if result is not None:
         inputs, head = _read_result(result)
+        flame = _read_flame(result, form)
         if photographs_alone(folder):
             front = _take_over_found(result, kept) or front
     prepared = read_or_calibrate(folder, kept, front=front, report=report)
@@ -68,7 +72,7 @@ def export_folder(
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
     segmented = partial(keep_masks, kept, rig=rig, settings=chosen.segmentation, report=report)
     views = usable_views(capture, rig, segmented, exchanged=chosen.exchanged_pictures)
-    dataset = ViewDataset(views.capture, rig, views.silhouettes, head)
+    dataset = ViewDataset(views.capture, rig, views.silhouettes, head, flame)
     report("write", 0.0)
     for name in DATASET_FILES:
         _remove(out / name)
@@ -78,7 +82,7 @@ def export_folder(
     used = dataset.rig_used.names
     left_out = tuple(name for name in rig.names if name not in used)
     points = 0 if head is None else len(head.vertices)
-    return Exported(used, left_out, points, (*prepared.warnings, *views.warnings))
+    return Exported(used, left_out, points, flame is not None, (*prepared.warnings, *views.warnings))
 
 
 def _read_result(result: Path) -> tuple[Mapping[str, str], Mesh]:
@@ -88,6 +92,12 @@ def _read_result(result: Path) -> tuple[Mapping[str, str], Mesh]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(str(result), [compose("no-result-folder")]) from error
     return inputs, read_head_ply(result / "head.ply")[0]
+
+
+def _read_flame(result: Path, form: DatasetFormat) -> FlameParam | None:
+    """Returns the FLAME parameters of a result, for a data set whose program reads them. Raises InputError."""
+    path = result / FILE
+    return read_flame_param(path) if form == "gaussian-avatars" and path.is_file() else None
 
 
 def _take_over_found(result: Path, kept: Path) -> str | None:

@@ -12,9 +12,9 @@ from jaxtyping import Float
 
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras_file import NO_RIG, find_rig_file, read_rig_file
-from rig.formats.capture_folder import has_known_length
-from rig.formats.images import read_image
+from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_rig_file
+from rig.formats.captures.capture_folder import has_known_length
+from rig.formats.pictures.images import read_image
 from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.face_cache import FacesDocument, FoundFace, PixelsOfPoints

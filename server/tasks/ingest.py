@@ -22,10 +22,11 @@ from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.archive import ArchiveLimits, extract_archive
-from rig.formats.cameras_file import NO_RIG, find_rig_file, no_rig_fault, read_cameras, rig_file_parts
-from rig.formats.cameras_json import read_rig
-from rig.formats.capture_folder import (
+from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, no_rig_fault, read_cameras, rig_file_parts
+from rig.formats.cameras.cameras_json import read_rig
+from rig.formats.cameras.scale_json import read_scale
+from rig.formats.captures.archive import ArchiveLimits, extract_archive
+from rig.formats.captures.capture_folder import (
     SCALE,
     capture_root,
     check_folders,
@@ -34,13 +35,12 @@ from rig.formats.capture_folder import (
     read_shot,
     size_fault,
 )
-from rig.formats.fault_groups import say_once
-from rig.formats.features_json import FEATURES_FORMAT, features_from_bytes
-from rig.formats.images import IMAGE_SUFFIXES, picture_size
+from rig.formats.captures.features_json import FEATURES_FORMAT, features_from_bytes
+from rig.formats.captures.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
+from rig.formats.pictures.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.rig_toml import ShotConfig
-from rig.formats.scale_json import read_scale
-from rig.formats.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
 from rig.image import ImageRgb, plates_for
+from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
 from rig.plausibility import rig_faults
 from rig.progress import Progress

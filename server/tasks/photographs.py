@@ -21,24 +21,26 @@ from pipeline.settings import SegmentationSettings
 from pipeline.warnings import ReportWarning
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
-from rig.capture import Capture
+from rig.capture import Capture, ReadImage
 from rig.errors import InputError
-from rig.formats.cameras_file import find_rig_file, read_rig_file
-from rig.formats.cameras_json import CAMERAS_MOST, read_rig, write_rig
-from rig.formats.capture_folder import (
+from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
+from rig.formats.cameras.cameras_json import CAMERAS_MOST, read_rig, write_rig
+from rig.formats.cameras.scale_json import read_scale
+from rig.formats.cameras.unread_programs import unread_programs
+from rig.formats.captures.capture_folder import (
     SCALE,
     capture_root,
     has_known_length,
     read_capture,
+    read_rig_of,
     read_shot,
     unread_pictures,
 )
-from rig.formats.fault_groups import say_once
-from rig.formats.images import is_picture, picture_size, write_image
-from rig.formats.scale_json import read_scale
-from rig.formats.shot_files import find_files, picture_folder
-from rig.formats.unread_programs import unread_programs
-from rig.formats.work_size import WORK_PIXELS, work_rig
+from rig.formats.captures.full_size import full_size_reader
+from rig.formats.captures.shot_files import find_files, picture_folder
+from rig.formats.pictures.images import is_picture, picture_size, write_image
+from rig.formats.pictures.work_size import WORK_PIXELS, work_rig
+from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose, documents_of, read_message
 from rig.plausibility import rig_faults
 from rig.progress import Progress
@@ -106,6 +108,14 @@ def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) 
     if faults := rig_faults(scaled):
         raise InputError("capture", [f"{rig_file.name}, scaled by {SCALE}: {fault}" for fault in faults])
     return replace(capture, remarks=(*capture.remarks, *remarks)), scaled
+
+
+def full_size_pictures(folder: Path, kept: Path) -> ReadImage:
+    """Returns a function that reads a capture's pictures at the size of their files. Cameras that were estimated lie in
+    ``kept``."""
+    root = capture_root(folder)
+    read = read_rig_of(find_rig_file(root) or kept / CAMERAS)
+    return full_size_reader(root, read.rig, read.left_out)
 
 
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Progress) -> tuple[ReportWarning, ...]:

@@ -13,9 +13,10 @@ import structlog
 
 if TYPE_CHECKING:
     from server.storage.events import EventLog
+    from server.storage.records import EventDocument
 
 AGAIN = " again"
-EVERY_S = 0.25  # the shortest time between two progress events of one stage
+EVERY_S = 0.25  # the shortest time between two progress events of one stage, unless nobody looks so often
 OVERTIME = 0.1  # of a stage's expected time: what is left of one that has taken longer
 PACE_S = 2.0  # of work, before a machine's pace counts as much as the expectation
 FRACTION_LEAST = 0.05  # below it a stage's own fraction says little of its end
@@ -106,11 +107,13 @@ class JobProgress:
 
 class ProgressMeter:
     """Writes the progress and remaining time of a job to its events: when a stage begins, and then at most every
-    ``EVERY_S`` seconds."""
+    ``every_s`` seconds. What tells of a stage's beginning stays; anything else supersedes what was written before it,
+    so that the events of a long job are as few as those of a short one."""
 
-    def __init__(self, log: "EventLog", job_id: str, progress: JobProgress) -> None:
-        self._log, self._job_id, self._progress = log, job_id, progress
+    def __init__(self, log: "EventLog", job_id: str, progress: JobProgress, every_s: float = EVERY_S) -> None:
+        self._log, self._job_id, self._progress, self._every_s = log, job_id, progress, every_s
         self._last = ("", 0.0)
+        self._superseded: int | None = None
 
     def report(self, stage: str, fraction: float) -> None:
         """Records the progress of a stage (fraction 0 to 1), and writes an event if one is due."""
@@ -120,10 +123,13 @@ class ProgressMeter:
     def tick(self) -> None:
         """Writes an event if one is due. To be called often during stages that report no progress themselves."""
         stage, now = self._progress.stage, time.monotonic()
-        if not stage or (stage == self._last[0] and now - self._last[1] < EVERY_S):
+        if not stage or (stage == self._last[0] and now - self._last[1] < self._every_s):
             return
-        if stage != self._last[0]:
+        begins = stage != self._last[0]
+        if begins:
             log.info("stage", stage=stage)
         self._last = (stage, now)
         share, left_s = round(self._progress.progress(), 4), round(self._progress.remaining_s(), 1)
-        self._log.append(self._job_id, {"state": "running", "stage": stage, "progress": share, "eta_s": left_s})
+        event: EventDocument = {"state": "running", "stage": stage, "progress": share, "eta_s": left_s}
+        seq = self._log.append(self._job_id, event, self._superseded)
+        self._superseded = None if begins else seq

@@ -61,7 +61,7 @@ def reconstruct_capture(
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
     from server.tasks.matching_device import matching_device
-    from server.tasks.photographs import calibration_warnings, read_scaled_capture
+    from server.tasks.photographs import calibration_warnings, full_size_pictures, read_scaled_capture
     from server.tasks.prepare import prepare_kernels
 
     chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
@@ -79,7 +79,15 @@ def reconstruct_capture(
 
     done = reconstruct(
         ReconstructionContext(
-            shot, rig, head_model, chosen, renderer, tell, once, device=matching_device(context, chosen, renderer)
+            shot,
+            rig,
+            head_model,
+            chosen,
+            renderer,
+            tell,
+            once,
+            device=matching_device(context, chosen, renderer),
+            read_original=full_size_pictures(Path(capture), Path(capture)) if chosen.detail == "pores" else None,
         )
     )
     report("write", 0.0)

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rig.formats.archive import extract_archive
+from rig.formats.captures.archive import extract_archive
 from rig.progress import Progress
 from server.processes import end_with_parent, share_one_heap
 from server.tasks.child import WorkerContext
@@ -52,7 +52,7 @@ def reconstruct_folder(
     of the pipeline, and OSError for a full disk.
     """
     from pipeline.compute.trace import span
-    from server.tasks.photographs import keep_masks, read_or_calibrate
+    from server.tasks.photographs import full_size_pictures, keep_masks, read_or_calibrate
     from server.tasks.prepare import prepare_kernels
 
     with span("stage", "read"):
@@ -77,7 +77,15 @@ def reconstruct_folder(
         device = matching_device(context, chosen, renderer)
     segment = partial(keep_masks, kept)
     reconstruction = ReconstructionContext(
-        prepared.capture, prepared.rig, head_model, chosen, renderer, report, segment, device=device
+        prepared.capture,
+        prepared.rig,
+        head_model,
+        chosen,
+        renderer,
+        report,
+        segment,
+        device=device,
+        read_original=full_size_pictures(folder, kept) if chosen.detail == "pores" else None,
     )
     done = reconstruct(reconstruction)
     done = replace(done, warnings=(*prepared.warnings, *done.warnings))

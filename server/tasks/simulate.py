@@ -37,7 +37,7 @@ def simulated(context: WorkerContext, report: Progress, *, folder: str, seed: in
     Without a seed each shot shows another subject. The capture has no feature points, since operators pick them.
     """
     from pipeline.head_model.model import load_model
-    from rig.formats.capture_folder import write_capture
+    from rig.formats.captures.capture_folder import write_capture
     from rig.render.renderer import Renderer
     from rig.studio.devices.folder import write_truth
     from rig.studio.scene.layout import default_layout

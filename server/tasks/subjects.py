@@ -10,7 +10,7 @@ from pipeline.head_model.expressions import closed_lids, weights_from_text
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.model_building.correspondence.scans import landmark_file, read_landmarks
 from rig.errors import InputError
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh
 from rig.messages.message import compose
 from rig.render.renderer import Renderer

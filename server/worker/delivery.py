@@ -22,6 +22,7 @@ from server.storage.object_places import locate, open_objects
 from server.storage.objects import ObjectStore, StoreDenied, StoreUnavailable, sha256_of
 from server.storage.records import DeliveryRequest, FileEntry
 from server.storage.store import Store, StoredFile
+from server.worker.pauses import pause
 
 DELIVERIES_AT_ONCE = 4  # of one worker; they wait for the store, not for cores
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # between two tries where the store is away
@@ -66,7 +67,8 @@ class Deliverer:
 
     def deliver(self, wanted: DeliveryRequest) -> bool:
         """Delivers a job's result, and waits for a store that is away. Returns False where the job or its delivery was
-        removed meanwhile. Raises JobFailed where it cannot be delivered, and once ``until`` is over."""
+        removed meanwhile. Raises JobFailed where it cannot be delivered and once ``until`` is over, and
+        WorkerStopped."""
         pause_s = FIRST_PAUSE_S
         while True:
             try:
@@ -78,7 +80,7 @@ class Deliverer:
                 log.warning("delivery waits for the store", reason=error.detail.text)
             except Refused as error:
                 raise JobFailed(error.kind, error.detail, error.errors) from error
-            self._stop.wait(pause_s)
+            pause(self._stop, pause_s)
             pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
     def _try(self, wanted: DeliveryRequest) -> bool:
@@ -86,7 +88,7 @@ class Deliverer:
         prefix, key = locate(place_of(wanted), self._settings.deliver_prefixes)
         objects = open_objects(prefix, self._settings)
         while (row := DBOS.get_workflow_status(job_id)) is not None and row.status in ("PENDING", "ENQUEUED"):
-            time.sleep(self._settings.poll_s)  # the job is about to be noted as done
+            pause(self._stop, self._settings.poll_s)  # the job is about to be noted as done
         if row is None or row.status != "SUCCESS":
             return self._take_back(objects, key)
         files = cast(dict[str, FileEntry], row.output)

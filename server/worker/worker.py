@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from importlib.metadata import version
 
 import sqlalchemy as sa
@@ -54,12 +55,13 @@ from server.storage.records import (
 from server.storage.store import Store, move_durably
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkFailed, function_at
-from server.tasks.progress import JobProgress, ProgressMeter
+from server.tasks.progress import EVERY_S, JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
 from server.worker.engine import engine_config, take_over
 from server.worker.heartbeat import dead_workers
+from server.worker.pauses import pause
 from server.worker.result_files import described, warnings_of
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
@@ -203,7 +205,7 @@ class Worker:
             folder.mkdir(parents=True)
             chosen = settings_from_document(settings)
             progress = JobProgress(self._durations.of(chosen))
-            meter = ProgressMeter(self.events, job_id, progress)
+            meter = ProgressMeter(self.events, job_id, progress, max(EVERY_S, self.settings.poll_s))
 
             def cancelled() -> bool:
                 meter.tick()  # asked many times a second, also where a stage reports nothing
@@ -234,7 +236,7 @@ class Worker:
         folder = self.store.folder("calibrations", identity)
         in_use = self.settings.data / "rig" / "cameras.json"
         attempt = folder / f"attempt-{secrets.token_hex(6)}"
-        meter = ProgressMeter(self.events, identity, JobProgress(expected(folder)))
+        meter = ProgressMeter(self.events, identity, JobProgress(expected(folder)), max(EVERY_S, self.settings.poll_s))
 
         def tick() -> bool:
             meter.tick()
@@ -279,7 +281,7 @@ class Worker:
         for old in folder.glob("attempt-*"):
             shutil.rmtree(old, ignore_errors=True)
         files = described(target)
-        self.results.keep(job_id, files, lambda: self._states.runs(job_id))
+        self.results.keep(job_id, files, lambda: self._states.runs(job_id), partial(pause, self._stop))
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 

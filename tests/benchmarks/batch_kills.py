@@ -3,9 +3,10 @@
     python -m tests.benchmarks.batch_kills pinned [CAPTURES] [KILLS] [PROCESSES]   pinned work: 500 captures, 20 kills
     python -m tests.benchmarks.batch_kills real [CAPTURES] [KILLS] [PROCESSES]     heads of the studio, level span: 60
 
-All processes have the same share of one folder. ``results``: complete ones at the end; ``bytes_differ``: files that are
-not those of an undisturbed run (but for seconds); ``left_over``: files that an undisturbed run does not have;
-``begun_twice``: captures that two undisturbed processes side by side both began, of pinned work.
+All processes that are killed have the whole of one folder. ``results``: complete ones at the end; ``bytes_differ``:
+files that are not those of an undisturbed run (but for seconds); ``left_over``: files that an undisturbed run does not
+have; ``begun_twice``: captures that two undisturbed processes side by side both began, of pinned work, where both have
+the whole folder (``1/1``), and where each has its shard (``1/2``, ``2/2``).
 """
 
 import json
@@ -30,17 +31,17 @@ PINNED_S = "0.05"
 SEED = 37
 
 
-def command_of(kind: str, shots: Path, out: Path) -> list[str]:
+def command_of(kind: str, shots: Path, out: Path, shard: str) -> list[str]:
     if kind == "pinned":
-        return [sys.executable, "-m", "tests.support.pinned_batch", str(shots), str(out), "2"]
-    options = ["--out", str(out), "--detail", "span", "--surface", "head", "--workers", "2"]
+        return [sys.executable, "-m", "tests.support.pinned_batch", str(shots), str(out), "2", shard]
+    options = ["--out", str(out), "--detail", "span", "--surface", "head", "--workers", "2", "--shard", shard]
     return [sys.executable, "-m", "server.cli", "batch", str(shots), *options]
 
 
-def start(kind: str, shots: Path, out: Path, log: Path | None = None) -> "subprocess.Popen[bytes]":
+def start(kind: str, shots: Path, out: Path, log: Path | None = None, shard: str = "1/1") -> "subprocess.Popen[bytes]":
     environment = os.environ | {SECONDS: PINNED_S} | ({} if log is None else {LOG: str(log)})
     quiet = subprocess.DEVNULL
-    return subprocess.Popen(command_of(kind, shots, out), cwd=ROOT, env=environment, stdout=quiet, stderr=quiet)
+    return subprocess.Popen(command_of(kind, shots, out, shard), cwd=ROOT, env=environment, stdout=quiet, stderr=quiet)
 
 
 def finish(running: "list[subprocess.Popen[bytes]]") -> float:
@@ -64,10 +65,12 @@ def kill_often(kind: str, shots: Path, out: Path, *, kills: int, processes: int,
     finish(running)
 
 
-def begun_twice(shots: Path, folder: Path) -> int:
+def begun_twice(shots: Path, folder: Path, shards: tuple[str, str]) -> int:
+    """How many captures two processes both began, which between them have begun all."""
     log = folder / "log"
-    finish([start("pinned", shots, folder / "both" / "heads", log) for _ in range(2)])
+    finish([start("pinned", shots, folder / "heads", log, shard) for shard in shards])
     begun = Counter(line.split()[2] for line in log.read_text().splitlines() if " begins " in line)
+    assert begun.keys() == {path.name for path in shots.iterdir()}
     return sum(count > 1 for count in begun.values())
 
 
@@ -94,7 +97,16 @@ def figures_of(kind: str, captures: int, kills: int, processes: int, folder: Pat
         "left_over": len(found.keys() - wanted.keys()),
         "seconds_undisturbed": round(seconds, 1),
         "seconds_with_kills": round(killed_s, 1),
-    } | ({"begun_twice": begun_twice(shots, folder)} if kind == "pinned" else {})
+    } | ({"begun_twice": twice_of_all(shots, folder)} if kind == "pinned" else {})
+
+
+def twice_of_all(shots: Path, folder: Path) -> dict[str, int]:
+    found = {}
+    for shards in (("1/1", "1/1"), ("1/2", "2/2")):
+        both = folder / shards[0].replace("/", "-")
+        both.mkdir()
+        found[" and ".join(shards)] = begun_twice(shots, both, shards)
+    return found
 
 
 def main(kind: str, *numbers: str) -> None:

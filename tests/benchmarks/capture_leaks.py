@@ -25,7 +25,7 @@ from rig.acquisition.commands import capture_with
 from rig.acquisition.session import RigSession
 from rig.acquisition.shot import ShotFailed
 from rig.camera import Camera, Intrinsics
-from rig.formats.cameras_json import write_rig
+from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.rig_toml import read_rig_config
 from rig.geometry import RigidTransform
 from rig.rig import Rig

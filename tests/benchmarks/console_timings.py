@@ -29,7 +29,7 @@ import httpx
 import numpy as np
 from playwright.sync_api import Page
 
-from rig.formats.cameras_json import read_rig
+from rig.formats.cameras.cameras_json import read_rig
 from tests.support.browser import LONG_MS, Visit, chromium, visit
 from tests.support.services import RunningService, await_state, running_service
 

@@ -26,7 +26,7 @@ from pipeline.stages.depth import Depth, measure_depth
 from pipeline.stages.faces import find_faces
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.views import find_views
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.render.compute import ComputeDevice
 from rig.render.renderer import Renderer
 

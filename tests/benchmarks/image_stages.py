@@ -26,7 +26,7 @@ from pipeline.reconstruct import reconstruct
 from pipeline.results.write import write_result
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.render.renderer import Renderer
 
 

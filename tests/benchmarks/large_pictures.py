@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from pipeline.head_model.model import load_model
-from rig.formats.cameras_json import write_rig
-from rig.formats.images import write_image
+from rig.formats.cameras.cameras_json import write_rig
+from rig.formats.pictures.images import write_image
 from rig.image import ImageRgb
 from rig.render.renderer import Renderer
 from rig.rig import Rig

@@ -28,8 +28,8 @@ from pipeline.settings import PartSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.camera import Camera
 from rig.capture import Capture
-from rig.formats.capture_folder import read_capture
-from rig.formats.images import read_image
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.pictures.images import read_image
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

@@ -22,8 +22,8 @@ from pipeline.head_model.model import load_model
 from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
-from rig.formats.capture_folder import write_capture
-from rig.formats.images import read_image, write_image
+from rig.formats.captures.capture_folder import write_capture
+from rig.formats.pictures.images import read_image, write_image
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import rig_from_directions

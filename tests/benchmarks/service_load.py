@@ -22,7 +22,7 @@ from typing import Any
 
 import httpx
 
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from tests.server.worker.test_durability import pinned_worker
 from tests.support.postgres import running_postgres
 from tests.support.services import RunningService, await_state, running_service, small_capture

@@ -22,7 +22,7 @@ import numpy as np
 from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.render.renderer import Renderer
 from rig.studio.sensor.faults import fault_from_text
 from rig.studio.sensor.preset import PRESET

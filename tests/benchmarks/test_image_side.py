@@ -15,7 +15,7 @@ from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings, TextureSettings
 from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.mesh import Mesh
 from rig.rig import Rig
 from tests.support.shared_data import shared

@@ -17,8 +17,8 @@ from calibration.quality.checks import check_against_previous, failed
 from calibration.result import Calibration, CalibrationRefused, write_calibration
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras_file import read_rig_file
-from rig.formats.cameras_json import read_rig
+from rig.formats.cameras.cameras_file import read_rig_file
+from rig.formats.cameras.cameras_json import read_rig
 from rig.rig import Rig
 from tests.support.board_sessions import CHECKERBOARD, Session, session, visible
 from tests.support.shared_data import shared

@@ -18,8 +18,8 @@ import pytest
 
 from pipeline.geometry.raster import picture
 from rig.camera import Camera, Intrinsics
-from rig.formats.images import read_image
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.pictures.images import read_image
 from rig.geometry import look_at
 from rig.mesh import Mesh
 from tests.support.shared_data import shared

@@ -16,7 +16,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, expect
 
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from server.cli.client import Client
 from tests.support.services import ROOT, RunningService, free_port, running_service, small_capture
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.studio.scene.layout import default_layout
 from tests.support.served_studio import command, served_studio
 

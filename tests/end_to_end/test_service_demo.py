@@ -10,7 +10,7 @@ import jsonschema_rs
 import pytest
 
 from pipeline.settings import Settings
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from server.cli.client import Client
 from server.services.truth import error_mm
 from server.tasks.stage_durations import StageDurations

@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 
 from rig.atomic_write import write_atomically
-from rig.formats.glb import write_glb
-from rig.formats.ply import write_ply
+from rig.formats.meshes.glb import write_glb
+from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from rig.progress import Progress
 from server.tasks.child import WorkerContext

@@ -41,6 +41,17 @@ def avatar_pixel(frame: dict[str, Any], point_m: np.ndarray) -> np.ndarray:
     return np.array([focal * x / z + 0.5 * frame["w"], focal * y / z + 0.5 * frame["h"]]) - 0.5
 
 
+def moments_of(folder: Path) -> dict[int, dict[str, np.ndarray]]:
+    """FLAME parameters by moment, of the frames that name some, as GaussianAvatars' loader takes them: the first frame
+    of a moment decides."""
+    moments: dict[int, dict[str, np.ndarray]] = {}
+    for frame in frames_of(folder, "transforms_train.json"):
+        if "flame_param_path" in frame and frame["timestep_index"] not in moments:
+            with np.load(folder / frame["flame_param_path"], allow_pickle=False) as file:
+                moments[frame["timestep_index"]] = dict(file)
+    return moments
+
+
 def read_png(path: Path) -> np.ndarray:
     """Grey levels or RGB."""
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)

@@ -8,7 +8,7 @@ import numpy as np
 
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture, ImageRgb
-from rig.formats.capture_folder import write_capture
+from rig.formats.captures.capture_folder import write_capture
 from rig.geometry import Similarity, look_at, rotation_from_vector
 from rig.rig import Rig
 from tests.support.drawn_faces import WALL, photographed_face

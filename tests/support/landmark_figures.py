@@ -25,9 +25,9 @@ from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import find_subject
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.multiview.triangulation import triangulate_many
-from rig.formats.cameras_json import read_rig
-from rig.formats.capture_folder import read_capture
-from rig.formats.mesh_file import read_mesh
+from rig.formats.cameras.cameras_json import read_rig
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.geometry import rigid_fit, vector_from_rotation
 from rig.rig import Rig
 

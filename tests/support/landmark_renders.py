@@ -19,7 +19,7 @@ from pipeline.head_model.expressions import closed_lids
 from pipeline.head_model.model import HeadModel
 from pipeline.research.people.expressions import drawn_weights
 from rig.capture import ImageRgb
-from rig.formats.cameras_json import document_from_rig, rig_from_document
+from rig.formats.cameras.cameras_json import document_from_rig, rig_from_document
 from rig.geometry import Similarity, rigid_fit, rotation_from_vector
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer

@@ -14,7 +14,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import Settings
 from pipeline.stages.alignment import Alignment
-from pipeline.stages.bust import Bust
+from pipeline.stages.bust import Bust, HairyHead
 from pipeline.stages.evidence import Evidence
 from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
@@ -52,6 +52,7 @@ def made_up_result(
     settings: Settings | None = None,
     atlas: Atlas | None = None,
     bust: Bust | None = None,
+    hair: HairyHead | None = None,
     warnings: tuple[ReportWarning, ...] = (),
     seconds: Mapping[str, float] | None = None,
 ) -> Reconstruction:
@@ -77,6 +78,7 @@ def made_up_result(
         RefinedHead(mesh_world, deviation_mm, detail),
         Texturing(mesh_world.normals(), {}, capture, Texture(colours, views), atlas),
         bust,
+        hair,
         PoseEvidence("silhouettes", {}, None, False),
         evidence,
         warnings,

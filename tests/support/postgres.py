@@ -23,8 +23,9 @@ def programs() -> Path:
 
 
 @contextmanager
-def running_postgres() -> Iterator[str]:
-    """The URL of an empty database, in a folder that the server's own user may enter (pytest's are closed to it)."""
+def running_postgres(more: str = "") -> Iterator[str]:
+    """The URL of an empty database, in a folder that the server's own user may enter (pytest's are closed to it).
+    ``more``: further options of the server."""
     binaries, port = programs(), free_port()
     as_user: list[str] = []
     with tempfile.TemporaryDirectory(prefix="eigenhead-postgres-", ignore_cleanup_errors=True) as name:
@@ -40,7 +41,7 @@ def running_postgres() -> Iterator[str]:
             assert done.returncode == 0, done.stdout + done.stderr
 
         call("initdb", "-A", "trust", "-U", "eigenhead", "-E", "UTF8", "--no-sync")
-        options = f"-k {folder} -p {port} -c listen_addresses=127.0.0.1 -c fsync=off -c max_connections=100"
+        options = f"-k {folder} -p {port} -c listen_addresses=127.0.0.1 -c fsync=off -c max_connections=100 {more}"
         call("pg_ctl", "-w", "-l", str(folder / "log"), "-o", options, "start")
         try:
             yield f"postgresql://eigenhead@127.0.0.1:{port}/postgres"

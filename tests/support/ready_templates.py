@@ -6,7 +6,7 @@ import trimesh
 from pipeline.head_model.model import HeadModel
 from pipeline.templates.carrying import bind_vertices, surface_binding
 from pipeline.templates.template_file import Template
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
 
 EYE_CENTRE = np.array([31.0, 12.5, 62.0])

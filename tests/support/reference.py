@@ -31,11 +31,12 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 MADE = "<!-- Made of the program by `make reference`; changes belong there. -->\n"
 WIDTH = 100
 ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
-    "heads": ("Heads", ("reconstruct", "batch", "check", "export", "simulate", "demo", "verify", "experiments")),
+    "heads": ("Heads", ("reconstruct", "batch", "check", "export")),
+    "trials": ("Trials", ("simulate", "demo", "verify", "experiments")),
     "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
     "rig": ("The rig", ("rig",)),
     "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),
-    "models": ("Models and templates", ("model", "template")),
+    "models": ("Models and templates", ("model", "template", "wrap")),
 }
 OF_EVERY_COMMAND = {
     "CACHE": (

@@ -18,8 +18,8 @@ import numpy as np
 
 from rig.camera import Camera, Intrinsics
 from rig.capture import Capture
-from rig.formats.archive import pack_folder
-from rig.formats.capture_folder import write_capture
+from rig.formats.captures.archive import pack_folder
+from rig.formats.captures.capture_folder import write_capture
 from rig.geometry import RigidTransform
 from rig.rig import Rig
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.head_model.model import load_model
-from rig.formats.capture_folder import write_capture
-from rig.formats.work_size import work_rig
+from rig.formats.captures.capture_folder import write_capture
+from rig.formats.pictures.work_size import work_rig
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import simulate

@@ -17,7 +17,7 @@ from jaxtyping import Float, UInt8
 from calibration.scene.result import SceneCalibration
 from calibration.scene.scene import calibrate_scene
 from rig.camera import Camera, Intrinsics
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform, look_at
 from rig.rig import Rig
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.progress import Progress
 from server.tasks.child import WorkerContext
 from tests.support.pinned_work import picture_bytes, pinned_report
@@ -25,10 +25,12 @@ def work(
     model: str | None,
     settings: dict[str, Any],
 ) -> dict[str, Any]:
-    """Takes ``EIGENHEAD_TINY_S`` seconds and writes files that follow from the capture alone."""
+    """Takes ``EIGENHEAD_TINY_S`` seconds, or as many as ``front`` is. Its files follow from the capture alone."""
     shot, _ = read_capture(Path(capture))
     seconds = float(os.environ.get("EIGENHEAD_TINY_S", "0.2"))
     mode = settings.get("front") or ""
+    if mode[:1].isdigit():
+        seconds = max(float(mode), 1e-3)
     if mode in ("long", "deaf"):
         seconds = 120.0  # a slow machine needs 30 s to start a service again under it
     if mode == "fail":

@@ -7,7 +7,7 @@ the surface free to slide between them, so by default a refinement follows: the 
 heads (``prior``), given the scan's landmarks and surface, and from there a smooth displacement along the normals onto
 the scan."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -291,24 +291,39 @@ def refined(
     marks: Mapping[int, Float[np.ndarray, " 3"]] = MappingProxyType({}),
     mark_weight: float = 0.0,
 ) -> Float[np.ndarray, "V 3"]:
-    """Refines a warped reference onto a target by non-rigid closest points.
+    """Refines a warped reference onto a target by non-rigid closest points (``relaxed``). Matches are nearest by
+    position and normal together. ``marks`` are target positions of vertices (mm)."""
+    tree, fixed = _tree(target, search), np.array(list(marks), int)
 
-    Each step solves (W + k L^T L) u = W d for the displacements u from ``start``. L is the graph Laplacian, so that
-    nearly affine motions cost little; all three axes share the matrix. d moves a vertex along the normal towards its
-    match and leaves it in place in the tangent plane. Matches are nearest by position and normal together. ``marks``
-    are target positions of vertices (mm)."""
-    bending, tree = _bending(faces, start), _tree(target, search)
-    fixed = np.array(list(marks), int)
-    shape = start
-    for stiffness in stiffnesses:
+    def match(shape: Float[np.ndarray, "V 3"]) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, " V"]]:
         near, weight = _matched(shape, faces, target, tree, search)
         normals = target.normals[near]
-        wanted = shape - start + _dots(target.vertices[near] - shape, normals)[:, None] * normals
+        wanted = shape + _dots(target.vertices[near] - shape, normals)[:, None] * normals
         if marks:
-            wanted[fixed], weight[fixed] = np.array(list(marks.values())) - start[fixed], mark_weight
+            wanted[fixed], weight[fixed] = np.array(list(marks.values())), mark_weight
+        return wanted, weight
+
+    return relaxed(start, faces, match, stiffnesses)
+
+
+def relaxed(
+    start: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    match: Callable[[Float[np.ndarray, "V 3"]], tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, " V"]]],
+    stiffnesses: Sequence[float],
+) -> Float[np.ndarray, "V 3"]:
+    """Moves a mesh smoothly to where its vertices match: non-rigid closest points, a step for each stiffness.
+
+    Each step solves (W + k L^T L) u = W d for the displacements u from ``start``. L is the graph Laplacian, so that
+    nearly affine motions cost little; all three axes share the matrix. ``match`` returns the wanted position and the
+    weight of every vertex of a shape (mm). It should move a vertex along the normal of its match and leave it in place
+    in the tangent plane."""
+    bending, shape = _bending(faces, start), start
+    for stiffness in stiffnesses:
+        wanted, weight = match(shape)
         system = sparse.csc_array(sparse.diags_array(weight + 1e-4) + stiffness * bending)
         solver = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        shape = start + solver.solve(weight[:, None] * wanted)
+        shape = start + solver.solve(weight[:, None] * (wanted - start))
     return shape
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from pipeline.head_model.landmarks import NAMES
 from rig.errors import InputError
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh
 
 MESH_SUFFIXES = (".ply", ".obj", ".glb")

@@ -29,7 +29,7 @@ from pipeline.stages.context import ReconstructionContext
 from rig.camera import Camera
 from rig.capture import Capture, ImageRgb
 from rig.errors import EigenheadError
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh, boundary_edges
 from rig.progress import Progress

@@ -48,8 +48,8 @@ from pipeline.stages.views import find_views
 from pipeline.texturing.vertex_colours import texture
 from rig.camera import Camera
 from rig.capture import Capture
-from rig.formats.capture_folder import read_capture
-from rig.formats.mesh_file import read_mesh
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh
 from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer

@@ -20,7 +20,7 @@ from pipeline.model_building.correspondence.surface_fit import SurfaceFit, fit_s
 from pipeline.model_building.training.model_metrics import of_draws
 from pipeline.research.outcome import Outcome
 from rig.errors import InputError
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.geometry import rigid_fit
 from rig.progress import Progress
 

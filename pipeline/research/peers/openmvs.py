@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from pipeline.stereo.depth_map import DepthMap
 from rig.camera import Camera
 from rig.errors import EigenheadError, InputError
-from rig.formats.images import write_image
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 
 PROGRAMS = ("InterfaceCOLMAP", "DensifyPointCloud", "ReconstructMesh", "RefineMesh")

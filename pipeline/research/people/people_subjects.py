@@ -21,10 +21,10 @@ from pipeline.research.people.view_subsets import even_views, frontal_views, is_
 from pipeline.research.surface.visible_surface import read_visible
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.cameras_file import read_rig_file, rig_files
-from rig.formats.capture_folder import capture_root, read_capture
-from rig.formats.images import decode_image_file
-from rig.formats.mesh_file import read_mesh
+from rig.formats.cameras.cameras_file import read_rig_file, rig_files
+from rig.formats.captures.capture_folder import capture_root, read_capture
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.pictures.images import decode_image_file
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer

@@ -20,7 +20,7 @@ from pipeline.research.outcome import Outcome
 from pipeline.research.records import Records, Row, key_of
 from pipeline.research.speed.scaling import JobCommand, run_job
 from pipeline.research.subjects import random_subjects
-from rig.formats.capture_folder import write_capture
+from rig.formats.captures.capture_folder import write_capture
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from pipeline.head_model.decimation import decimate
 from pipeline.head_model.subdivision import edges_of
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 
 CM = 10.0
 

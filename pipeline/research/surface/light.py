@@ -39,7 +39,7 @@ from pipeline.texturing.layout.uv_unwrap import Layout
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.errors import EigenheadError
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer

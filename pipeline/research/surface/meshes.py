@@ -27,7 +27,7 @@ from pipeline.research.outcome import Outcome
 from pipeline.research.records import Records, Row, key_of
 from pipeline.settings import Settings
 from rig.errors import InputError
-from rig.formats.ply import read_head_ply
+from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import vertex_normals
 from rig.progress import Progress
 

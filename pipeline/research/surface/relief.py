@@ -31,7 +31,7 @@ from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.capture import Capture
 from rig.errors import EigenheadError
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from rig.progress import Progress

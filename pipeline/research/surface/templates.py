@@ -24,7 +24,7 @@ from pipeline.research.records import Records, key_of
 from pipeline.templates import carrying, likeness, placement, registration
 from pipeline.templates.carrying import bind_vertices
 from pipeline.templates.registration import Registration, register
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
 from rig.progress import Progress
 

@@ -34,7 +34,7 @@ from pipeline.results.clay import clay
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer

@@ -2,11 +2,13 @@
 
 TEMPLATES = {
     "no-bust": "{reason}",
+    "hair-beyond-head": "the head's vertices reach {share:.0%} of the hair to 2 mm; the rest hangs or stands beyond them: bust.ply shows it whole",
     "features": "{remark}",
     "view": "{remark}",
     "view-left-out": "{remark}",
     "mask-doubtful": "{camera}: {remark}",
     "no-texture-layout": "{reason}",
+    "no-pores": "there are no maps of the pores: they need a texture, and the pictures' files",
     "view-unused": "{remark}; the view is left out",
     "eyes-closed": "{eyes} closed: no white and no iris in the photographs, or lids that meet",
     "both-eyes-are": "both eyes are",

@@ -71,6 +71,8 @@ TEMPLATES = {
     "rig-described": "{kind:word}, {count} cameras",
     "records-damaged": "{count} damaged records lie in set-aside: {names}",
     "no-record-damaged": "none damaged",
+    "store-answers": "{place} answers",
+    "store-none": "results lie in the data folder",
     "results-missing": "{count} jobs have no result folder any more: {jobs}",
     "results-complete": "all there",
     "capture-in-use": "Jobs that are queued or running need this capture; cancel them first.",

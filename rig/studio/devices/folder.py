@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from rig.atomic_write import write_atomically
-from rig.formats.cameras_json import write_rig
-from rig.formats.capture_folder import write_capture
-from rig.formats.images import write_image
-from rig.formats.ply import write_ply
+from rig.formats.cameras.cameras_json import write_rig
+from rig.formats.captures.capture_folder import write_capture
+from rig.formats.meshes.ply import write_ply
+from rig.formats.pictures.images import write_image
 from rig.studio.scene.simulate import SimulatedCapture
 from rig.studio.sensor.realism import REALISM, made_real
 

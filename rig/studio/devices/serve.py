@@ -20,7 +20,7 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.cameras_json import write_rig
+from rig.formats.cameras.cameras_json import write_rig
 from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.studio.devices.sources import ImageSource, SceneImages

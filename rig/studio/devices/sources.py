@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.image import ImageRgb
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout

@@ -126,7 +126,7 @@ def build_scene(
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
     dressed = dress(renderer, subject, look, pose, clothes=preset.clothes, rng=dress_rng, lamps=lamps)
     true_rig = Rig(tuple(_knocked(camera, faults, set_rng) for camera in rig))
-    light = renderer.photograph(true_rig, (*dressed.worn, dressed.head), dressed.gallery, samples=preset.samples)
+    light = renderer.photograph(true_rig, (*dressed.worn, dressed.skin), dressed.gallery, samples=preset.samples)
     if preset.rolling_ms > 0:
         light = _rolling(true_rig, light, pose.translation, preset, rng.spawn(1)[0])
     head = dressed.head

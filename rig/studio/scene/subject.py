@@ -18,6 +18,7 @@ from rig.studio.scene.headwear import cap, glasses
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
 from rig.studio.scene.long_hair import hang, knot
 from rig.studio.scene.scattering import scattered
+from rig.studio.scene.skin_relief import SkinRelief, relieved
 from rig.studio.scene.skin_texture import oily_zones, skin_paint
 from rig.studio.sensor.noise import volume
 
@@ -56,13 +57,14 @@ NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
     """Holds a head (head frame, mm). Without landmarks, its skin has neither brows nor lips. ``closed`` says how far
-    the lids of each side are closed, 0 to 1."""
+    the lids of each side are closed, 0 to 1. ``relief`` is what its skin shows close up and its mesh does not."""
 
     mesh: Mesh
     landmarks: Landmarks = field(default_factory=dict)
     face_region: Bool[np.ndarray, " v"] | None = None
     name: str = "subject"
     closed: Mapping[str, float] = field(default_factory=dict)  # eyes by side, 0 open to 1
+    relief: SkinRelief | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,10 +105,11 @@ class Dressed:
     of the rest.
 
     ``solid`` are vertices and triangles of everything but strands of hair, which decide what hides what. ``surfaces``
-    are the same by name: head, hair, clothes.
+    are the same by name: head, hair, clothes. ``skin`` is the head as cameras see it, with its relief.
     """
 
     head: Part
+    skin: Part
     worn: tuple[Part, ...]
     gallery: Gallery
     solid: tuple[Float[np.ndarray, "v 3"], np.ndarray]
@@ -163,13 +166,19 @@ def dress(
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
     normals = [vertex_normals(*piece) for piece in placed]
     solid = _joined(placed)
-    light = irradiance(renderer, [(v, n) for (v, _), n in zip(placed, normals, strict=True)], solid, lamps)
+    close_up = None if subject.relief is None else _relieved(pieces[0], head, subject.relief, world_from_head)
+    lit = [(v, n) for (v, _), n in zip(placed, normals, strict=True)]
+    lit += [] if close_up is None else [(close_up.vertices, close_up.normals)]
+    light = irradiance(renderer, lit, solid, lamps)
     if max(look.scattering_mm) > 0.0:
         light[0] = scattered(*placed[0], light[0], look.scattering_mm)
+        if close_up is not None:
+            light[-1] = scattered(close_up.vertices, close_up.faces, light[-1], look.scattering_mm)
     parts = [
         Part(vertices, faces, normal, piece.places, piece.paint, lit, piece.grain, piece.one_sided, piece.oil)
-        for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light, strict=True)
+        for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light[: len(pieces)], strict=True)
     ]
+    skin = parts[0] if close_up is None else replace(close_up, irradiance=light[-1])
     strands = [
         _strand_part(hair, part, world_from_head, strand_rng)
         for (hair, _), part in zip(hairs, parts[1:], strict=False)
@@ -183,7 +192,7 @@ def dress(
         name: Mesh(*_joined([mesh for mesh, one in zip(placed, shown, strict=True) if one == name]))
         for name in dict.fromkeys(("head", *shown))
     }
-    return Dressed(parts[0], tuple(parts[1:] + strands), gallery, solid, surfaces)
+    return Dressed(parts[0], skin, tuple(parts[1:] + strands), gallery, solid, surfaces)
 
 
 def _skin(subject: Subject, body: Anatomy, look: Look, one_sided: bool, rng: np.random.Generator) -> Piece:
@@ -197,6 +206,23 @@ def _skin(subject: Subject, body: Anatomy, look: Look, one_sided: bool, rng: np.
     grain = replace(SKIN, freckles=look.pores * look.freckles)
     oil = look.oil * oily_zones(head.vertices, body) if look.oil > 0.0 else None
     return Piece("head", head.vertices, head.faces, head.vertices, paint, grain, one_sided, oil)
+
+
+def _relieved(piece: Piece, head: Mesh, relief: SkinRelief, world_from_head: Similarity) -> Part:
+    """The skin with its relief in the world frame, not lit yet."""
+    oil = np.zeros((len(piece.vertices), 1)) if piece.oil is None else piece.oil[:, None]
+    fine = relieved(head, relief, {"paint": piece.paint, "oil": oil})
+    return Part(
+        world_from_head.apply(fine.vertices),
+        fine.faces,
+        fine.normals @ world_from_head.rotation.T,
+        fine.places,
+        fine.values["paint"],
+        np.zeros_like(fine.vertices),
+        piece.grain,
+        piece.one_sided,
+        None if piece.oil is None else fine.values["oil"][:, 0],
+    )
 
 
 def _hairs(

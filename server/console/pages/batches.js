@@ -64,7 +64,7 @@ export default spoken({
       <form v-if="form" class="panel pad line wrap" style="align-items: end; flex: none" aria-label="New batch" @submit.prevent="busy = 'begin'; $emit('act', { name: 'begin', ...form })">
         <label class="field grow">Captures whose label begins with<input ref="prefix" v-model="form.prefix" id="prefix" maxlength="500" required></label>
         <label class="field grow">Name<input v-model="form.label" maxlength="500"></label>
-        <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option value="span">span</option><option value="kernel">kernel</option><option value="photo">photo</option><option value="fine">fine</option></select></label>
+        <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option value="span">span</option><option value="kernel">kernel</option><option value="photo">photo</option><option value="fine">fine</option><option value="pores">pores</option></select></label>
         <button class="b main-action" :disabled="!!busy">Begin</button><button type="button" class="b quiet" @click="form = null">Cancel</button></form>
       <div class="columns" style="grid-template-columns: 24rem minmax(0, 1fr)">
         <div class="stack" style="min-height: 0">

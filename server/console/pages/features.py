@@ -15,7 +15,7 @@ from nicegui import ui
 from starlette.responses import RedirectResponse
 
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS
-from rig.formats.cameras_file import find_rig_file, read_rig_file
+from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.messages.message import Message, MessageDocument, compose
 from rig.rig import Rig
 from server.console.found_faces import found_faces

@@ -117,7 +117,7 @@ export default spoken({
               <div class="line wrap" style="align-items: end">
                 <label class="field">Method<select v-model="form.method"><option value="">as set</option><option value="contour">contour (fast)</option><option value="simplex">simplex (the paper's)</option></select></label>
                 <label v-if="state.models.length > 1" class="field">Model<select v-model="form.model"><option value="">as before</option><option v-for="m in state.models" :key="m">{{ m }}</option></select></label>
-                <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option value="span">span</option><option value="kernel">kernel</option><option value="photo">photo</option><option value="fine">fine</option></select></label>
+                <label class="field">Detail<select v-model="form.detail"><option value="">as deep as the images carry</option><option value="span">span</option><option value="kernel">kernel</option><option value="photo">photo</option><option value="fine">fine</option><option value="pores">pores</option></select></label>
                 <label class="field">Front camera<input v-model="form.front" placeholder="guessed" size="8"></label></div>
               <label class="field">Further settings, JSON<textarea v-model="form.more" rows="3" spellcheck="false"></textarea></label>
               <div class="line"><button class="b main-action" :disabled="!!busy">Queue the new job</button><button type="button" class="b quiet" @click="form = null">Keep it as it is</button></div>

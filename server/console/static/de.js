@@ -129,6 +129,7 @@ export default {
   "kernel": "Kernel",
   "photo": "Foto",
   "fine": "fein",
+  "pores": "Poren",
   "new": "neu",
   "head": "Kopf",
   "job": "Auftrag",

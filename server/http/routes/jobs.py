@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 import anyio
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
-from fastapi.responses import FileResponse, PlainTextResponse, StreamingResponse
+from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from server.http.auth import ServiceOf, require
@@ -174,6 +174,7 @@ RESULT: Responses = {
     200: {"content": FILES},
     206: {"description": "Partial Content", "content": FILES},
     304: {"description": "Not Modified"},
+    307: {"description": "Temporary Redirect"},
     **documented(404, 409, 416),
 }
 
@@ -198,9 +199,14 @@ def get_archive(service: ServiceOf, caller: Reader, request: Request, job_id: st
 
 @router.head("/jobs/{job_id}/result/{name:path}", include_in_schema=False)
 @router.get("/jobs/{job_id}/result/{name:path}", responses=RESULT, response_class=FileResponse)
-def get_result(service: ServiceOf, caller: Reader, request: Request, job_id: str, name: str) -> Response:
+def get_result(
+    service: ServiceOf, caller: Reader, request: Request, job_id: str, name: str, redirect: bool = False
+) -> Response:
     """Returns a file of the result: head.ply, head.glb, report.json, contact_sheet.png, overlays/<camera>.png and so
-    on. ``GET .../result`` lists them."""
+    on. ``GET .../result`` lists them. With ``redirect`` a result that an S3 store keeps is answered with 307 and a
+    signed address of the store, which holds for five minutes and takes no API key."""
+    if redirect and (address := service.result_address(job_id, name)) is not None:
+        return RedirectResponse(address, 307, {"Cache-Control": "no-store"})
     return send_file(request, service.jobs.result_file(job_id, name))
 
 

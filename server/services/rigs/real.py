@@ -15,9 +15,9 @@ from rig.acquisition.shot import ShotDocument, ShotFailed
 from rig.atomic_write import write_atomically
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
-from rig.formats.cameras_json import read_rig, write_rig
-from rig.formats.capture_folder import write_capture
-from rig.formats.images import write_image
+from rig.formats.cameras.cameras_json import read_rig, write_rig
+from rig.formats.captures.capture_folder import write_capture
+from rig.formats.pictures.images import write_image
 from rig.formats.rig_toml import RigConfig, adjusted, read_rig_config
 from rig.image import ImageRgb
 from rig.messages.message import compose, message_of

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rig.acquisition.plates import PlatesVersion
-from rig.formats.cameras_json import read_rig, write_rig
+from rig.formats.cameras.cameras_json import read_rig, write_rig
 from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig

@@ -8,7 +8,7 @@ import pytest
 from calibration.scene.matching import match_photographs
 from calibration.scene.photographs import find_photographs
 from rig.errors import InputError
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from tests.support.textured_wedge import photograph, wedge_rig
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from calibration.scene.photographs import find_masks, find_photographs
 from rig.errors import InputError
-from rig.formats.cameras_json import read_rig
-from rig.formats.images import write_image
+from rig.formats.cameras.cameras_json import read_rig
+from rig.formats.pictures.images import write_image
 from tests.support.services import small_capture
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from rig.formats.cameras_json import rig_from_document
+from rig.formats.cameras.cameras_json import rig_from_document
 from tests.support.textured_wedge import solved
 
 

@@ -8,7 +8,7 @@ from calibration.scene.rig_scale import scaled_by_length, times
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.scale_json import CameraDistance, PointDistance, TagSize
+from rig.formats.cameras.scale_json import CameraDistance, PointDistance, TagSize
 from rig.plausibility import rig_faults
 from rig.studio.scene.layout import default_layout
 

@@ -11,7 +11,7 @@ from calibration.scene.scale import ASSUMED, find_scale, find_tags, scale_from_h
 from calibration.scene.scene import transformed
 from calibration.scene.structure import Structure
 from rig.errors import InputError
-from rig.formats.scale_json import CameraDistance, PointDistance, TagSize
+from rig.formats.cameras.scale_json import CameraDistance, PointDistance, TagSize
 from tests.support.textured_wedge import TAG_MM, TAG_NUMBER, wedge_rig, write_photographs
 
 UNIT = 0.0125  # of the structure in mm: what must come back is its inverse

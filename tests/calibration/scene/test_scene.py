@@ -9,7 +9,7 @@ from calibration.adjustment.gauge import align_world
 from calibration.result import CalibrationRefused
 from calibration.scene.scene import calibrate_scene, judged
 from rig.errors import InputError
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from tests.support.textured_wedge import HEIGHT, WIDTH, solved, wedge_rig, write_photographs
 
 

@@ -8,7 +8,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from tests.support.browser import keep_screenshots, violations, visit
 from tests.support.services import RunningService, packed_capture, running_service, small_capture, uploaded_capture
 

@@ -8,7 +8,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from rig.formats.cameras_json import write_rig
+from rig.formats.cameras.cameras_json import write_rig
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.browser import keep_screenshots, live_rate, visit

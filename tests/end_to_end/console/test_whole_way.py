@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
 from tests.support.browser import LONG_MS, keep_screenshots, keep_widths, live_rate, visit
 from tests.support.services import RunningService, running_service
 
@@ -184,7 +184,7 @@ def pick_features(page: Page, studio: RunningService, screenshots: Path) -> None
 
 def landmark_pixels(studio: RunningService, capture: str, truth: dict) -> dict[str, dict[str, np.ndarray]]:
     from pipeline.head_model.landmarks import SEVEN_POINTS
-    from rig.formats.cameras_json import read_rig
+    from rig.formats.cameras.cameras_json import read_rig
 
     rig = read_rig(studio.data / "captures" / capture / "files" / "cameras.json")
     points = {name: np.array(truth["landmarks_world"][name]) for name in SEVEN_POINTS}

@@ -8,7 +8,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from tests.support.browser import LONG_MS, keep_screenshots, keep_widths, live_rate, visit
 from tests.support.services import RunningService, uploaded_capture
 from tests.support.shared_data import shared

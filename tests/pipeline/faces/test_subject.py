@@ -11,10 +11,10 @@ from pipeline.faces.networks import FaceNetworks, load_networks
 from pipeline.faces.subject import find_subject
 from rig.camera import Camera, Intrinsics
 from rig.capture import ImageRgb
-from rig.formats.cameras_file import read_rig_file
-from rig.formats.capture_folder import read_capture
-from rig.formats.images import read_image
-from rig.formats.mesh_file import read_mesh
+from rig.formats.cameras.cameras_file import read_rig_file
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.pictures.images import read_image
 from rig.geometry import RigidTransform, Similarity, look_at, rotation_from_vector
 from rig.rig import Rig
 from tests.support.drawn_faces import EYES_MM, photographed_face, relief_mm

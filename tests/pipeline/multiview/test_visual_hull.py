@@ -6,8 +6,8 @@ from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.multiview.visual_hull import NoHull, hull_extent, visual_hull
 from pipeline.segmentation.view_consistency import judge_agreement
 from pipeline.settings import SegmentationSettings
-from rig.formats.capture_folder import read_capture
-from rig.formats.images import read_image
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.pictures.images import read_image
 from rig.mesh import boundary_edges
 from rig.rig import Rig
 from tests.support.photographs import trace

@@ -12,10 +12,11 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.detail.depth_bias import points_on_face
 from pipeline.detail.surface_points import SurfacePoints
 from pipeline.head_model.model import load_model
+from pipeline.part_labels.codes import Part
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import BustSettings, OutputSettings, Settings, settings_from_document
-from pipeline.stages.bust import Bust, colour_bust, fuse_depth, shape_bust
+from pipeline.stages.bust import Bust, colour_bust, fuse_depth, push_out_hair, shape_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.refined_head import RefinedHead
@@ -25,6 +26,7 @@ from pipeline.warnings import Detail
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.errors import InputError
+from rig.formats.meshes.ply import read_head_ply
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import verbatim
@@ -126,6 +128,34 @@ def test_surface_says_which_are_written(
     write_result(tmp_path, made, photographed[1])
     assert {path.stem for path in tmp_path.glob("*.ply")} == files
     assert {path.stem for path in tmp_path.glob("*.glb")} == files
+
+
+def test_a_head_is_written_pushed_out_to_the_hair(
+    result: Reconstruction, photographed, renderer: Renderer, tmp_path: Path
+) -> None:
+    """The head is a ball of 57 mm, the bust one of 60 mm whose upper half is hair."""
+    bust, capture, _ = photographed
+    part = np.where(bust.mesh_world.vertices[:, 1] > 0.0, Part.HAIR, Part.SKIN).astype(np.uint8)
+    bust = replace(bust, surface=replace(bust.surface, part=part))
+    sphere = trimesh.creation.icosphere(4, 57.0)
+    head = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32))
+    refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", verbatim("planted")))
+    settings = replace(SETTINGS, outputs=OutputSettings(surface="hair"))
+    context = ReconstructionContext(capture, pinhole_fan(), load_model(), settings, renderer)
+    staged = push_out_hair(context, refined, bust)
+    assert staged.product is not None
+    assert list(staged.warnings) == []
+    assert push_out_hair(replace(context, settings=SETTINGS), refined, bust).product is None
+    made = made_up_result(head, result.head.fit, settings=settings, bust=bust, hair=staged.product)
+    write_result(tmp_path, made, capture)
+    assert {path.stem for path in tmp_path.glob("*.ply")} == {"head", "bust", "head_hair"}
+    written, height = read_head_ply(tmp_path / "head_hair.ply")
+    np.testing.assert_array_equal(written.faces, head.faces)
+    up = head.vertices[:, 1] > 15.0
+    assert np.median(np.linalg.norm(written.vertices[up], axis=1)) == pytest.approx(60.0, abs=0.5)
+    assert np.median(height[up]) == pytest.approx(3.0, abs=0.5)
+    section = json.loads((tmp_path / "report.json").read_text())["hair"]
+    assert section["covered_share"] > 0.95
 
 
 def test_spacing_has_bounds() -> None:

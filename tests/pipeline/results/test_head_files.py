@@ -27,7 +27,7 @@ from pipeline.texturing.layout.reduced_layout import reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.light import Light
 from rig.errors import InputError
-from rig.formats.ply import read_head_ply
+from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
 from tests.support.made_up_results import textured_result
 

@@ -15,7 +15,7 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
 from rig.capture import Capture
-from rig.formats.glb_document import opened_glb
+from rig.formats.meshes.glb_document import opened_glb
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from tests.support.made_up_results import made_up_result

@@ -18,8 +18,8 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
 from rig.capture import Capture
-from rig.formats.images import read_image
-from rig.formats.mesh_file import read_mesh
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.pictures.images import read_image
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import compose

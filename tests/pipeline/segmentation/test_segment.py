@@ -18,8 +18,8 @@ from pipeline.segmentation.segment import _without_specks, segment, segment_view
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.capture_folder import read_capture
-from rig.formats.images import read_image
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.pictures.images import read_image
 from rig.messages.message import texts_of
 from rig.rig import Rig
 from tests.support.composites import Scene, compose

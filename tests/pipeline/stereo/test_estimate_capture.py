@@ -10,7 +10,7 @@ from pipeline.settings import DenseSettings
 from pipeline.stereo.depth_map import DepthMap, points_world
 from pipeline.stereo.estimate import estimate_depth
 from rig.capture import Capture
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from tests.support.noisy_captures import noisier
 from tests.support.shared_data import shared
 

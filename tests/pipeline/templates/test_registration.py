@@ -17,7 +17,7 @@ from pipeline.templates.registration import (
     without_specks,
 )
 from rig.errors import InputError
-from rig.formats.polygon_obj import PolygonMesh
+from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.geometry import rotation_from_vector
 from rig.mesh import vertex_normals
 

@@ -19,7 +19,7 @@ from pipeline.templates.template_file import Template, read_template, save_templ
 from pipeline.texturing.layout.model_layout import model_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from rig.errors import InputError
-from rig.formats.polygon_obj import PolygonMesh, read_polygons
+from rig.formats.meshes.polygon_obj import PolygonMesh, read_polygons
 from rig.mesh import Mesh
 from tests.support.made_up_results import PLACE, textured_result
 

@@ -9,8 +9,8 @@ import pytest
 from pipeline.model_building.correspondence.scans import write_landmarks
 from pipeline.verification.reference import Reference, read_reference
 from rig.errors import InputError
-from rig.formats.obj import obj_bytes
-from rig.formats.ply import ply_bytes
+from rig.formats.meshes.obj import obj_bytes
+from rig.formats.meshes.ply import ply_bytes
 from rig.mesh import Mesh
 from tests.support.measured_heads import mannequin, marks
 

@@ -14,7 +14,7 @@ from pipeline.verification.pictures import draw, heat_colours, scale_end
 from pipeline.verification.reference import Reference
 from pipeline.verification.report import Occasion, report_document
 from pipeline.verification.write import write_verification
-from rig.formats.images import read_image
+from rig.formats.pictures.images import read_image
 from tests.support.measured_heads import mannequin, marks, measured_head
 
 OCCASION = Occasion("2026-01-31", ResultIdentity("tiny", "0" * 64), Limits(face_rms_mm=0.01))

@@ -100,7 +100,7 @@ def test_a_plate_without_texture_is_inconclusive() -> None:
 def test_own_and_foreign_backgrounds_of_rendered_captures(capture: str) -> None:
     """What the bounds of rig.acquisition.judgement were set by: renderings that share no code with the studio."""
     from rig.acquisition.judgement import FOUND_LEAST, FOUND_SURELY
-    from rig.formats.capture_folder import read_capture
+    from rig.formats.captures.capture_folder import read_capture
 
     shot, rig = read_capture(shared(f"data/captures/{capture}"))
     names = rig.names

@@ -19,9 +19,9 @@ from rig.camera import Camera, Intrinsics
 from rig.capture import Capture as CaptureValue
 from rig.drivers.base import Frame
 from rig.errors import InputError
-from rig.formats.cameras_json import write_rig
-from rig.formats.capture_folder import read_capture, write_capture
-from rig.formats.images import read_image
+from rig.formats.cameras.cameras_json import write_rig
+from rig.formats.captures.capture_folder import read_capture, write_capture
+from rig.formats.pictures.images import read_image
 from rig.formats.rig_toml import RigConfig, read_rig_config, rig_config_from_document
 from rig.geometry import RigidTransform
 from rig.rig import Rig

@@ -11,8 +11,8 @@ from rig.acquisition.commands import capture_with, check, take_plates
 from rig.acquisition.session import RigSession
 from rig.drivers.base import CameraNotFound, grab_frame
 from rig.drivers.registry import driver_for
-from rig.formats.capture_folder import read_capture
-from rig.formats.ply import write_ply
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.meshes.ply import write_ply
 from rig.formats.rig_toml import CameraConfig, read_rig_config
 from rig.geometry import Similarity
 from rig.mesh import Mesh

@@ -8,8 +8,8 @@ import pytest
 
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.capture_folder import read_capture
-from rig.formats.mesh_file import read_mesh
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from rig.rig import Rig

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rig.errors import InputError
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from rig.messages.message import texts_of
 from server.batch.captures import BatchCapture, find_captures, read_list
 from tests.support.services import small_capture

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from rig.formats.cameras_file import FOLDER_FORMATS, FORMATS, write_rig_file
-from rig.formats.cameras_json import read_rig, write_rig
+from rig.formats.cameras.cameras_file import FOLDER_FORMATS, FORMATS, write_rig_file
+from rig.formats.cameras.cameras_json import read_rig, write_rig
 from server.cli.answers import CannotWrite
 from server.cli.main import app
 from tests.server.cli.test_main import run

@@ -10,9 +10,9 @@ import pytest
 from pipeline.head_model.model import load_model
 from rig.capture import Capture, reassign_images
 from rig.errors import WrongVariable
-from rig.formats.archive import pack_folder
-from rig.formats.cameras_file import write_rig_file
-from rig.formats.capture_folder import write_capture
+from rig.formats.cameras.cameras_file import write_rig_file
+from rig.formats.captures.archive import pack_folder
+from rig.formats.captures.capture_folder import write_capture
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

@@ -13,15 +13,24 @@ import pytest
 from typer.testing import CliRunner
 
 from rig.capture import Capture
-from rig.formats.cameras_file import read_rig_file
-from rig.formats.capture_folder import read_capture, write_capture
-from rig.formats.images import write_image
-from rig.formats.ply import write_ply
+from rig.formats.cameras.cameras_file import read_rig_file
+from rig.formats.captures.capture_folder import read_capture, write_capture
+from rig.formats.meshes.ply import write_ply
+from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from server.cli.main import app
-from tests.support.dataset_readers import avatar_pixel, dot_centre, frames_of, nerfstudio_pixel, read_png, with_dots
+from tests.support.dataset_readers import (
+    avatar_pixel,
+    dot_centre,
+    frames_of,
+    moments_of,
+    nerfstudio_pixel,
+    read_png,
+    with_dots,
+)
+from tests.support.made_up_flame import flame_surface, made_up_flame, some_parameters
 from tests.support.scenes import ellipsoid
 from tests.support.small_studio import small_studio_captures
 from tests.support.textured_wedge import HEIGHT, WIDTH, wedge_rig, write_photographs
@@ -163,6 +172,34 @@ def test_a_results_head_becomes_the_point_cloud_in_the_same_frame(
     points = np.frombuffer(body, record)
     np.testing.assert_allclose(np.stack([points[axis] for axis in "xyz"], 1) * 1000.0, mesh.vertices, atol=1e-3)
     assert (np.stack([points[channel] for channel in "rgb"], 1) == colours).all()
+
+
+def test_flame_parameters_of_a_result_make_its_head_where_the_pictures_show_it(
+    shot: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    """Read as GaussianAvatars' loader does: a file of parameters a moment, named by frames, and a canonical one."""
+    capture, _ = read_capture(shot[0])
+    arrays, parameters, result = made_up_flame(), some_parameters(), tmp_path / "result"
+    offsets = np.random.default_rng(5).normal(0.0, 1e-3, arrays["v_template"].shape)
+    parameters |= {"static_offset": offsets[None]}
+    write_head(result, ellipsoid(2))
+    (result / "report.json").write_text(json.dumps({"inputs": dict(capture.digests)}))
+    single: dict[str, Any] = {name: array.astype(np.float32) for name, array in parameters.items()}
+    np.savez(result / "flame_param.npz", **single)
+    assert exported(shot[0], tmp_path / "out", "gaussian-avatars", "--result", str(result))["flame"]
+    moments = moments_of(tmp_path / "out")
+    assert list(moments) == [0]
+    np.testing.assert_allclose(flame_surface(arrays, moments[0]), flame_surface(arrays, parameters), atol=1e-5)
+    at_rest = {name: 0.0 * array for name, array in parameters.items()} | {"jaw_pose": np.array([[0.3, 0.0, 0.0]])}
+    at_rest |= {"shape": parameters["shape"], "static_offset": parameters["static_offset"]}
+    with np.load(tmp_path / "out/canonical_flame_param.npz", allow_pickle=False) as file:
+        np.testing.assert_allclose(flame_surface(arrays, dict(file)), flame_surface(arrays, at_rest), atol=1e-6)
+    exported(shot[0], tmp_path / "out", "gaussian-avatars", "--overwrite")
+    assert not (tmp_path / "out/canonical_flame_param.npz").exists()
+    assert not moments_of(tmp_path / "out")
+    (result / "flame_param.npz").write_bytes(b"no archive")
+    arguments = ["export", str(shot[0]), "--as", "gaussian-avatars", "--out", str(tmp_path / "bad"), "--result"]
+    assert "damaged" in str(CliRunner().invoke(app, [*arguments, str(result)]).exception)
 
 
 def test_a_result_of_another_capture_is_refused_by_its_files(shot: tuple[Path, np.ndarray], tmp_path: Path) -> None:

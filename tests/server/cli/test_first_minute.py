@@ -112,7 +112,7 @@ def test_it_names_its_version(run: Run) -> None:
     [
         ("eigenhead mod", ["model"]),
         ("eigenhead reconstruct shots/anna --det", ["--detail"]),
-        ("eigenhead reconstruct shots/anna --detail ", ["span", "kernel", "photo", "fine"]),
+        ("eigenhead reconstruct shots/anna --detail ", ["span", "kernel", "photo", "fine", "pores"]),
         ("eigenhead reconstruct shots/anna --surface b", ["bust", "both"]),
         ("eigenhead reconstruct shots/anna --model mak", ["makehuman-138"]),
         ("eigenhead convert cameras.json --to met", ["metashape"]),

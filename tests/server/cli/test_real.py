@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from rig.errors import InputError
-from rig.formats.cameras_json import read_rig
-from rig.formats.images import write_image
+from rig.formats.cameras.cameras_json import read_rig
+from rig.formats.pictures.images import write_image
 from server.cli.main import app
 from server.cli.real import judge_folders, read_real_capture
 from tests.support.services import small_capture
@@ -56,7 +56,7 @@ def test_wrong_usage_is_told_before_anything_is_loaded(tmp_path: Path) -> None:
     other = run(app, ["experiments", "views", str(folder)])
     assert other.exit_code == 2
     for option, value, takes in (
-        ("--only", "front-3", "only people and growth take it"),
+        ("--only", "front-3", "only people, growth, wrap and hair-shell take it"),
         ("--detail", "span", "only people takes it"),
     ):
         elsewhere = run(app, ["experiments", "views", option, value])

@@ -13,8 +13,8 @@ from calibration.silhouette_refinement.refine import Refinement, Residuals, TooF
 from calibration.silhouette_refinement.report import RefinementRun, refinement_page
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.cameras_json import read_rig
-from rig.formats.capture_folder import write_capture
+from rig.formats.cameras.cameras_json import read_rig
+from rig.formats.captures.capture_folder import write_capture
 from rig.messages.message import verbatim
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

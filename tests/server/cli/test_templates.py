@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from pipeline.head_model.model import load_model
 from rig.errors import EigenheadError, InputError
-from rig.formats.ply import read_head_ply
-from rig.formats.polygon_obj import read_polygons
+from rig.formats.meshes.ply import read_head_ply
+from rig.formats.meshes.polygon_obj import read_polygons
 from server.cli.main import app
 from tests.support.shared_data import shared
 from tests.support.template_headers import header_file

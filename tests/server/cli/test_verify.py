@@ -13,8 +13,8 @@ from pipeline.head_model.model import load_model
 from pipeline.model_building.correspondence.scans import write_landmarks
 from pipeline.verification.limits import Limits
 from rig.errors import InputError
-from rig.formats.obj import obj_bytes
-from rig.formats.ply import write_ply
+from rig.formats.meshes.obj import obj_bytes
+from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from server.cli.verify import read_limits, verify_captures

@@ -14,7 +14,7 @@ from starlette.types import Scope
 
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
-from rig.formats.ply import write_ply
+from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import compose, verbatim

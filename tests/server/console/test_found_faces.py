@@ -96,7 +96,7 @@ def endless(context: WorkerContext, report: Progress, *, capture: str, images: d
 
 def test_pictures_without_a_face_suggest_nothing(children: ChildProcessPool, tmp_path: Path) -> None:
     service, capture = service_with(children, tmp_path)
-    from rig.formats.images import write_image
+    from rig.formats.pictures.images import write_image
 
     names = drawn_studio().names
     blank = hidden_from(names, {name: np.zeros((LENS.height, LENS.width, 3), np.uint8) for name in names})

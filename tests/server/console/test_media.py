@@ -10,7 +10,7 @@ from fastapi.routing import APIRoute
 from nicegui import app as pages
 from PIL import Image
 
-from rig.formats.images import read_image, write_image
+from rig.formats.pictures.images import read_image, write_image
 from server.console import media
 from server.console.media import THUMBNAIL_WIDTH, make_thumbnail
 from server.errors import NotFound

@@ -18,7 +18,7 @@ from typing import Any
 import httpx
 import pytest
 
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from server.address import is_loopback
 from server.services.keys import KeylessAddress, Keys, check_address
 from server.settings import ServiceSettings

@@ -14,8 +14,8 @@ from typing import Any
 import httpx
 import pytest
 
-from rig.formats.archive import pack_folder
-from tests.rig.formats.test_archive import HOSTILE
+from rig.formats.captures.archive import pack_folder
+from tests.rig.formats.captures.test_archive import HOSTILE
 from tests.support.disks import small_disk
 from tests.support.services import RunningService, await_state, running_service, small_capture
 

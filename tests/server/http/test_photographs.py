@@ -8,7 +8,7 @@ import httpx
 import numpy as np
 import pytest
 
-from rig.formats.images import write_image
+from rig.formats.pictures.images import write_image
 from tests.support.services import await_state, packed, upload
 from tests.support.textured_wedge import HEIGHT, TAG_MM, WIDTH, wedge_rig, write_photographs
 

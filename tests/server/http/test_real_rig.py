@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rig.acquisition.commands import take_plates
-from rig.formats.cameras_json import write_rig
+from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.rig_toml import read_rig_config
 from rig.studio.devices.serve import DeviceFault, StudioDevices
 from server.console.live import RigSource

@@ -9,7 +9,7 @@ import httpx
 import numpy as np
 import pytest
 
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from tests.support.services import running_service
 from tests.support.shared_data import shared
 

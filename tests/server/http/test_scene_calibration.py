@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from calibration.adjustment.gauge import image_distance
-from rig.formats.cameras_json import rig_from_document
-from rig.formats.images import write_image
+from rig.formats.cameras.cameras_json import rig_from_document
+from rig.formats.pictures.images import write_image
 from tests.support.services import RunningService, packed, small_capture, upload
 from tests.support.textured_wedge import TAG_MM, wedge_rig, write_photographs
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from tests.support.services import RunningService, await_state, running_service, small_capture
 
 

@@ -12,8 +12,8 @@ from rig.acquisition.session import RigSession
 from rig.drivers.base import Driver
 from rig.drivers.registry import driver_for
 from rig.errors import InputError
-from rig.formats.cameras_json import read_rig, write_rig
-from rig.formats.capture_folder import read_capture
+from rig.formats.cameras.cameras_json import read_rig, write_rig
+from rig.formats.captures.capture_folder import read_capture
 from rig.formats.rig_toml import CameraConfig, read_rig_config
 from rig.messages.message import texts_of
 from rig.studio.devices.serve import DeviceFault, StudioDevices

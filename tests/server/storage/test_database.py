@@ -8,7 +8,7 @@ import sqlalchemy as sa
 from server.services.keys import Keys
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
-from server.storage.database import open_database
+from server.storage.database import capture_tags, open_database, scrub
 
 NOBODY = 65534
 
@@ -36,3 +36,16 @@ def test_tables_of_an_earlier_version_get_their_columns(tmp_path: Path) -> None:
     assert BatchIndex(again).add(row, ["c"])
     assert BatchIndex(again).get("b") == row
     again.dispose()
+
+
+def test_a_connection_that_scrubbed_begins_its_transactions_as_before(tmp_path: Path) -> None:
+    engine = open_database(ServiceSettings(data=tmp_path / "data"))
+    with engine.begin() as connection:
+        connection.execute(sa.insert(capture_tags).values(capture_id="a", folded="anna", name="Anna"))
+    scrub(engine)
+    wal = tmp_path / "data" / "eigenhead.sqlite-wal"
+    assert wal.stat().st_size == 0, "nothing of what was deleted is left there"
+    with engine.connect() as connection:
+        driver = connection.connection.dbapi_connection
+        assert getattr(driver, "isolation_level", None) == "IMMEDIATE"
+    engine.dispose()

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from server.errors import DiskFull, InvalidInput
@@ -17,7 +18,6 @@ from server.storage.objects import (
     ObjectMissing,
     ObjectStore,
     StoreDenied,
-    StoredObject,
     StoreUnavailable,
 )
 from server.wire.problems import problem_from
@@ -84,7 +84,30 @@ def test_what_was_put_is_listed_fetched_and_erased(store: ObjectStore, tmp_path:
         store.fetch("anna/head.ply", tmp_path / "other", "0" * 64)
     assert not any((tmp_path / name).exists() for name in ("large", "none", "other"))
     assert store.erase("anna/") == 2
-    assert [*store.entries("")] == [StoredObject("annabel/head.ply", 6)]
+    assert [(entry.key, entry.bytes) for entry in store.entries("")] == [("annabel/head.ply", 6)]
+
+
+def test_folders_and_ages_are_listed(store: ObjectStore, tmp_path: Path) -> None:
+    path, digest = made(tmp_path, b"a head")
+    for key in ("owner", "anna/head.ply", "anna/overlays/cam00.png", "bert/head.ply"):
+        store.put(key, path, digest)
+    assert [*store.folders()] == ["anna", "bert"]
+    assert all(abs(entry.written - time.time()) < 60 for entry in store.entries(""))
+
+
+def test_a_link_gives_the_object_to_whoever_has_it(s3: ObjectStore, tmp_path: Path) -> None:
+    path, digest = made(tmp_path, b"a head")
+    s3.put("anna/head.ply", path, digest)
+    link = s3.link("anna/head.ply", "head ä.ply", 60)
+    assert link is not None
+    answer = httpx.get(link)
+    assert (answer.status_code, answer.content) == (200, b"a head")
+    assert answer.headers["content-disposition"] == "attachment; filename*=UTF-8''head%20%C3%A4.ply"
+    assert httpx.get(link.replace("head.ply", "none.ply")).status_code == 403
+    with pytest.raises(ObjectMissing):
+        s3.link("anna/none.ply", "none.ply", 60)
+    (tmp_path / "nas").mkdir()
+    assert open_objects(f"file://{tmp_path}/nas/", ServiceSettings()).link("anna/head.ply", "head.ply", 60) is None
 
 
 def test_a_file_that_is_not_what_it_should_be_is_not_stored(store: ObjectStore, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.rig import Rig
 from server.storage.silhouette_cache import segment_once
 from tests.support.services import small_capture

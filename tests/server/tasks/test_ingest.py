@@ -11,12 +11,12 @@ import pytest
 from pipeline.faces.networks import DamagedNetwork
 from rig.capture import Capture
 from rig.errors import InputError
-from rig.formats.archive import ArchiveLimits, pack_folder
-from rig.formats.cameras_file import write_rig_file
-from rig.formats.cameras_json import read_rig
-from rig.formats.capture_folder import read_capture, write_capture
-from rig.formats.features_json import FEATURES_FORMAT
-from rig.formats.images import read_image, write_image
+from rig.formats.cameras.cameras_file import write_rig_file
+from rig.formats.cameras.cameras_json import read_rig
+from rig.formats.captures.archive import ArchiveLimits, pack_folder
+from rig.formats.captures.capture_folder import read_capture, write_capture
+from rig.formats.captures.features_json import FEATURES_FORMAT
+from rig.formats.pictures.images import read_image, write_image
 from rig.messages.message import texts_of
 from server.storage.records import CaptureContent
 from server.tasks import ingest

@@ -7,8 +7,8 @@ import pytest
 
 from calibration.adjustment.gauge import image_distance
 from rig.errors import InputError
-from rig.formats.cameras_json import write_rig
-from rig.formats.images import read_image, write_image
+from rig.formats.cameras.cameras_json import write_rig
+from rig.formats.pictures.images import read_image, write_image
 from server.tasks.photographs import photographs_alone, read_or_calibrate
 from tests.support.textured_wedge import wedge_rig, write_photographs
 

@@ -76,8 +76,9 @@ class Recorded:
     def __init__(self) -> None:
         self.documents: list[EventDocument] = []
 
-    def append(self, job_id: str, document: EventDocument) -> None:
+    def append(self, job_id: str, document: EventDocument, instead_of: int | None = None) -> int:
         self.documents.append(document)
+        return len(self.documents)
 
 
 def test_a_silent_stage_is_told_of_when_asked(monkeypatch) -> None:

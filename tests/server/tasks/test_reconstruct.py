@@ -11,8 +11,8 @@ from scipy.spatial import KDTree
 
 from pipeline.head_model.model import load_model
 from pipeline.view_checks.usable_views import TooFewViews
-from rig.formats.capture_folder import write_capture
-from rig.formats.mesh_file import read_mesh
+from rig.formats.captures.capture_folder import write_capture
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rig.errors import InputError
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from rig.render.renderer import Renderer
 from server.tasks.child import Child, WorkerContext
 from server.tasks.reconstruct_folder import folder_of, reconstruct_beside

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.model_building.correspondence.scans import write_landmarks
-from rig.formats.obj import obj_bytes
+from rig.formats.meshes.obj import obj_bytes
 from server.tasks.subjects import subject_of
 from tests.support.measured_heads import mannequin, marks, model
 

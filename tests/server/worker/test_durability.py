@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from psycopg.errors import LockNotAvailable
 from sqlalchemy.exc import OperationalError
 
-from rig.formats.archive import pack_folder
+from rig.formats.captures.archive import pack_folder
 from server.settings import ServiceSettings
 from tests.support.postgres import running_postgres
 from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture, worker_pids

@@ -4,13 +4,14 @@ erased is gone with every version; a store that is away holds jobs up and makes 
 import hashlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
+from server.storage.store import new_id
 from tests.support.object_server import KEYS, Network, client_of, network_before
 from tests.support.services import RunningService, await_state, running_service, uploaded_capture
 
@@ -42,6 +43,7 @@ def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         results_store="s3://results/of/",
         results_bytes="0",
         sweep_s="0.3",
+        keep_unclaimed_days="0.00001",
         store_endpoint=way.url,
         store_timeout_s="1",
     ) as service:
@@ -68,6 +70,13 @@ def submitted(client: httpx.Client, capture: str) -> str:
 def listed(bucket: Any, job: str) -> set[str]:
     found = bucket.list_objects_v2(Bucket="results", Prefix=f"of/{job}/").get("Contents", ())
     return {entry["Key"].removeprefix(f"of/{job}/") for entry in found}
+
+
+def until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 def age(folder: Path) -> None:
@@ -124,6 +133,49 @@ def test_a_job_waits_for_the_store_and_goes_on(client: httpx.Client, capture: st
         time.sleep(0.1)
 
 
+def test_a_result_is_fetched_from_the_store_itself(client: httpx.Client, bucket: Any, capture: str) -> None:
+    job = submitted(client, capture)
+    files = await_state(client, job, ("succeeded",))["files"]
+    answer = client.get(f"/v1/jobs/{job}/result/overlays/cam00.png", params={"redirect": True})
+    assert (answer.status_code, answer.headers["cache-control"]) == (307, "no-store")
+    data = httpx.get(answer.headers["location"]).content
+    assert hashlib.sha256(data).hexdigest() == files["overlays/cam00.png"]["sha256"]
+    bucket.delete_object(Bucket="results", Key=f"of/{job}/head.ply")
+    here = client.get(f"/v1/jobs/{job}/result/head.ply", params={"redirect": True})
+    assert (here.status_code, hashlib.sha256(here.content).hexdigest()) == (200, files["head.ply"]["sha256"])
+    assert client.get(f"/v1/jobs/{job}/result/none", params={"redirect": True}).status_code == 404
+
+
+def figures(client: httpx.Client) -> dict[str, float]:
+    lines = client.get("/metrics").text.splitlines()
+    return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines if line[0] != "#")}
+
+
+def test_metrics_and_readiness_say_whether_the_store_answers(client: httpx.Client, way: Network) -> None:
+    up, away = 'eigenhead_store_up{store="results"}', 'operation="list",outcome="unavailable"'
+    until(lambda: figures(client)[up] == 1.0)
+    assert client.get("/readyz").json()["checks"]["store"]["detail"] == "s3://results/of/ answers"
+    way.fail("503", 10_000)
+    until(lambda: figures(client)[up] == 0.0)
+    answer = client.get("/readyz")
+    assert "s3://results/of/none/" in answer.json()["checks"]["store"]["detail"]
+    assert answer.json()["checks"]["store"]["ok"], "captures and jobs are taken, and wait"
+    assert figures(client)[f"eigenhead_store_operations{{{away}}}"] >= 1
+    way.heal()
+    until(lambda: figures(client)[up] == 1.0)
+    assert figures(client)['eigenhead_store_seconds{operation="list"}'] > 0
+
+
+def test_what_no_job_claims_goes_and_what_one_claims_stays(client: httpx.Client, bucket: Any, capture: str) -> None:
+    job, stray = submitted(client, capture), new_id()
+    await_state(client, job, ("succeeded",))
+    for key in (f"of/{stray}/head.ply", f"of/{stray}/overlays/cam00.png", "of/somebody's own/head.ply"):
+        bucket.put_object(Bucket="results", Key=key, Body=b"a head")
+    until(lambda: not listed(bucket, stray))
+    assert listed(bucket, job) == NAMES
+    assert listed(bucket, "somebody's own") == {"head.ply"}
+
+
 def test_what_is_erased_is_gone_from_the_store_with_every_version(
     client: httpx.Client, capture: str, bucket: Any, service: RunningService, way: Network
 ) -> None:
@@ -136,7 +188,7 @@ def test_what_is_erased_is_gone_from_the_store_with_every_version(
     way.heal()
     assert client.delete(f"/v1/captures/{capture}", params={"erase": True}).status_code == 204
     left = bucket.list_object_versions(Bucket="results", Prefix="of/")
-    assert "Versions" not in left
+    assert {entry["Key"] for entry in left.get("Versions", ())} <= {"of/owner", "of/somebody's own/head.ply"}
     assert "DeleteMarkers" not in left
     assert client.get(f"/v1/jobs/{job}").status_code == 404
     assert not (service.data / "jobs" / job).exists()

@@ -3,6 +3,8 @@ SIGKILL may not do to them is driven in ``test_durability.py``."""
 
 import hashlib
 import json
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from rig.errors import Cancelled, InputError
 from server.services.failures import JobFailed
 from server.settings import ServiceSettings
 from server.storage.database import workers
-from server.storage.records import CaptureRecord, JobRequest
+from server.storage.records import CaptureRecord, DeliveryRequest, FileEntry, JobRequest
 from server.storage.store import Store, new_id
 from server.tasks.child import WorkFailed
 from server.worker.result_files import described, warnings_of
@@ -30,9 +32,10 @@ class Engine:
 
     def __init__(self) -> None:
         self.status: str | None = "PENDING"
+        self.output: dict[str, FileEntry] | None = None
 
     def get_workflow_status(self, job_id: str) -> Any:
-        return None if self.status is None else type("Row", (), {"status": self.status})
+        return None if self.status is None else type("Row", (), {"status": self.status, "output": self.output})
 
 
 @pytest.fixture
@@ -200,3 +203,44 @@ def test_a_result_is_described_by_size_and_content(tmp_path: Path) -> None:
         "overlays/cam00.png": {"bytes": 3, "sha256": hashlib.sha256(b"abc").hexdigest()},
         "report.json": {"bytes": 2, "sha256": hashlib.sha256(b"{}").hexdigest()},
     }
+
+
+@pytest.fixture
+def stopping(tmp_path: Path, engine: Engine) -> Iterator[Worker]:
+    """A worker whose stores are not mounted."""
+    away = f"file://{tmp_path}/away/"
+    stores: dict[str, Any] = {"results_store": away, "deliver_prefixes": (away,)}
+    worker = Worker(ServiceSettings(data=tmp_path / "data", poll_s=100.0, **stores))
+    yield worker
+    worker._children.close()
+    worker.engine.dispose()
+
+
+@pytest.mark.parametrize("waits_for", ["the job", "the place", "the results' store"])
+def test_a_worker_that_stops_ends_what_waits_and_fails_nothing(
+    stopping: Worker, engine: Engine, tmp_path: Path, waits_for: str
+) -> None:
+    if waits_for == "the place":
+        engine.status = "SUCCESS"
+        engine.output = {"head.ply": {"bytes": 1, "sha256": hashlib.sha256(b"x").hexdigest()}}
+    (result := stopping.store.folder("jobs", JOB) / "result").mkdir(parents=True)
+    (result / "head.ply").write_bytes(b"x")
+    wanted: DeliveryRequest = {"job_id": JOB, "to": f"file://{tmp_path}/away/", "until": time.time() + 3600}
+    ended = list[BaseException | None]()
+
+    def step() -> None:
+        try:
+            stopping.publish(JOB, "attempt-1") if waits_for == "the results' store" else stopping._deliverer.deliver(
+                wanted
+            )
+        except BaseException as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=step, daemon=True)
+    thread.start()
+    time.sleep(0.2)
+    assert not ended
+    stopping.stop()
+    thread.join(2.0)
+    assert not thread.is_alive()
+    assert not isinstance(ended[0], Exception), "the engine would note it as a failure"

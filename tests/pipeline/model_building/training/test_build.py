@@ -17,7 +17,7 @@ from pipeline.model_building.correspondence.scans import Scan, read_scan, write_
 from pipeline.model_building.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.model_building.training.build import build_model
 from rig.errors import InputError
-from rig.formats.obj import obj_bytes
+from rig.formats.meshes.obj import obj_bytes
 from rig.geometry import rigid_fit
 from rig.mesh import Mesh
 

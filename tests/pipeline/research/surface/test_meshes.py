@@ -8,7 +8,7 @@ import pytest
 from pipeline.head_model.model import load_model
 from pipeline.research.surface.meshes import meshes
 from rig.errors import InputError
-from rig.formats.ply import write_ply
+from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from rig.progress import discard_progress
 from tests.support.subdivided_spheres import subdivided_sphere

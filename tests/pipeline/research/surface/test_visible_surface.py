@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from pipeline.research.surface.visible_surface import read_visible, score_visible
-from rig.formats.mesh_file import read_mesh
-from rig.formats.ply import write_ply
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from rig.studio.scene.visible import PARTS, VisiblePoints
 from tests.support.shared_data import shared

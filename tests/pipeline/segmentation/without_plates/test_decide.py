@@ -7,7 +7,7 @@ from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
 from pipeline.view_checks.usable_views import view_warnings
 from rig.capture import Capture
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.render.renderer import Renderer
 from rig.studio.sensor.preset import PRESET
 from tests.pipeline.segmentation.test_segment import true_mask

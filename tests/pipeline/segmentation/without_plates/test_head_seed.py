@@ -7,7 +7,7 @@ from pipeline.segmentation.segment import segment
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, beside_head, head_core
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
-from rig.formats.capture_folder import read_capture
+from rig.formats.captures.capture_folder import read_capture
 from tests.pipeline.segmentation.test_segment import true_mask
 from tests.pipeline.segmentation.test_segment_studio import iou
 from tests.support.scenes import fan

@@ -1,0 +1,158 @@
+"""Reads and writes rigs in other programs' files.
+
+Read and written are COLMAP (text and binary), caliscope's ``camera_array.toml``, aniposelib's TOML, Metashape's XML,
+RealityCapture's XMP and CSV, nerfstudio's ``transforms.json`` and OpenCV's YAML; Blender's script is only written.
+Every reader turns its file into the ``eigenhead-cameras/1`` document and passes it to ``rig_from_document``, so that
+all formats meet the same checks. Each format's module says where its layout is described.
+
+Pixels: in this project and OpenCV the centre of the top-left pixel is (0, 0); in COLMAP, Metashape, RealityCapture and
+nerfstudio it is (0.5, 0.5). Lengths become millimetres: caliscope, Metashape and RealityCapture are in metres; COLMAP's
+scale is free and taken as millimetres; the unit of aniposelib, nerfstudio and OpenCV follows from the size of the
+rig."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from rig.errors import InputError
+from rig.formats.cameras.blender_script import write_blender
+from rig.formats.cameras.cameras_json import read_rig, write_rig
+from rig.formats.cameras.colmap import read_colmap, write_colmap
+from rig.formats.cameras.metashape import read_metashape, write_metashape
+from rig.formats.cameras.opencv_toml import looks_like_aniposelib, read_toml, write_aniposelib, write_caliscope
+from rig.formats.cameras.opencv_yaml import read_yaml, write_yaml
+from rig.formats.cameras.reading import CamerasRead
+from rig.formats.cameras.realitycapture import looks_like_csv, read_csv, read_xmp, write_csv, write_xmp
+from rig.formats.cameras.transforms_json import read_transforms, write_transforms
+from rig.formats.cameras.unread_keys import unread_keys
+from rig.formats.cameras.unread_programs import unread_programs
+from rig.formats.pictures.picture_names import is_junk
+from rig.messages.fault_groups import some_of
+from rig.messages.message import Message, compose
+from rig.rig import Rig
+
+WRITERS: dict[str, Callable[[Rig, Path], None]] = {
+    "eigenhead": write_rig,
+    "colmap": lambda rig, folder: write_colmap(rig, folder, binary=True),
+    "colmap-text": write_colmap,
+    "caliscope": write_caliscope,
+    "aniposelib": write_aniposelib,
+    "metashape": write_metashape,
+    "realitycapture": write_xmp,
+    "realitycapture-csv": write_csv,
+    "nerfstudio": write_transforms,
+    "opencv-yaml": write_yaml,
+    "blender": write_blender,
+}
+FORMATS = tuple(WRITERS)
+FOLDER_FORMATS = ("colmap", "colmap-text", "realitycapture", "opencv-yaml")  # formats of several files
+NO_RIG = compose("no-rig-file")
+COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
+ARCHIVE_ENDINGS = (".zip", ".tar", ".tgz", ".gz", ".xz", ".bz2", ".7z", ".rar")
+HEAD_BYTES = 1 << 16  # read to recognise an XMP file; the names of the formats in it stand near its beginning
+
+
+def no_rig_fault(folder: Path) -> Message:
+    """Returns the fault of a folder without a rig's file; if it contains captures, an archive, or cameras of a program
+    that is not read instead, the fault names them."""
+    if unread := unread_programs(folder):
+        return unread[0]
+    archives = [path.name for path in sorted(folder.iterdir()) if path.name.lower().endswith(ARCHIVE_ENDINGS)]
+    if archives:
+        return compose("archives-inside", archives=some_of(archives))
+    inner = sorted(path for path in folder.iterdir() if path.is_dir() and not is_junk(path.name))
+    captures = [path.name for path in inner if find_rig_file(path) is not None]
+    return compose("captures-inside", captures=some_of(captures)) if len(captures) > 1 else NO_RIG
+
+
+def find_rig_file(folder: Path) -> Path | None:
+    """Returns the file in ``folder`` that holds the rig, for ``read_rig_file``; None if there is none."""
+    return next(rig_files(folder), None)
+
+
+def rig_files(folder: Path) -> Iterator[Path]:
+    """Yields the files in ``folder`` that may hold the rig, at most one for each program. The first is the one that is
+    read.
+
+    In this order: ``cameras.json``; a COLMAP model in ``sparse/0``, ``sparse`` or at the top (``cameras.bin`` or
+    ``.txt``); ``camera_array.toml``; any other TOML file with aniposelib's keys; ``transforms.json``; ``intri.yml``;
+    any other YAML file of OpenCV's with a ``K_<camera>``; an XML file of Metashape's; RealityCapture's XMP files,
+    beside the pictures or at the top, or its CSV.
+    """
+    names = ("cameras.json", *(f"{inner}/cameras{end}" for inner in COLMAP_FOLDERS for end in (".bin", ".txt")))
+    native, *colmap = (folder / name for name in names)
+    caliscope, nerfstudio, easymocap = (folder / n for n in ("camera_array.toml", "transforms.json", "intri.yml"))
+    aniposelib = (path for path in sorted(folder.glob("*.toml")) if path != caliscope and looks_like_aniposelib(path))
+    yaml = sorted({*folder.glob("*.yml"), *folder.glob("*.yaml")} - {easymocap})
+    opencv = (path for path in yaml if b"\nK_" in _head(path))
+    metashape = (path for path in sorted(folder.glob("*.xml")) if b"<chunk" in _head(path))
+    sidecars = (
+        path
+        for place in ("images", ".")
+        for path in sorted((folder / place).glob("*.xmp"))
+        if b"capturingreality" in _head(path)
+    )
+    tables = (path for path in sorted(folder.glob("*.csv")) if looks_like_csv(_head(path)))
+    for found in (
+        [native],
+        colmap,
+        [caliscope],
+        aniposelib,
+        [nerfstudio],
+        [easymocap],
+        opencv,
+        metashape,
+        sidecars,
+        tables,
+    ):
+        first = next((path for path in found if path.is_file()), None)
+        if first is not None:
+            yield first
+
+
+def read_rig_file(path: Path) -> Rig:
+    """Returns the rig in a file of any known format. Raises InputError naming every fault found in it."""
+    return read_cameras(path).rig
+
+
+def read_cameras(path: Path) -> CamerasRead:
+    """Returns the rig in a file of any known format, with its reader's remarks. Raises InputError naming every
+    fault."""
+    if path.name == "transforms.json":
+        return read_transforms(path)
+    if path.suffix == ".json":
+        return CamerasRead(read_rig(path), tuple(compose("unknown-key", remark=remark) for remark in unread_keys(path)))
+    if path.suffix in (".bin", ".txt"):
+        return read_colmap(path.parent, path.suffix)
+    if path.suffix == ".xmp":
+        return read_xmp(path.parent)
+    readers = {".toml": read_toml, ".xml": read_metashape, ".csv": read_csv, ".yml": read_yaml, ".yaml": read_yaml}
+    if path.suffix not in readers:
+        endings = (".json", *readers, ".txt", ".bin", ".xmp")
+        raise InputError(path.name, [compose("no-rig-ending", endings=endings, formats=FORMATS[:-1])])
+    return readers[path.suffix](path)
+
+
+def rig_file_parts(path: Path) -> tuple[Path, ...]:
+    """Returns all files that ``read_rig_file`` reads for ``path``; most formats have one."""
+    if path.suffix in (".bin", ".txt"):
+        return path, path.with_stem("images")
+    if path.suffix == ".xmp":
+        return tuple(sorted(path.parent.glob("*.xmp")))
+    return (path, path.with_name("extri.yml")) if path.name == "intri.yml" else (path,)
+
+
+def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
+    """Writes a rig in the format ``kind``, one of ``FORMATS``; for ``FOLDER_FORMATS`` the path is a folder. Raises
+    InputError for another kind."""
+    if kind not in WRITERS:
+        raise InputError("format", [compose("none-of", value=f"{kind!r}", known=FORMATS)])
+    WRITERS[kind](rig, path)
+
+
+def _head(path: Path) -> bytes:
+    """Returns the first bytes of a file, by which its format is recognised; no bytes if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")
+    except OSError:
+        return b""

@@ -1,0 +1,299 @@
+"""Reads and writes COLMAP models, text and binary (https://colmap.github.io/format.html; parameter order of
+``src/colmap/sensor/models.h``).
+
+In COLMAP the centre of the top-left pixel is (0.5, 0.5), in this project (0, 0): half a pixel is subtracted on reading
+and added on writing. COLMAP's scale is free and taken as millimetres."""
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig.atomic_write import write_atomically
+from rig.camera import Camera
+from rig.formats.cameras.cameras_json import CAMERAS_MOST
+from rig.formats.cameras.foreign import Malformed, camera_names, lens_entry, parsed
+from rig.formats.cameras.reading import CamerasRead, Reading, shown
+from rig.geometry import vector_from_rotation
+from rig.messages.message import Message, compose
+from rig.rig import Rig
+
+# name: (number in the binary file, parameter names in their order).
+COLMAP_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
+    "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": (2, ("f", "cx", "cy", "k1")),
+    "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": (5, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k1")),
+    "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
+    "SIMPLE_FISHEYE": (14, ("f", "cx", "cy")),
+    "FISHEYE": (15, ("fx", "fy", "cx", "cy")),
+}
+# Models that have no counterpart here, by their number.
+REFUSED_MODELS = {
+    7: "FOV",
+    10: "THIN_PRISM_FISHEYE",
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+    12: "SIMPLE_DIVISION",
+    13: "DIVISION",
+    16: "EUCM",
+    17: "EQUIRECTANGULAR",
+}
+
+
+COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
+
+
+def read_colmap(folder: Path, suffix: str = ".bin") -> CamerasRead:
+    """Returns the rig in a COLMAP model: each image becomes a camera of this project, named after the image file.
+    Raises InputError naming every fault."""
+    files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
+    subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
+    binary = suffix == ".bin"
+    cameras = parsed(files[0], _binary_cameras if binary else _text_cameras)
+    images = parsed(files[1], _binary_images if binary else _text_images)
+    names = camera_names([image.name for image in images])
+    reading = Reading(subject)
+    faults = reading.faults
+    entries = []
+    for name, image in zip(names, images, strict=True):
+        camera = cameras.get(image.camera)
+        if camera is None:
+            files = f"cameras{suffix}"
+            faults.append(compose("image-of-strange-camera", image=f"{name!r}", camera=image.camera, file=files))
+            continue
+        entries.append(_colmap_entry(name, image, camera, faults))
+    return reading.finish(entries)
+
+
+def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = ".png") -> None:
+    """Writes ``cameras``, ``images`` and an empty ``points3D``; images are called ``<camera><suffix>``."""
+    end = ".bin" if binary else ".txt"
+    encode = _binary_model if binary else _text_model
+    for kind, data in zip(("cameras", "images", "points3D"), encode(rig, suffix), strict=True):
+        write_atomically(folder / f"{kind}{end}", data)
+
+
+class _Records:
+    """Reads little-endian records one after the other. Raises ``struct.error`` if the bytes end too early."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from("<" + layout, self.data, self.at)
+        self.at += struct.calcsize("<" + layout)
+        return values
+
+    def count(self, least_bytes: int) -> int:
+        """Reads a number of records of at least ``least_bytes`` each. Raises Malformed if so many cannot fit in the
+        rest of the file, before memory is spent on them."""
+        (count,) = self.take("Q")
+        if count * least_bytes > len(self.data) - self.at:
+            raise Malformed(compose("records-promised", records=str(count)))
+        return count
+
+    def skip(self, size: int) -> None:
+        self.at += size
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise Malformed(compose("name-without-end"))
+        text = self.data[self.at : end].decode("utf-8")
+        self.at = end + 1
+        return text
+
+
+@dataclass(frozen=True, slots=True)
+class ColmapCamera:
+    """Holds a camera of a COLMAP model; ``values`` are its parameters in the order of that model."""
+
+    model: str
+    width: int
+    height: int
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ColmapImage:
+    """Holds an image of a COLMAP model: quaternion and translation of camera_from_world, and the number of its
+    camera."""
+
+    pose: list[float]
+    camera: int
+    name: str
+
+
+def _binary_cameras(data: bytes) -> dict[int, ColmapCamera]:
+    records = _Records(data)
+    cameras = {}
+    for _ in range(records.count(24)):
+        number, model, width, height = records.take("iiQQ")
+        name = COLMAP_NAMES.get(model)
+        if name is None:
+            known = REFUSED_MODELS.get(model)
+            of_number = compose("model-of-number", number=model)
+            named = compose("model-and-number", model=known, number=model) if known else of_number
+            raise Malformed(_model_fault(named, number))
+        values = records.take(f"{len(COLMAP_MODELS[name][1])}d")
+        cameras[number] = ColmapCamera(name, width, height, values)
+    return cameras
+
+
+def _binary_images(data: bytes) -> list[ColmapImage]:
+    records = _Records(data)
+    images = []
+    for _ in range(_limited(records.count(73))):
+        _, *pose, camera = records.take("i7di")
+        images.append(ColmapImage(pose, camera, records.text()))
+        records.skip(24 * records.count(24))
+    return images
+
+
+def _text_cameras(data: bytes) -> dict[int, ColmapCamera]:
+    cameras = {}
+    for line in _text_lines(data):
+        if not line.split():
+            continue
+        number, name, width, height, *values = line.split()
+        if name not in COLMAP_MODELS:
+            raise Malformed(_model_fault(shown(name), number))
+        wanted = len(COLMAP_MODELS[name][1])
+        if len(values) != wanted:
+            held = len(values)
+            raise Malformed(compose("lens-parameters", camera=number[:20], held=held, model=name, wanted=wanted))
+        numbers = tuple(float(value) for value in values)
+        cameras[int(number)] = ColmapCamera(name, int(width), int(height), numbers)
+    return cameras
+
+
+def _text_images(data: bytes) -> list[ColmapImage]:
+    """Reads images: one line each, followed by a line with its points, which files written by hand often lack."""
+    images: list[ColmapImage] = []
+    after_image = False
+    for line in _text_lines(data):
+        if after_image and _is_of_points(line):
+            after_image = False
+            continue
+        if not line.split():
+            continue
+        words = line.split(maxsplit=9)
+        if len(words) != 10:
+            raise Malformed(compose("image-line", held=len(words), line=shown(line.strip())))
+        pose = [float(word) for word in words[1:8]]
+        images.append(ColmapImage(pose, int(words[8]), words[9].strip()))
+        after_image = True
+        _limited(len(images))
+    return images
+
+
+def _is_of_points(line: str) -> bool:
+    """Tells whether a line lists points, as X, Y and a whole number each, or is empty; it may as well be the next
+    image's.
+
+    An image's line has ten words or more and among them a name; ten numbers cannot be points, since 3 does not divide
+    10."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(
+            np.isfinite([float(x), float(y), int(i)]).all() for x, y, i in _triples(words)
+        )
+    except ValueError:
+        return False
+
+
+def _triples(words: list[str]) -> Iterator[tuple[str, str, str]]:
+    return zip(words[0::3], words[1::3], words[2::3], strict=True)
+
+
+def _text_lines(data: bytes) -> Iterator[str]:
+    return (line for line in data.decode("utf-8").splitlines() if not line.lstrip().startswith("#"))
+
+
+def _limited(count: int) -> int:
+    if count > CAMERAS_MOST:
+        raise Malformed(compose("images-many", images=str(count), most=CAMERAS_MOST))
+    return count
+
+
+def _model_fault(model: str | Message, number: Any) -> Message:
+    return compose("lens-model-unread", camera=f"{number!s:.20}", model=model, known=[*COLMAP_MODELS])
+
+
+def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[Message]) -> dict[str, object]:
+    parameters = dict(zip(COLMAP_MODELS[camera.model][1], camera.values, strict=True))
+    focal = parameters.get("f", 0.0)
+    w, x, y, z = _unit_quaternion(image.pose[:4])
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return {
+        "name": name,
+        "width": camera.width,
+        "height": camera.height,
+        "intrinsics": {
+            "fx": parameters.get("fx", focal),
+            "fy": parameters.get("fy", focal),
+            "cx": parameters["cx"] - 0.5,
+            "cy": parameters["cy"] - 0.5,
+        },
+        "distortion": lens_entry(parameters, name, faults, fisheye="FISHEYE" in camera.model),
+        "camera_from_world": {"rotation": rotation, "translation": list(image.pose[4:])},
+    }
+
+
+def _unit_quaternion(values: list[float]) -> tuple[float, ...]:
+    length = math.hypot(*values)
+    # A length far from 1 is no rotation; NaN is named by the document's own check.
+    return tuple(value / length for value in values) if 0.9 < length < 1.1 else (math.nan,) * 4
+
+
+def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
+    """Returns the name and the parameters of COLMAP's model for a camera."""
+    k, lens = camera.intrinsics, camera.recorded
+    frame = [k.fx, k.fy, k.cx + 0.5, k.cy + 0.5]
+    if lens is None:
+        return "FULL_OPENCV", [*frame, *k.distortion.opencv().tolist(), 0.0, 0.0, 0.0]
+    return "OPENCV_FISHEYE" if lens.model == "kannala-brandt" else "FULL_OPENCV", [*frame, *lens.coefficients]
+
+
+def _colmap_pose(camera: Camera) -> list[float]:
+    vector = vector_from_rotation(camera.camera_from_world.rotation)
+    angle = float(np.linalg.norm(vector))
+    imaginary = vector * (math.sin(angle / 2) / angle if angle > 1e-12 else 0.5)
+    return [math.cos(angle / 2), *imaginary.tolist(), *camera.camera_from_world.translation.tolist()]
+
+
+def _text_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
+    for number, camera in enumerate(rig, start=1):
+        k = camera.intrinsics
+        model, parameters = _colmap_model(camera)
+        cameras.append(f"{number} {model} {k.width} {k.height} {' '.join(map(repr, parameters))}")
+        images += [f"{number} {' '.join(map(repr, _colmap_pose(camera)))} {number} {camera.name}{suffix}", ""]
+    points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
+    return "\n".join([*cameras, ""]).encode(), "\n".join([*images, ""]).encode(), points.encode()
+
+
+def _binary_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
+    count = struct.pack("<Q", len(rig))
+    cameras, images = [count], [count]
+    for number, camera in enumerate(rig, start=1):
+        k = camera.intrinsics
+        model, parameters = _colmap_model(camera)
+        head = struct.pack("<iiQQ", number, COLMAP_MODELS[model][0], k.width, k.height)
+        cameras.append(head + struct.pack(f"<{len(parameters)}d", *parameters))
+        images.append(struct.pack("<i7di", number, *_colmap_pose(camera), number))
+        images.append(f"{camera.name}{suffix}".encode() + b"\0" + struct.pack("<Q", 0))
+    return b"".join(cameras), b"".join(images), struct.pack("<Q", 0)

@@ -1,0 +1,203 @@
+"""Reads and writes OpenCV's YAML of several cameras, as EasyMocap lays it out
+(https://chingswy.github.io/easymocap-public-doc).
+
+``names``, ``K_<name>`` and ``dist_<name>`` are in ``intri.yml``; ``Rot_<name>`` (or ``R_<name>``, a rotation vector)
+and ``T_<name>`` are in ``extri.yml`` and give camera_from_world. All may also be in one file of another name. Lengths
+are metres if all cameras lie within 30 units of the origin, otherwise millimetres. ``W_<name>`` and ``H_<name>`` are
+the size; without them it is read from the pictures."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.atomic_write import write_atomically
+from rig.errors import InputError
+from rig.formats.cameras.foreign import MATRIX_PLACES, METRES_MOST, Malformed, lens_entry, number_array, parsed, sized
+from rig.formats.cameras.foreign_keys import OPENCV_YAML
+from rig.formats.cameras.reading import CamerasRead, Reading
+from rig.geometry import rotation_from_vector
+from rig.messages.fault_groups import some_of
+from rig.messages.message import Message, compose
+from rig.recorded_lens import COEFFICIENTS
+from rig.rig import Rig
+
+if TYPE_CHECKING:
+    import cv2
+
+FILES = ("intri.yml", "extri.yml")
+POSE_KEY = re.compile(r"(R|Rot|T)_")
+
+
+def read_yaml(path: Path) -> CamerasRead:
+    """Returns the rig in ``intri.yml`` and the ``extri.yml`` beside it, or in ``path`` alone. Raises InputError naming
+    every fault."""
+    parts = [path.with_name(name) for name in FILES] if path.name in FILES else [path, path]
+    lenses, poses = (parsed(part, _matrices) for part in parts)
+    held = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
+    if not held:
+        raise InputError(path.name, [compose("yaml-without-camera")])
+    reading = Reading(path.name)
+    faults = reading.faults
+    names = _taking_part(held, [*lenses["names"]] if isinstance(lenses.get("names"), list) else None, reading)
+    _judge(lenses | poses, held, reading)
+    lacking = [key for key in poses if (m := POSE_KEY.match(key)) and key[m.end() :] not in held]
+    if lacking:
+        faults.append(compose("yaml-pose-alone", keys=some_of(lacking)))
+    entries: list[dict[str, Any]] = []
+    for name in names:
+        matrix = number_array(lenses[f"K_{name}"], (3, 3), f"K_{name}", faults)
+        lens = number_array(lenses.get(f"dist_{name}", np.zeros(5)), None, f"dist_{name}", faults).ravel()
+        keys = COEFFICIENTS["rational"]
+        if lens[len(keys) :].any():
+            faults.append(compose("coefficients-many", key=f"dist_{name}", most=len(keys), names=" ".join(keys)))
+        if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
+            faults.append(compose("matrix-skewed", key=f"K_{name}"))
+        turned, rodrigues = poses.get(f"Rot_{name}"), _array(poses, f"R_{name}")
+        if turned is None:
+            turned = rotation_from_vector(rodrigues.ravel()) if rodrigues.size == 3 else rodrigues
+        rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
+        _check_alike(poses, name, faults)
+        translation = number_array(_array(poses, f"T_{name}").ravel(), (3,), f"T_{name}", faults)
+        size: tuple[float, float]
+        if f"W_{name}" in lenses and f"H_{name}" in lenses:
+            width, height = (
+                number_array(_array(lenses, key).ravel(), (1,), key, faults) for key in (f"W_{name}", f"H_{name}")
+            )
+            size = float(width[0]), float(height[0])
+        else:
+            size = sized(path.parent, name, faults)
+        entries.append(
+            {
+                "name": name,
+                "width": size[0],
+                "height": size[1],
+                "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
+                "distortion": lens_entry(dict(zip(keys, lens.tolist(), strict=False)), name, faults),
+                "camera_from_world": {"rotation": rotation.tolist(), "translation": translation},
+            }
+        )
+    reach = max((float(np.abs(entry["camera_from_world"]["translation"]).max()) for entry in entries), default=0.0)
+    millimetres = 1000.0 if reach < METRES_MOST else 1.0
+    for entry in entries:
+        pose = entry["camera_from_world"]
+        pose["translation"] = (millimetres * pose["translation"]).tolist()
+    return reading.finish(entries)
+
+
+def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) -> list[str]:
+    """Returns the cameras listed in ``names``, or all if there is no such list. A listed camera that the file lacks is
+    a fault."""
+    if not listed:
+        return held
+    lacking = [name for name in listed if name not in held]
+    if lacking:
+        reading.faults.append(compose("yaml-names-lacking", cameras=some_of(lacking)))
+    for name in held:
+        if name not in listed:
+            reading.leave_out(name, compose("left-not-named"))
+    return [name for name in held if name in listed]
+
+
+def _judge(values: Mapping[str, object], held: Sequence[str], reading: Reading) -> None:
+    """Checks every key against the table of keys, with ``<name>`` in place of a camera's name."""
+    for key, value in values.items():
+        name = next((name for name in sorted(held, key=len, reverse=True) if key.endswith(f"_{name}")), "")
+        general = key.removesuffix(name) + "<name>" if name else key
+        if name or key == "names" or not POSE_KEY.match(key):
+            plain = value.ravel().tolist() if isinstance(value, np.ndarray) else value
+            reading.judge(OPENCV_YAML, {general: plain}, name)
+
+
+def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> None:
+    """Appends a fault if a camera's rotation vector and rotation matrix are both given and disagree."""
+    vector, matrix = _array(poses, f"R_{name}"), _array(poses, f"Rot_{name}")
+    if vector.size not in (3, 9) or matrix.shape != (3, 3):
+        return
+    other = rotation_from_vector(vector.ravel()) if vector.size == 3 else vector.reshape(3, 3)
+    if not np.abs(other - matrix).max() < 1e-3:
+        faults.append(compose("rotations-differ", one=f"R_{name}", other=f"Rot_{name}"))
+
+
+def write_yaml(rig: Rig, folder: Path) -> None:
+    """Writes ``intri.yml`` and ``extri.yml`` into a folder. Raises InputError for a fisheye lens, which the format
+    cannot state."""
+    fisheyes = [c.name for c in rig if c.recorded is not None and c.recorded.model == "kannala-brandt"]
+    if fisheyes:
+        raise InputError("opencv-yaml", [compose("yaml-fisheye", cameras=fisheyes)])
+
+    import cv2  # here and below: other formats do without its 0.1 s
+
+    def lenses(file: "cv2.FileStorage") -> None:
+        for camera in rig:
+            k, lens = camera.intrinsics, camera.recorded
+            file.write(f"K_{camera.name}", k.matrix())
+            file.write(f"dist_{camera.name}", np.array([k.distortion.opencv() if lens is None else lens.coefficients]))
+            file.write(f"W_{camera.name}", k.width)
+            file.write(f"H_{camera.name}", k.height)
+
+    def poses(file: "cv2.FileStorage") -> None:
+        for camera in rig:
+            pose = camera.camera_from_world
+            file.write(f"R_{camera.name}", cv2.Rodrigues(pose.rotation)[0])
+            file.write(f"Rot_{camera.name}", pose.rotation)
+            file.write(f"T_{camera.name}", pose.translation[:, None] / 1000.0)
+
+    for name, fill in zip(FILES, (lenses, poses), strict=True):
+        write_atomically(folder / name, _written(rig, fill))
+
+
+def _written(rig: Rig, fill: "Callable[[cv2.FileStorage], None]") -> bytes:
+    import cv2
+
+    file = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    file.startWriteStruct("names", cv2.FILE_NODE_SEQ)
+    for camera in rig:
+        file.write("", camera.name)
+    file.endWriteStruct()
+    fill(file)
+    return file.releaseAndGetString().encode()
+
+
+def _matrices(data: bytes) -> dict[str, Any]:
+    """Returns all matrices and numbers of a file by key, and lists of words. Raises ValueError for damaged YAML."""
+    import cv2
+
+    try:
+        file = cv2.FileStorage(data.decode("utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = file.root()
+        found: dict[str, Any] = {}
+        for key in root.keys():  # noqa: SIM118 a FileNode is no mapping
+            node = root.getNode(key)
+            if node.isMap():
+                found[key] = np.asarray(node.mat(), float)
+            elif node.isReal() or node.isInt():
+                found[key] = np.array([node.real()])
+            elif node.isSeq():
+                found[key] = _listed(node)
+            elif node.isString():
+                found[key] = node.string()
+        return found
+    except (cv2.error, SystemError, TypeError) as error:
+        said = " ".join(str(error).split())[:120]
+        raise Malformed(compose("no-opencv-yaml", reason=said)) from None
+
+
+def _listed(node: "cv2.FileNode") -> list[str] | Float[np.ndarray, "..."]:
+    """Returns the words of a list, or its numbers as an array, which is empty where its rows differ in length."""
+    entries = [node.at(i) for i in range(node.size())]
+    if any(entry.isString() for entry in entries):
+        return [entry.string() for entry in entries if entry.isString()]
+    try:
+        return np.array([_listed(entry) if entry.isSeq() else entry.real() for entry in entries], float)
+    except ValueError:
+        return np.zeros(0)
+
+
+def _array(values: Mapping[str, Any], key: str) -> Float[np.ndarray, "..."]:
+    """Returns the numbers under a key; an empty array if there are none."""
+    value = values.get(key)
+    return value if isinstance(value, np.ndarray) else np.zeros(0)

@@ -1,0 +1,246 @@
+"""Reads and writes RealityCapture's and RealityScan's cameras: XMP files beside the pictures, and the CSV
+"Internal/External camera parameters".
+
+XMP (https://support.capturingreality.com/hc/en-us/articles/360017783459): ``Rotation`` is camera_from_world with
+OpenCV's axes; ``Position`` is the camera's centre in metres; the focal length is that of a film whose longer side is 36
+mm; the principal point is relative to the middle, in longer sides. CSV: the same focal length, the principal point in
+millimetres of that film, and heading, pitch and roll (degrees) of a camera that at 0 0 0 looks down, its top to the
+north. Neither contains the picture's size, which is read from the pictures beside it. Distortion, of ``X / Z``: k1 to
+k4; t1 and t2 are OpenCV's p1 and p2."""
+
+import csv
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from rig.atomic_write import write_atomically
+from rig.camera import Camera
+from rig.errors import InputError
+from rig.formats.cameras.foreign import brown_conrady, camera_names, corner_radius, lens_entry, parsed, sized, xml_root
+from rig.formats.cameras.foreign_keys import REALITYCAPTURE, REALITYCAPTURE_CSV
+from rig.formats.cameras.reading import CamerasRead, Reading, shown
+from rig.formats.pictures.picture_names import picture_stem
+from rig.messages.message import Message, compose
+from rig.rig import Rig
+
+XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
+FILM_MM = 36.0
+MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
+NO_LENS = "division"  # model named in files that have no coefficients
+COLUMNS = ("#name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+DOWN = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes from those of the CSV: x right, y up, z backwards
+
+_XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
+  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+    <rdf:Description xcr:Version="3" xcr:PosePrior="locked" xcr:Coordinates="absolute" xcr:DistortionModel="brown3t2"
+       xcr:FocalLength35mm="{focal!r}" xcr:Skew="0" xcr:AspectRatio="{aspect!r}" xcr:PrincipalPointU="{u!r}"
+       xcr:PrincipalPointV="{v!r}" xcr:CalibrationPrior="locked" xcr:CalibrationGroup="-1" xcr:DistortionGroup="-1"
+       xcr:InTexturing="1" xcr:InMeshing="1" xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#">
+      <xcr:Rotation>{rotation}</xcr:Rotation>
+      <xcr:Position>{position}</xcr:Position>
+      <xcr:DistortionCoeficients>{lens}</xcr:DistortionCoeficients>
+    </rdf:Description>
+  </rdf:RDF>
+</x:xmpmeta>
+"""
+
+
+def read_xmp(folder: Path) -> CamerasRead:
+    """Returns the rig in a folder of XMP files, one camera each. Cameras that are not aligned or not used for meshing
+    take no part. Raises InputError naming every fault."""
+    reading = Reading(f"{folder.name}/*.xmp")
+    entries = []
+    components = set()
+    for path in sorted(path for path in folder.glob("*.xmp") if not path.name.startswith(".")):
+        try:
+            values = _xmp_values(path)
+        except InputError as error:
+            reading.faults += [compose("of-file", file=path.name, fault=fault) for fault in error.faults]
+            continue
+        name = picture_stem(path.stem)  # RealityScan also writes cam00.png.xmp
+        if not {"Rotation", "Position"} & values.keys():
+            reading.leave_out(name, compose("left-not-aligned-keys", keys=("Rotation", "Position")))
+        elif values.get("InMeshing", "1").strip().lower() in ("0", "false"):
+            reading.leave_out(name, compose("left-switched-off", key='InMeshing="0"'))
+        else:
+            reading.judge(REALITYCAPTURE, values, name)
+            components |= {values["ComponentId"]} if "ComponentId" in values else set()
+            entries.append(_xmp_entry(folder, name, values, reading.faults))
+    if len(components) > 1:
+        reading.faults.append(compose("components-unaligned", components=len(components)))
+    return reading.finish(entries)
+
+
+def write_xmp(rig: Rig, folder: Path) -> None:
+    """Writes ``<camera>.xmp`` into the folder of the pictures. Raises InputError for a lens that the format cannot
+    state."""
+    for camera in _held(rig, "realitycapture"):
+        k, d, side = camera.intrinsics, camera.intrinsics.distortion, _side(camera)
+        text = _XMP.format(
+            focal=k.fx / side * FILM_MM,
+            aspect=k.fy / k.fx,
+            u=(k.cx + 0.5 - 0.5 * k.width) / side,
+            v=(k.cy + 0.5 - 0.5 * k.height) / side,
+            rotation=_words(camera.camera_from_world.rotation.ravel()),
+            position=_words(camera.centre_world / 1000.0),
+            lens=_words(np.array([d.k1, d.k2, d.k3, 0.0, d.p1, d.p2])),
+        )
+        write_atomically(folder / f"{camera.name}.xmp", text.encode())
+
+
+def read_csv(path: Path) -> CamerasRead:
+    """Returns the rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
+    rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(_with_commas(data.decode("utf-8-sig"))))))
+    if not rows or not set(COLUMNS[:8]) <= rows[0].keys():
+        raise InputError(path.name, [compose("no-camera-csv", columns=",".join(COLUMNS))])
+    reading = Reading(path.name)
+    faults = reading.faults
+    entries = []
+    for name, row in zip(camera_names([str(row["#name"]) for row in rows]), rows, strict=True):
+        reading.judge(REALITYCAPTURE_CSV, {str(key): value for key, value in row.items() if key}, name)
+        values = {key: _number(row.get(key, "0"), f"{name}.{key}", faults) for key in COLUMNS[1:]}
+        size = sized(path.parent, name, faults)
+        side = max(size)
+        focal = values["f"] / FILM_MM * side
+        offset = values["px"] / FILM_MM * side, values["py"] / FILM_MM * side
+        position = np.array([values["x"], values["y"], values["alt"]])
+        entries.append(
+            _entry(
+                name,
+                size,
+                (focal, focal),
+                offset,
+                values,
+                DOWN @ _attitude(values).T,
+                position_m=position,
+                faults=faults,
+            )
+        )
+    return reading.finish(entries)
+
+
+def looks_like_csv(head: bytes) -> bool:
+    """Tells whether a file that begins so is the CSV, as RealityCapture wrote it or as a spreadsheet saved it."""
+    return _with_commas(head.decode("utf-8", "replace")).startswith(",".join(COLUMNS[:8]))
+
+
+def _with_commas(text: str) -> str:
+    """Returns the table with commas between values, where a spreadsheet put semicolons and decimal commas."""
+    return text.replace(",", ".").replace(";", ",") if text.startswith(COLUMNS[0] + ";") else text
+
+
+def write_csv(rig: Rig, path: Path) -> None:
+    """Writes the CSV. Raises InputError for pixels that are not square, and for a lens that the format cannot state."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for camera in _held(rig, "realitycapture-csv"):
+        k, d, side = camera.intrinsics, camera.intrinsics.distortion, _side(camera)
+        if abs(k.fx / k.fy - 1) * side > 0.02:
+            raise InputError("realitycapture-csv", [compose("focal-lengths-differ", camera=camera.name)])
+        world_from_camera = camera.camera_from_world.rotation.T @ DOWN
+        pitch = np.arcsin(np.clip(world_from_camera[2, 1], -1.0, 1.0))
+        heading = np.arctan2(world_from_camera[0, 1], world_from_camera[1, 1])
+        roll = np.arctan2(-world_from_camera[2, 0], world_from_camera[2, 2])
+        angles = np.degrees([heading, pitch, roll]).tolist()
+        offset = np.array([k.cx + 0.5 - 0.5 * k.width, k.cy + 0.5 - 0.5 * k.height]) / side * FILM_MM
+        lens = [d.k1, d.k2, d.k3, 0.0, d.p1, d.p2]
+        position = (camera.centre_world / 1000.0).tolist()
+        row = [*position, *angles, k.fx / side * FILM_MM, *offset.tolist(), *lens]
+        writer.writerow([f"{camera.name}.png", *map(repr, row)])
+    write_atomically(path, out.getvalue().encode())
+
+
+def _attitude(values: Mapping[str, float]) -> Float[np.ndarray, "3 3"]:
+    """Returns ``world_from_camera`` in the CSV's axes: heading about z, clockwise, then pitch about x, then roll about
+    y."""
+    heading, pitch, roll = np.radians([-values["heading"], values["pitch"], values["roll"]])
+    z = np.array([[np.cos(heading), -np.sin(heading), 0], [np.sin(heading), np.cos(heading), 0], [0, 0, 1]])
+    x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    y = np.array([[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]])
+    return z @ x @ y
+
+
+def _xmp_values(path: Path) -> dict[str, str]:
+    """Returns the values of the namespace ``xcr`` by name, whether written as attributes or as elements."""
+    described = parsed(path, xml_root).find(f".//{RDF}Description")
+    if described is None:
+        raise InputError(path.name, [compose("no-rdf-description")])
+    values = {key.removeprefix(XCR): text for key, text in described.attrib.items() if key.startswith(XCR)}
+    return values | {node.tag.removeprefix(XCR): node.text or "" for node in described if node.tag.startswith(XCR)}
+
+
+def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[Message]) -> dict[str, object]:
+    def numbers(key: str, count: int, default: str = "") -> list[float]:
+        found = [_number(word, f"{name}.{key}", faults) for word in values.get(key, default).split()]
+        if len(found) != count:
+            faults.append(compose("no-numbers", key=f"{name}.{key}", count=count))
+        return found if len(found) == count else [np.nan] * count
+
+    model = values.get("DistortionModel", "perspective")
+    bent = any(word.strip("0.-+") for word in values.get("DistortionCoeficients", "").split())
+    if model not in MODELS and (bent or model != NO_LENS):
+        faults.append(compose("distortion-model", camera=name, model=shown(model), known=MODELS))
+    size = sized(folder, name, faults)
+    side = max(size)
+    focal = numbers("FocalLength35mm", 1)[0] / FILM_MM * side
+    aspect = numbers("AspectRatio", 1, "1")[0]
+    offset = numbers("PrincipalPointU", 1, "0")[0] * side, numbers("PrincipalPointV", 1, "0")[0] * side
+    lens = numbers("DistortionCoeficients", 6, "0 0 0 0 0 0")
+    rotation, position = np.array(numbers("Rotation", 9)).reshape(3, 3), np.array(numbers("Position", 3))
+    named: dict[str, float] = dict(zip(("k1", "k2", "k3", "k4", "t1", "t2"), lens, strict=True))
+    return _entry(name, size, (focal, focal * aspect), offset, named, rotation, position_m=position, faults=faults)
+
+
+def _entry(
+    name: str,
+    size: tuple[int, int],
+    focal: tuple[float, float],
+    offset: tuple[float, float],
+    lens: Mapping[str, float],
+    rotation: np.ndarray,
+    *,
+    position_m: np.ndarray,
+    faults: list[Message],
+) -> dict[str, object]:
+    centre = offset[0] + 0.5 * size[0], offset[1] + 0.5 * size[1]
+    radial = [lens[key] for key in ("k1", "k2", "k3", "k4")]
+    k1, k2, k3 = brown_conrady(radial, corner_radius(size, focal, centre), focal[1], name, faults)
+    return {
+        "name": name,
+        "width": size[0],
+        "height": size[1],
+        "intrinsics": {"fx": focal[0], "fy": focal[1], "cx": centre[0] - 0.5, "cy": centre[1] - 0.5},
+        "distortion": lens_entry({"k1": k1, "k2": k2, "k3": k3, "p1": lens["t1"], "p2": lens["t2"]}, name, faults),
+        "camera_from_world": {
+            "rotation": rotation.tolist(),
+            "translation": (-rotation @ (1000.0 * position_m)).tolist(),
+        },
+    }
+
+
+def _held(rig: Rig, kind: str) -> Rig:
+    foreign = [camera.name for camera in rig if camera.recorded is not None]
+    if foreign:
+        raise InputError(kind, [compose("format-without-lens", cameras=foreign)])
+    return rig
+
+
+def _side(camera: Camera) -> int:
+    return max(camera.intrinsics.width, camera.intrinsics.height)
+
+
+def _words(values: np.ndarray) -> str:
+    return " ".join(map(repr, values.tolist()))
+
+
+def _number(word: str | None, where: str, faults: list[Message]) -> float:
+    try:
+        return float(word or "")
+    except ValueError:
+        faults.append(compose("no-number", key=where, value=shown(word)))
+        return np.nan

@@ -1,0 +1,168 @@
+"""Reads and writes ``transforms.json``: cameras of nerfstudio, instant-ngp and Blender's exporters for them.
+
+``transform_matrix`` is world_from_camera with OpenGL's axes (x right, y up, z backwards;
+https://docs.nerf.studio/quickstart/data_conventions.html). The centre of the top-left pixel is (0.5, 0.5), as in
+COLMAP, from which nerfstudio takes its intrinsics. Intrinsics are at the top or in a frame; Blender's files give
+``camera_angle_x``, and the size follows from the pictures. Lengths are metres if all cameras lie within 30 units of
+each other, otherwise millimetres; ``applied_scale`` is undone."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rig.atomic_write import write_atomically
+from rig.camera import Camera
+from rig.errors import InputError
+from rig.formats.cameras.foreign import METRES_MOST, camera_names, lens_entry, number_array, parsed, sized
+from rig.formats.cameras.foreign_keys import TRANSFORMS
+from rig.formats.cameras.reading import CamerasRead, Reading, shown
+from rig.messages.message import Message, compose
+from rig.rig import Rig
+
+OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV's camera axes from OpenGL's
+MODELS = {"PINHOLE": False, "SIMPLE_PINHOLE": False, "OPENCV": False, "OPENCV_FISHEYE": True}
+LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+PER_CAMERA = (*LENS, "k5", "k6", "rolling_shutter")  # keys at the top that hold for every camera
+
+
+def read_transforms(path: Path) -> CamerasRead:
+    """Returns the rig in a ``transforms.json``: each frame is a camera. Raises InputError naming every fault."""
+    document = parsed(path, json.loads)
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(path.name, [compose("no-frame-list")])
+    reading = Reading(path.name)
+    faults = reading.faults
+    reading.judge(TRANSFORMS, {key: value for key, value in document.items() if key not in PER_CAMERA}, "")
+    names = camera_names([str(frame.get("file_path", f"frame{i:03}")) for i, frame in enumerate(frames)])
+    matrices = [
+        number_array(frame.get("transform_matrix"), (4, 4), f"{name}.transform_matrix", faults)
+        for name, frame in zip(names, frames, strict=True)
+    ]
+    for name, frame in zip(names, frames, strict=True):
+        lens = {key: value for key, value in document.items() if key in PER_CAMERA}
+        reading.judge(TRANSFORMS, lens | frame, name)
+    _check_applied(document.get("applied_transform"), faults)
+    applied = _number(document.get("applied_scale", 1.0), "applied_scale", faults)
+    if applied <= 0:
+        faults.append(compose("no-positive-number", key="applied_scale", value=f"{applied:g}"))
+    scale = 1.0 / applied if applied > 0 else 1.0
+    reach = scale * max((np.abs(matrix[:3, 3]).max() for matrix in matrices), default=0.0)
+    millimetres = scale * (1000.0 if reach < METRES_MOST else 1.0)
+    entries = [
+        _entry(path.parent, name, document | frame, matrix, millimetres, faults)
+        for name, frame, matrix in zip(names, frames, matrices, strict=True)
+    ]
+    return reading.finish(entries)
+
+
+def write_transforms(rig: Rig, path: Path) -> None:
+    """Writes a ``transforms.json`` in metres, pictures called ``images/<camera>.png``."""
+    frames = [frame_document(camera, f"images/{camera.name}.png") for camera in rig]
+    write_atomically(path, json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1).encode())
+
+
+def frame_document(camera: Camera, file_path: str) -> dict[str, object]:
+    """Returns the frame of one camera, in metres. Raises InputError for a lens that the format does not hold."""
+    matrix = np.eye(4)
+    pose = camera.camera_from_world.inverse()
+    matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation / 1000.0
+    return {"file_path": file_path, **_lens(camera), "transform_matrix": matrix.tolist()}
+
+
+def _lens(camera: Camera) -> dict[str, object]:
+    k, d, lens = camera.intrinsics, camera.intrinsics.distortion, camera.recorded
+    entry: dict[str, object] = {"w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy}
+    entry |= {"cx": k.cx + 0.5, "cy": k.cy + 0.5}
+    if lens is None:
+        return entry | {"k1": d.k1, "k2": d.k2, "k3": d.k3, "p1": d.p1, "p2": d.p2}
+    if lens.model == "rational":
+        raise InputError("nerfstudio", [compose("format-without-lens", cameras=[camera.name])])
+    return entry | {"camera_model": "OPENCV_FISHEYE", **dict(zip(LENS[:4], lens.coefficients, strict=True))}
+
+
+def _entry(
+    folder: Path, name: str, values: dict[str, Any], matrix: np.ndarray, millimetres: float, faults: list[Message]
+) -> dict[str, object]:
+    fisheye = _is_fisheye(values, name, faults)
+    size = values.get("w"), values.get("h")
+    if None in size:
+        size = sized(folder, name, faults)
+    width, height = (_number(value, f"{name}.{key}", faults) for value, key in zip(size, ("w", "h"), strict=True))
+    fx = _focal(values, "x", width, None, name, faults)
+    fy = _focal(values, "y", height, fx, name, faults)
+    cx = _number(values.get("cx", 0.5 * width), f"{name}.cx", faults)
+    cy = _number(values.get("cy", 0.5 * height), f"{name}.cy", faults)
+    lens = {key: _number(values.get(key, 0.0), f"{name}.{key}", faults) for key in LENS}
+    if not fisheye and lens["k4"]:
+        faults.append(compose("k4-of-no-fisheye", key=f"{name}.k4"))
+        lens["k4"] = 0.0
+    pose = (matrix[:3, :3] @ OPENGL).T
+    return {
+        "name": name,
+        "width": width,
+        "height": height,
+        "intrinsics": {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5},
+        "distortion": lens_entry(lens, name, faults, fisheye=fisheye),
+        "camera_from_world": {
+            "rotation": pose.tolist(),
+            "translation": (-pose @ (millimetres * matrix[:3, 3])).tolist(),
+        },
+    }
+
+
+def _is_fisheye(values: dict[str, Any], name: str, faults: list[Message]) -> bool:
+    """Tells whether the lens is Kannala-Brandt's: nerfstudio states it by ``camera_model``, instant-ngp by
+    ``is_fisheye``."""
+    model, flag = values.get("camera_model"), values.get("is_fisheye", False)
+    if not (model is None or (isinstance(model, str) and model in MODELS)):
+        faults.append(compose("value-not-read", key=f"{name}.camera_model", value=shown(model), known=[*MODELS]))
+        return False
+    if not isinstance(flag, bool) and flag not in (0, 1):
+        faults.append(compose("no-switch", key=f"{name}.is_fisheye", value=shown(flag)))
+        return False
+    if flag and model is not None and not MODELS[model]:
+        faults.append(compose("fisheye-or-not", key=f"{name}.is_fisheye", model=model))
+    return bool(flag) or (model is not None and MODELS[model])
+
+
+def _check_applied(value: object, faults: list[Message]) -> None:
+    """Appends a fault if the applied transform scales or mirrors, which would change lengths or exchange left and
+    right.
+
+    A rotation is accepted and not undone, since the world frame is free."""
+    if value is None:
+        return
+    try:
+        matrix = np.array(value, dtype=float)[:3, :3]
+    except (TypeError, ValueError, IndexError):
+        matrix = np.zeros(0)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        faults.append(compose("applied-transform-shape", value=shown(value)))
+    elif np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-3 or np.linalg.det(matrix) < 0:
+        faults.append(compose("applied-transform-scales"))
+
+
+def _focal(
+    values: dict[str, Any], axis: str, pixels: float, default: float | None, name: str, faults: list[Message]
+) -> float:
+    if (focal := values.get(f"fl_{axis}")) is not None:
+        return _number(focal, f"{name}.fl_{axis}", faults)
+    angle = values.get(f"camera_angle_{axis}")
+    if angle is None:
+        if default is None:
+            faults.append(compose("focal-length-missing", camera=name, axis=axis))
+        return math.nan if default is None else default
+    angle = _number(angle, f"{name}.camera_angle_{axis}", faults)
+    return 0.5 * pixels / math.tan(0.5 * angle) if 0 < angle < math.pi else math.nan
+
+
+def _number(value: object, where: str, faults: list[Message]) -> float:
+    # NaN fails the comparison, and so does a whole number too large for a float
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12:
+        return value
+    faults.append(compose("no-finite-number", key=where, value=shown(value)))
+    return math.nan

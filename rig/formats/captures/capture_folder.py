@@ -1,0 +1,352 @@
+"""Reads and writes the folder of one synchronised shot of every camera.
+
+cameras.json                       (or another program's file: rig.formats.cameras.cameras_file)
+images/<camera>.png|jpg|jpeg|tif|webp|bmp|ppm|pgm, RAW, DNG or HEIC
+background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
+features.json                      optional
+masks/<camera>.png                 optional; then background/ may be absent
+
+Without background/ and masks/ the subject is the opaque part if every picture was cut out; otherwise it is segmented
+from the photographs. Without images/ the pictures lie beside cameras.json. ``shot_files`` decides which file
+belongs to which camera where names differ.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rig.atomic_write import write_atomically
+from rig.camera import Intrinsics
+from rig.capture import Capture, Features
+from rig.errors import InputError
+from rig.formats.cameras.cameras_file import no_rig_fault, read_cameras, rig_file_parts, rig_files
+from rig.formats.cameras.cameras_json import write_rig
+from rig.formats.cameras.reading import CamerasRead
+from rig.formats.captures.capture_masks import MaskSubjects, mask_subjects
+from rig.formats.captures.features_json import document_from_features, features_from_bytes
+from rig.formats.captures.shot_files import (
+    BESIDE_PICTURES,
+    ShotFiles,
+    find_files,
+    listed_pictures,
+    stray_sentence,
+)
+from rig.formats.pictures.images import cut_out_alpha, decode_image_file, page_count, picture_size, write_image
+from rig.formats.pictures.picture_names import is_junk
+from rig.formats.pictures.picture_rims import fill_rims
+from rig.formats.pictures.picture_samples import WHOLE_BITS, measure_samples
+from rig.formats.pictures.work_size import work_features, work_rig, work_share
+from rig.image import is_grey
+from rig.messages.fault_groups import say_once, some_of
+from rig.messages.message import Message, compose
+from rig.plausibility import rig_faults
+from rig.rig import Rig
+from rig.text import suggest
+
+SCALE = "scale.json"
+ENCLOSING_MOST = 8  # levels of single folders around a capture, as nested packing leaves them
+ALIKE_LEAST = 0.75  # likeness of two folders' names: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
+
+
+def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
+    """Reads a capture folder and returns its capture and cameras.
+
+    Pictures and feature points of a ``recorded`` lens are undistorted. Pictures of more than ``pixels_most`` pixels are
+    reduced, and their cameras with them (``rig.formats.pictures.work_size``). Raises InputError naming every fault of
+    the folder."""
+    faults: list[Message] = []
+    folder = capture_root(folder)
+    rigs = [*rig_files(folder)]
+    if not rigs:
+        raise InputError(folder.name, [no_rig_fault(folder)])
+    rig_file = rigs[0]
+    read = read_rig_of(rig_file)
+    rig = read.rig
+    check_folders(folder, rig)
+    faults += [
+        compose("located", where=rig_file.name, fault=fault)
+        for fault in rig_faults(rig, any_unit=has_known_length(folder))
+    ]
+    files = find_files(folder, rig, read.left_out)
+    faults += files.faults
+    capture = read_shot(folder, rig, faults, files, pixels_most=pixels_most)
+    if faults:
+        raise InputError("capture", say_once(faults, rig.names))
+    digests = dict(capture.digests)
+    for path in rig_file_parts(rig_file):
+        digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
+    ordered = dict(sorted(digests.items()))
+    if has_known_length(folder):
+        digests[SCALE] = hashlib.sha256((folder / SCALE).read_bytes()).hexdigest()
+        ordered = dict(sorted(digests.items()))
+    remarks = [*capture.remarks, *read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
+    return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
+
+
+def read_rig_of(rig_file: Path) -> CamerasRead:
+    """Calls ``read_cameras`` on a capture's file. Raises InputError whose faults name the file."""
+    try:
+        return read_cameras(rig_file)
+    except InputError as error:
+        raise InputError("capture", [f"{error.subject}: {fault}" for fault in error.faults]) from error
+
+
+def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
+    """Returns remarks on pictures that belong to no camera, and on folders of pictures that are not read."""
+    remarks = [stray_sentence(files.strays, rig)] if files.strays else []
+    known = ("images", *BESIDE_PICTURES, *rig.names)
+    for path in sorted(folder.iterdir()):
+        is_other = path.is_dir() and path.name not in known and not is_junk(path.name)
+        used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
+        if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
+            remarks.append(compose("folder-unread", folder=path.name))
+    return [compose("file-unread", remark=message) for message in remarks]
+
+
+def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
+    """Returns remarks on the files of further rigs in the folder: only the first of ``rigs`` is read."""
+    read, *others = (path.relative_to(folder).as_posix() for path in rigs)
+    others += _other_models(folder, rigs[0])
+    remarks = [compose("cameras-unread", file=other, read=read) for other in others]
+    return [compose("file-unread", remark=message) for message in remarks]
+
+
+def _other_models(folder: Path, rig_file: Path) -> list[str]:
+    """Returns further COLMAP models: the same one in the other encoding, and those of images that were registered
+    separately."""
+    if rig_file.suffix not in (".bin", ".txt"):
+        return []
+    twin = rig_file.with_suffix(".txt" if rig_file.suffix == ".bin" else ".bin")
+    sparse = sorted((folder / "sparse").glob("*/cameras.*")) if (folder / "sparse").is_dir() else []
+    found = [twin] if twin.is_file() else []
+    found += [path for path in sparse if path.suffix in (".bin", ".txt") and path.parent != rig_file.parent]
+    return [path.relative_to(folder).as_posix() for path in found]
+
+
+def has_known_length(folder: Path) -> bool:
+    """Tells whether scale.json fixes the unit of the cameras. It does not where it was used already when the cameras
+    were calibrated from the photographs."""
+    return (folder / SCALE).is_file() and not (folder / "calibration.json").is_file()
+
+
+def capture_root(folder: Path) -> Path:
+    """Returns the capture's own folder: ``folder``, or the single folder in it, and so on, as archives have enclosing
+    folders.
+
+    Raises InputError if ``folder`` is no folder."""
+    if not folder.is_dir():
+        raise InputError(str(folder.name or folder), [compose("no-capture-folder")])
+    for _ in range(ENCLOSING_MOST):
+        entries = [entry for entry in folder.iterdir() if not is_junk(entry.name)]
+        if len(entries) != 1 or not entries[0].is_dir() or entries[0].name == "sparse":
+            break
+        folder = entries[0]
+        if folder.name in ("images", *BESIDE_PICTURES):
+            break
+    return folder
+
+
+def check_folders(folder: Path, rig: Rig) -> None:
+    """Raises InputError for folders whose names nearly are one of a capture's own, such as "backgrounds".
+
+    They would not be read, and the subject would be segmented without its clean plates, or every picture be missing."""
+    kinds = ("images", *BESIDE_PICTURES)
+    folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
+    others = {name.casefold(): name for name in folders if name not in (*kinds, *rig.names)}
+    faults = []
+    for kind in kinds:
+        alike = suggest(kind, others, min_likeness=ALIKE_LEAST)
+        if alike and not (folder / kind).is_dir():
+            faults.append(compose("folder-misnamed", folder=others[alike[0]], name=kind))
+    if faults:
+        raise InputError("capture", faults)
+
+
+def read_shot(
+    folder: Path,
+    rig: Rig,
+    faults: list[Message],
+    files: ShotFiles | None = None,
+    *,
+    pixels_most: int | None = None,
+    with_features: bool = True,
+    with_cut_outs: bool = True,
+) -> Capture:
+    """Returns the images of a folder for a known rig, at the size and undistorted as ``work_rig`` describes them.
+
+    Every fault is appended to ``faults``, except those of ``files``, which its finder has reported already."""
+    if files is None:
+        files = find_files(folder, rig)
+        faults += files.faults
+    jobs = [(kind, camera.name, path) for camera in rig for kind, path in files.of_camera(camera.name)]
+    bits, levels = _sample_bits(jobs, faults)
+    with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
+        decoded = list(
+            pool.map(
+                lambda job: decode_picture(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]]), jobs
+            )
+        )
+    images: dict[str, np.ndarray] = {}
+    masks: dict[str, tuple[str, np.ndarray]] = {}
+    backgrounds: dict[str, list[np.ndarray]] = {}
+    digests: dict[str, str] = {}
+    for (kind, name, path), (pixels, digest, fault) in zip(jobs, decoded, strict=True):
+        if pixels is None:
+            assert fault is not None
+            faults.append(fault)
+            continue
+        digests[path.relative_to(folder).as_posix()] = digest
+        if kind == "images":
+            images[name] = pixels
+        elif kind == "masks":
+            masks[name] = path.relative_to(folder).as_posix(), pixels
+        else:
+            backgrounds.setdefault(name, []).append(pixels)
+    features: Features = {}
+    if with_features and (folder / "features.json").is_file():
+        data = (folder / "features.json").read_bytes()
+        digests["features.json"] = hashlib.sha256(data).hexdigest()
+        features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
+        features = work_features(features, rig, work_rig(rig, pixels_most))
+    subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)
+    if with_cut_outs and not masks and not backgrounds and len(images) == len(rig):
+        subjects = _cut_outs(folder, jobs, rig, pixels_most) or subjects
+    shown, plates, rims = fill_rims(images, backgrounds, subjects.masks)
+    return Capture(
+        shown,
+        plates,
+        subjects.masks,
+        features,
+        digests,
+        (*levels, *_page_remarks(folder, jobs), *_grey_remarks(images), *rims, *subjects.remarks),
+        subjects.soft,
+    )
+
+
+def _cut_outs(
+    folder: Path, jobs: Sequence[tuple[str, str, Path]], rig: Rig, pixels_most: int | None
+) -> MaskSubjects | None:
+    """Returns masks made of the alpha channel, if the subject was cut out in every picture.
+
+    Returns None if one picture is not cut out, or its alpha is no valid mask. That is no fault, since nobody declared
+    the alpha to be a mask."""
+    found = {}
+    for _, name, path in jobs:
+        alpha, k = cut_out_alpha(path), rig[name].intrinsics
+        if alpha is None or alpha.shape != (k.height, k.width):
+            return None
+        found[name] = path.relative_to(folder).as_posix(), alpha
+    unfit: list[Message] = []
+    subjects = mask_subjects(found, rig, unfit, pixels_most=pixels_most)
+    return None if unfit else replace(subjects, remarks=(*subjects.remarks, compose("masks-of-alpha")))
+
+
+def _sample_bits(
+    jobs: Sequence[tuple[str, str, Path]], faults: list[Message]
+) -> tuple[Mapping[str, int], list[Message]]:
+    """Returns, for each kind of files, how many of 16 bits are used, and a remark where they are fewer. Sensor mosaics
+    that were not developed are appended to ``faults``."""
+    kinds = ("images", "background")
+    samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
+    mosaics = [f"{kind}/" for kind in kinds if samples[kind].mosaic]
+    if mosaics:
+        faults.append(compose("pictures-are-mosaics", folders=mosaics))
+    bits = {kind: samples[kind].bits or WHOLE_BITS for kind in kinds} | {"masks": WHOLE_BITS}
+    remarks = []
+    for used in sorted({bits[kind] for kind in kinds} - {WHOLE_BITS}):
+        folders = [f"{kind}/" for kind in kinds if bits[kind] == used]
+        remarks.append(compose("picture-levels", folders=folders, most=2**used - 1, bits=used, shift=WHOLE_BITS - used))
+    return bits, remarks
+
+
+def _page_remarks(folder: Path, jobs: Sequence[tuple[str, str, Path]]) -> list[Message]:
+    """Returns a remark that names the files of several pictures, of which the first is read."""
+    paged = [path.relative_to(folder).as_posix() for _, _, path in jobs if page_count(path) > 1]
+    if not paged:
+        return []
+    return [compose("file-unread", remark=compose("pages-unread", count=len(paged), pictures=some_of(paged)))]
+
+
+def _grey_remarks(images: Mapping[str, np.ndarray]) -> list[Message]:
+    """Returns a remark that names the grey pictures among some in colour."""
+    grey = [name for name, image in images.items() if is_grey(image)]
+    return [compose("pictures-grey", cameras=some_of(grey))] if 0 < len(grey) < len(images) else []
+
+
+def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
+    """Writes a capture folder of PNG files, each under a temporary name first. ``rig`` are the cameras of these
+    pictures."""
+    write_rig(rig, folder / "cameras.json")
+    files: list[tuple[Path, np.ndarray]] = []
+    for name, image in capture.images.items():
+        files.append((folder / "images" / f"{name}.png", image))
+    for name, plates in capture.backgrounds.items():
+        several = len(plates) > 1
+        for i, plate in enumerate(plates):
+            files.append((folder / "background" / (f"{name}/{i:03}.png" if several else f"{name}.png"), plate))
+    for name, mask in capture.masks.items():
+        share = capture.soft_masks.get(name, mask.astype(np.uint8) * np.uint8(255))
+        files.append((folder / "masks" / f"{name}.png", share))
+    with ThreadPoolExecutor(max_workers=4) as pool:
+        list(pool.map(lambda file: write_image(*file), files))
+    if capture.features:
+        text = json.dumps(document_from_features(capture.features), indent=1)
+        write_atomically(folder / "features.json", text.encode())
+
+
+def _in_read_pictures(features: Features, rig: Rig) -> Features:
+    """Moves feature points from the pictures in the files to the pictures as they are read, where these are
+    undistorted."""
+
+    def moved(name: str, pixel: np.ndarray) -> np.ndarray:
+        lens = rig[name].recorded
+        return pixel if lens is None else lens.undistorted(pixel[None], rig[name].intrinsics.matrix())[0]
+
+    return {point: {name: moved(name, at) for name, at in views.items()} for point, views in features.items()}
+
+
+def decode_picture(
+    folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None, bits: int
+) -> tuple[np.ndarray | None, str, Message | None]:
+    """Decodes a file of a camera, reduced and undistorted. Returns its pixels, the sha256 of the file, and a fault
+    (then there are no pixels). ``kind`` is images, background or masks."""
+    camera = rig[name]
+    wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
+    where, whole = path.relative_to(folder).as_posix(), kind == "masks"
+    pixels, digest, fault = decode_image_file(
+        path, where, "mask" if whole else "colour", share=1.0 if whole else share, bits=bits
+    )
+    if pixels is None:
+        return None, digest, fault
+    size = (pixels.shape[1], pixels.shape[0]) if whole or share == 1.0 else picture_size(path)
+    if size != wanted:
+        differs = size_fault(where, size, camera.intrinsics)
+        pages = page_count(path)
+        return None, "", differs if pages == 1 else compose("first-page-differs", fault=differs, pages=pages)
+    if whole:  # masks are interpreted together, and before pixels are averaged
+        return pixels, digest, fault
+    if camera.recorded is not None:
+        matrix = work_rig(rig.subset([name]), pixels_most)[name].intrinsics.matrix()
+        pixels = camera.recorded.undistort(pixels, matrix)
+    pixels.setflags(write=False)
+    return pixels, digest, fault
+
+
+def size_fault(where: str, size: tuple[int, int], k: Intrinsics) -> Message:
+    """Describes a picture whose size (width, height) is not that of its camera."""
+    of_picture, of_camera = f"{size[0]} x {size[1]}", f"{k.width} x {k.height}"
+    fault = compose("picture-size-differs", picture=where, size=of_picture, wanted=of_camera)
+    if size == (k.height, k.width):
+        as_told, turned = (abs(k.cx - w / 2) + abs(k.cy - h / 2) for w, h in ((k.width, k.height), size))
+        if turned < as_told:
+            return compose("located", where=fault, fault=compose("size-exchanged"))
+        return compose("located", where=fault, fault=compose("picture-turned"))
+    share = size[0] / k.width
+    if abs(size[1] - share * k.height) <= 1.0:
+        return compose("picture-scaled", fault=fault)
+    return fault

@@ -1,0 +1,226 @@
+"""Assigns the files of a capture folder to cameras: each camera's picture, mask and clean plates.
+
+A file belongs to the camera whose name it has. If a camera has no file of exactly its name, similar names are matched
+where only one camera can be meant (``rig.formats.pictures.picture_names``), then the body's serial number in EXIF
+(``serials``). A camera's file may also lie in a folder of the camera's name, and all files together in one more
+folder."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rig.formats.captures.serials import pictures_by_serial
+from rig.formats.pictures.images import is_picture
+from rig.formats.pictures.picture_names import UNREAD_PICTURES, is_junk, match_names, picture_stem
+from rig.messages.fault_groups import some_of
+from rig.messages.message import Message, compose
+from rig.rig import Rig
+
+PLATES_MOST = 32  # clean plates read per camera
+BESIDE_PICTURES = ("masks", "background")  # folders of a capture that belong to no single camera
+
+
+@dataclass(frozen=True, slots=True)
+class ShotFiles:
+    """Holds the files of a shot by camera. ``strays`` are pictures of no camera, relative to the capture's folder;
+    ``faults`` are messages on files that are missing or ambiguous."""
+
+    images: Mapping[str, Path]
+    masks: Mapping[str, Path]
+    plates: Mapping[str, tuple[Path, ...]]
+    strays: tuple[str, ...]
+    faults: tuple[Message, ...]
+
+    def of_camera(self, name: str) -> list[tuple[str, Path]]:
+        """Returns the kind (the folder's name) and path of each file of a camera."""
+        found = [("images", self.images.get(name)), ("masks", self.masks.get(name))]
+        found += [("background", plate) for plate in self.plates.get(name, ())]
+        return [(kind, path) for kind, path in found if path is not None]
+
+
+def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFiles:
+    """Finds the files of one shot. Files of the cameras in ``left_out``, which take no part, are neither used nor
+    strays."""
+    names, faults = [*rig.names, *left_out], list[Message]()
+    places = {"images": picture_folder(folder), **{kind: folder / kind for kind in BESIDE_PICTURES}}
+    owned = {kind: _owned(place, names, kind, rig, faults) for kind, place in places.items()}
+    images = {name: path for name in rig.names if (path := _one(owned["images"].get(name, []), folder, faults))}
+    masks = {name: path for name in rig.names if (path := _one(owned["masks"].get(name, []), folder, faults))}
+    plates = {
+        name: tuple(listed_plates)
+        for name in rig.names
+        if (listed_plates := _flat(owned["background"].get(name, []))[:PLATES_MOST])
+    }
+    used = {path for kind in owned.values() for paths in kind.values() for path in _flat(paths)}
+    strays = {kind: _strays(place, used, names, kind) for kind, place in places.items()}
+    missing, cause = _missing(folder, rig, images, masks, plates, places=places, strays=strays)
+    if places["images"] != folder:
+        strays["beside"] = [path for path in listed_pictures(folder) if path not in used]
+    stray_names = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
+    faults += missing + ([stray_sentence(stray_names, rig)] if missing and stray_names and not cause else [])
+    return ShotFiles(images, masks, plates, tuple(stray_names), tuple(faults))
+
+
+def picture_folder(folder: Path) -> Path:
+    """Returns the folder of a capture's photographs: images/ if it exists, otherwise the capture folder itself."""
+    return folder / "images" if (folder / "images").is_dir() else folder
+
+
+def listed_pictures(folder: Path) -> list[Path]:
+    """Returns the pictures in a folder, sorted; an empty list if the folder does not exist."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if is_picture(path))
+
+
+def stray_sentence(strays: Sequence[str], rig: Rig) -> Message:
+    """Returns a message that names the pictures which belong to no camera."""
+    return compose("pictures-strange", count=len(strays), pictures=some_of(strays), cameras=rig.names)
+
+
+def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[Message]) -> dict[str, list[Path]]:
+    """Returns the files and folders of each camera in one of the capture's folders."""
+    if not place.is_dir():
+        return {}
+    inner = _unwrapped(place, names)
+    pictures = listed_pictures(inner)
+    beside = () if kind != "images" or inner != place or place.name == "images" else BESIDE_PICTURES
+    folders = [path for path in _folders(inner) if path.name not in beside and listed_pictures(path)]
+    found: dict[str, list[Path]] = {}
+    for path in [*pictures, *folders]:
+        camera = path.stem if path in pictures and path.stem in names else path.name
+        if camera in names:
+            found.setdefault(camera, []).append(path)
+    paths = {path.name: path for path in [*pictures, *folders]}
+    spelled = match_names(paths, names, several=kind == "background")
+    found |= {name: [paths[file] for file in camera] for name, camera in spelled.items()}
+    if not spelled and kind != "masks":
+        found |= {name: [path] for name, path in pictures_by_serial(inner, rig, faults).items()}
+    return found
+
+
+def _unwrapped(place: Path, names: Sequence[str]) -> Path:
+    """Returns the single enclosing folder in a folder without pictures, unless it is a camera's own:
+    ``images/shot01/cam00.png``."""
+    folders = [path for path in _folders(place) if path.name not in (*BESIDE_PICTURES, "images")]
+    alone = len(folders) == 1 and not listed_pictures(place) and place.name in ("images", *BESIDE_PICTURES)
+    alone = alone and not match_names([folders[0].name], names) and folders[0].name not in names
+    return folders[0] if alone and len(listed_pictures(folders[0])) > 1 else place
+
+
+def _folders(place: Path) -> list[Path]:
+    return sorted(path for path in place.iterdir() if path.is_dir() and not is_junk(path.name))
+
+
+def _one(paths: Sequence[Path], root: Path, faults: list[Message]) -> Path | None:
+    """Returns a camera's single picture or mask: the file itself, or the file in the camera's folder. More than one is
+    a fault."""
+    files = [path for path in paths if path.is_file()]
+    if len(files) > 1:
+        where = files[0].parent.relative_to(root).as_posix()
+        faults.append(compose("pictures-of-one-camera", folder=where, pictures=[path.name for path in files]))
+    if files:
+        return files[0]
+    inside = _flat(paths)
+    if len(inside) > 1:
+        faults.append(compose("pictures-in-camera-folder", folder=paths[0].name, count=len(inside)))
+    return inside[0] if inside else None
+
+
+def _flat(paths: Sequence[Path]) -> list[Path]:
+    """Returns the files among the paths, and the pictures in the folders among them."""
+    return [path for entry in paths for path in (listed_pictures(entry) if entry.is_dir() else [entry])]
+
+
+def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> list[Path]:
+    """Returns pictures in a folder of the capture that belong to no camera, those of unreadable formats included."""
+    if not place.is_dir():
+        return []
+    is_root = kind == "images" and place.name != "images"
+    folders = [place, *(path for path in _folders(place) if not is_root or path.name in names)]
+    here = [path for folder in folders for path in sorted(folder.iterdir()) if _shows_something(path)]
+    return [path for path in here if path not in used and not (is_root and path.suffix.lower() in (".pdf", ".npy"))]
+
+
+def _shows_something(path: Path) -> bool:
+    return is_picture(path) or (path.suffix.lower() in UNREAD_PICTURES and not is_junk(path.name) and path.is_file())
+
+
+def _missing(
+    folder: Path,
+    rig: Rig,
+    images: Mapping[str, Path],
+    masks: Mapping[str, Path],
+    plates: Mapping[str, tuple[Path, ...]],
+    *,
+    places: Mapping[str, Path],
+    strays: Mapping[str, Sequence[Path]],
+) -> tuple[list[Message], bool]:
+    """Returns faults for missing files, and whether they name the strays already.
+
+    If no camera has a file of its name and other files are there, that is reported as one cause."""
+    inside = "" if places["images"] == folder else "images/"
+    faults, alone, named = list[Message](), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES), False
+    lacking = [name for name in rig.names if name not in images]
+    if cause := _cause(rig, lacking, strays["images"], inside or compose("the-folder"), compose("a-picture")):
+        faults.append(cause)
+        named = True
+    else:
+        for name in lacking:
+            other = _of_other_kind(name, folder, strays["images"])
+            if other is not None:
+                named = True
+                faults.append(other)
+            elif link := _broken_link(places["images"], name):
+                where, target = link.relative_to(folder).as_posix(), link.readlink().as_posix()
+                faults.append(compose("picture-link-broken", picture=where, target=target))
+            else:
+                faults.append(compose("picture-missing", picture=f"{inside}{name}.png"))
+    lacking = [] if alone else [name for name in rig.names if name not in plates and name not in masks]
+    cause = _cause(rig, lacking, strays["masks"], "masks/", compose("a-mask"))
+    cause = cause or _cause(rig, lacking, strays["background"], "background/", compose("a-clean-plate"))
+    for name in () if cause else lacking:
+        other = _of_other_kind(name, folder, [*strays["masks"], *strays["background"]])
+        named = named or other is not None
+        faults.append(other or compose("plate-missing", camera=name))
+    return [*faults, *([cause] if cause else [])], named or bool(cause)
+
+
+def _of_other_kind(name: str, folder: Path, strays: Sequence[Path]) -> Message | None:
+    """Returns the fault of a camera's file of a kind that is not read, or None."""
+    for path in strays:
+        kind = UNREAD_PICTURES.get(path.suffix.lower())
+        if kind is not None and picture_stem(path.name) == name:
+            return compose("picture-kind-unread", picture=path.relative_to(folder).as_posix(), kind=kind)
+    return None
+
+
+def _broken_link(place: Path, name: str) -> Path | None:
+    """Returns a symbolic link of the camera's name whose target is missing, or None."""
+    links = (path for path in sorted(place.iterdir()) if path.is_symlink() and not path.exists())
+    return next((path for path in links if picture_stem(path.name) == name), None)
+
+
+def _cause(
+    rig: Rig, lacking: Sequence[str], strays: Sequence[Path], place: str | Message, what: Message
+) -> Message | None:
+    """Returns one message if all cameras lack a file and at least as many other files are there; otherwise None."""
+    strangers = [path for path in strays if is_picture(path)]
+    if not len(lacking) == len(rig) > 1 or len(strangers) < max(len(lacking), 2):
+        return None
+    cameras = compose("first-to-last", first=rig.names[0], last=rig.names[-1])
+    parents = sorted({path.parent.name for path in strangers})
+    if len(parents) > 1 and len({path.name for path in strangers}) < len(strangers):
+        return compose("shots-in-folders", what=what, place=place, folders=some_of(parents), cameras=cameras)
+    found = compose("first-to-last", first=strangers[0].name, last=strangers[-1].name)
+    doubt = _doubt(strangers, rig) or compose("rename-either")
+    return compose("names-differ", what=what, place=place, cameras=cameras, found=found, remedy=doubt)
+
+
+def _doubt(strangers: Sequence[Path], rig: Rig) -> Message | None:
+    """Returns why names that contain those of cameras cannot be assigned: there are several for each camera."""
+    several = match_names([path.name for path in strangers], rig.names, several=True)
+    if len(several) < len(rig) or all(len(pictures) == 1 for pictures in several.values()):
+        return None
+    pictures = several[rig.names[0]]
+    return compose("several-of-each", camera=rig.names[0], count=len(pictures), files=some_of(pictures, 2))

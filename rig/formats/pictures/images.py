@@ -1,0 +1,308 @@
+"""Reads picture files by their content, and writes them so that no reader meets a half-written file.
+
+Ordinary pictures (8 or 16 bits) are decoded by OpenCV, RAW and DNG by LibRaw, HEIC by libheif; all become 8-bit sRGB.
+For Netpbm's maps the header states the value of white (4095 for 12 bits), which becomes 255. EXIF's orientation is
+ignored, since calibrations refer to the sensor's own rows and columns."""
+
+import hashlib
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, UnidentifiedImageError
+
+from rig.atomic_write import write_atomically
+from rig.errors import InputError, how_to_install
+from rig.formats.pictures.mask_values import Plane, mask_plane
+from rig.formats.pictures.picture_names import HEIC_SUFFIXES, IMAGE_SUFFIXES, RAW_SUFFIXES
+from rig.formats.pictures.picture_samples import TIFF, WHOLE_BITS
+from rig.formats.pictures.work_size import at_share, halvings
+from rig.image import ImageRgb
+from rig.mask_polarity import subject_convention
+from rig.messages.message import Message, compose
+
+# Pillow's names. JPEG covers the MPO that many phones write into a .jpg, PPM all of Netpbm's maps.
+IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM")
+
+
+PictureKind = Literal["colour", "grey", "mask"]
+JPEG = b"\xff\xd8\xff"
+NETPBM = re.compile(
+    rb"P[2356](?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+(\d+)\s"
+)  # its last number is the value of white
+PNG_COLOUR_TYPE, PNG_WITH_ALPHA = 25, (4, 6)  # offset of the header's colour type, and its values with alpha
+CUT_AWAY_LEAST = 0.25  # transparent share of a cut-out picture; the empty rim of an undistorted one is 0.1 at most
+PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+FTYP = slice(4, 12)  # bytes that name the kind of a HEIC, AVIF or video file
+HEIC_BRANDS = (b"ftypheic", b"ftypheix", b"ftypmif1")  # in telephones' .jpg files, too
+OTHER_BRANDS = {b"ftypavif": "AVIF", b"ftypisom": "video", b"ftypmp42": "video", b"ftypqt  ": "video"}
+OTHER_BEGINNINGS = {b"GIF8": "GIF", b"%PDF": "PDF", b"8BPS": "Photoshop", b"\xff\x0a": "JPEG XL"}
+GREY_FLAGS = (
+    cv2.IMREAD_GRAYSCALE,
+    cv2.IMREAD_REDUCED_GRAYSCALE_2,
+    cv2.IMREAD_REDUCED_GRAYSCALE_4,
+    cv2.IMREAD_REDUCED_GRAYSCALE_8,
+)
+COLOUR_FLAGS = (  # the reducing ones give BGR; OpenCV has no RGB variant of them
+    cv2.IMREAD_COLOR_RGB,
+    cv2.IMREAD_REDUCED_COLOR_2,
+    cv2.IMREAD_REDUCED_COLOR_4,
+    cv2.IMREAD_REDUCED_COLOR_8,
+)
+PAGED_SUFFIXES = (".tif", ".tiff", ".webp")  # of files that hold several pictures
+PIXELS_MOST = 100_000_000  # 100 Mpx, the largest studio backs; more is a decompression bomb
+
+
+# Sensor noise does not repeat, so a search for repeats is useless: this halves the time and saves a sixth of space.
+PNG_OPTIONS = [
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
+]
+
+
+def is_picture(path: Path) -> bool:
+    """Tells whether a path is a visible file (no folder, pipe or broken link) whose suffix is a picture's."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def write_image(
+    path: Path,
+    image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"],
+    quality: int = 95,
+    *,
+    parents: bool = True,
+) -> None:
+    """Writes RGB or grey pixels in the format of the suffix. ``quality`` is JPEG's; ``parents`` makes the folder if
+    need be."""
+    image = np.ascontiguousarray(image)
+    pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if path.suffix == ".jpg" else PNG_OPTIONS
+    done, data = cv2.imencode(path.suffix, pixels, options)
+    assert done
+    write_atomically(path, data.tobytes(), parents=parents)
+
+
+def read_image(path: Path) -> ImageRgb:
+    """Returns an RGB image. Raises InputError for a file that is no picture or damaged."""
+    pixels, _, fault = decode_image_file(path, path.name, "colour")
+    if pixels is None:
+        assert fault is not None
+        raise InputError(path.name, [fault])
+    return pixels
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Returns width and height from the header, without decoding: a small file may claim any size. Raises InputError if
+    there is no such header."""
+    with _faults_of(path.name):
+        return _header_size(path.read_bytes(), path.suffix.lower())[0]
+
+
+def page_count(path: Path) -> int:
+    """Returns how many pictures a TIFF or WebP file holds, of which the first is read; 1 for other and damaged ones."""
+    if path.suffix.lower() not in PAGED_SUFFIXES:
+        return 1
+    try:
+        with _faults_of(path.name), Image.open(path, formats=IMAGE_FORMATS) as header:
+            return int(getattr(header, "n_frames", 1))
+    except InputError:
+        return 1
+
+
+def open_picture(path: Path) -> Image.Image:
+    """Opens a picture with Pillow, which decodes only as much as a thumbnail needs. Raises InputError."""
+    if path.suffix.lower() in (*RAW_SUFFIXES, *HEIC_SUFFIXES):
+        return Image.fromarray(read_image(path))
+    with _faults_of(path.name):
+        return Image.open(path, formats=IMAGE_FORMATS)
+
+
+def decode_image_file(
+    path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
+) -> tuple[np.ndarray | None, str, Message | None]:
+    """Decodes a picture file. Returns its pixels, the sha256 of the file, and a fault (then there are no pixels).
+
+    Args:
+        path: the file.
+        where: its name in messages.
+        kind: ``colour`` gives RGB, ``grey`` one channel, ``mask`` the channel that holds the mask, in the file's own
+            values (``rig.formats.pictures.mask_values``).
+        share: scale of width and height, 1 or less; masks keep all their pixels.
+        bits: how many bits the samples of a 16-bit file use (``rig.formats.pictures.picture_samples``).
+    """
+    suffix, data = path.suffix.lower(), b""
+    try:
+        with _faults_of(where):
+            data = path.read_bytes()
+            (width, height), profile = _header_size(data, suffix)
+        if width * height > PIXELS_MOST:
+            raise InputError(where, [compose("picture-large", width=width, height=height, most=PIXELS_MOST)])
+        with _faults_of(where, compose("picture-damaged")):
+            pixels = _decoded(data, suffix, kind, halved=halvings(share, (width, height)), bits=bits)
+        pixels = _plane(pixels, where) if kind == "mask" else at_share(pixels, (width, height), share)
+    except InputError as error:
+        fault = compose("picture-floats") if _holds_floats(data) else error.faults[0]
+        return None, "", compose("of-file", file=where, fault=fault)
+    if data.startswith(PNG) and PNG_END not in data:  # OpenCV silently fills the missing part of a truncated file
+        return None, "", compose("of-file", file=where, fault=compose("picture-damaged"))
+    if profile and kind == "colour":
+        pixels = _in_srgb(pixels, profile)
+    return pixels, hashlib.sha256(data).hexdigest(), None
+
+
+def cut_out_alpha(path: Path) -> Plane | None:
+    """Returns the alpha channel, in the file's own values, of a picture from which the subject was cut out.
+
+    Returns None if the file has no alpha, is too large or damaged, or if its alpha shows no subject. A subject stands
+    in the middle, with at least ``CUT_AWAY_LEAST`` of the picture transparent around it; rounded corners and the empty
+    rim of an undistorted picture do not count."""
+    data, suffix = path.read_bytes(), path.suffix.lower()
+    if data.startswith(PNG):
+        if len(data) <= PNG_COLOUR_TYPE or data[PNG_COLOUR_TYPE] not in PNG_WITH_ALPHA:
+            return None
+    elif suffix not in (".webp", ".tif", ".tiff"):
+        return None
+    try:
+        with _faults_of(path.name):
+            (width, height), _ = _header_size(data, suffix)
+            if width * height > PIXELS_MOST:
+                return None
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except InputError:
+        return None
+    if pixels is None or pixels.ndim != 3 or pixels.shape[2] != 4:
+        return None
+    alpha = np.ascontiguousarray(pixels[..., 3])
+    opaque = alpha > {"uint8": 127, "uint16": 32767}.get(alpha.dtype.name, 0.5)
+    if 1.0 - opaque.mean() < CUT_AWAY_LEAST or subject_convention(opaque) != "white":
+        return None
+    return alpha
+
+
+@contextmanager
+def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
+    """Raises InputError in place of the errors that decoders raise for a damaged file."""
+    said = fault or compose("no-picture")
+    try:
+        yield
+    except PermissionError as error:
+        raise InputError(where, [compose("no-file-read", reason=error.strerror or str(error))]) from error
+    except Image.DecompressionBombError as error:
+        raise InputError(where, [compose("picture-huge", most=PIXELS_MOST)]) from error
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, cv2.error) as error:
+        raise InputError(where, [said]) from error
+
+
+def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
+    """Returns width and height, and the colour profile (empty for sRGB)."""
+    if suffix in RAW_SUFFIXES:
+        with _raw(data) as raw:
+            return (raw.sizes.width, raw.sizes.height), b""
+    if suffix in HEIC_SUFFIXES or data[FTYP] in HEIC_BRANDS:
+        header = heif_header(data)
+        return header.size, header.info.get("icc_profile") or b""
+    if data[FTYP] in OTHER_BRANDS or data.startswith(tuple(OTHER_BEGINNINGS)):
+        kind = OTHER_BRANDS.get(data[FTYP]) or next(k for b, k in OTHER_BEGINNINGS.items() if data.startswith(b))
+        raise InputError("picture", [compose("picture-of-kind", kind=kind)])
+    with Image.open(BytesIO(data), formats=IMAGE_FORMATS) as header:  # reads the header only
+        return header.size, header.info.get("icc_profile") or b""
+
+
+def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: int) -> np.ndarray:
+    """Returns the decoded pixels. ``halved``: how often a JPEG is halved while decoding, which is faster than full
+    size; other formats are never halved."""
+    if suffix in RAW_SUFFIXES:
+        with _raw(data) as raw:
+            # The camera's white balance, and no automatic brightness: pictures of all cameras must stay comparable.
+            pixels = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8, user_flip=0)
+    elif suffix in HEIC_SUFFIXES or data[FTYP] in HEIC_BRANDS:
+        pixels = np.asarray(heif_header(data).to_pillow().convert("RGB"))
+    else:
+        white = NETPBM.match(data, 0, 1 << 12)
+        if white is not None and int(white[1]) not in (255, 65535):
+            return _of_white(data, int(white[1]), kind)
+        halved = halved if data.startswith(JPEG) and kind != "mask" else 0
+        flags = cv2.IMREAD_UNCHANGED if kind == "mask" else (GREY_FLAGS if kind == "grey" else COLOUR_FLAGS)[halved]
+        flags |= cv2.IMREAD_ANYDEPTH if bits < WHOLE_BITS and kind != "mask" else 0
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+        if pixels is None:
+            raise ValueError("not decoded")
+        if kind == "mask":
+            return pixels
+        if pixels.dtype == np.uint16:
+            pixels = np.minimum(np.right_shift(pixels, bits - 8), 255).astype(np.uint8)
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if halved and kind == "colour" else pixels
+    if kind == "mask":
+        return pixels
+    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if kind == "grey" else np.ascontiguousarray(pixels)
+
+
+def _holds_floats(data: bytes) -> bool:
+    """Tells whether a TIFF file holds floating-point numbers, as programs for high dynamic range write them."""
+    if not data.startswith(TIFF):
+        return False
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return pixels is not None and pixels.dtype.kind == "f"
+
+
+def _of_white(data: bytes, white: int, kind: PictureKind) -> np.ndarray:
+    """Decodes a Netpbm map whose white is neither 255 nor 65535. Raises ValueError."""
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or not 0 < white < 65536:
+        raise ValueError("not decoded")
+    if kind == "mask":
+        return pixels
+    bytes_of = np.clip(np.round(np.arange(65536) * (255.0 / white)), 0, 255).astype(np.uint8)
+    pixels = bytes_of[np.asarray(pixels, np.uint16)]
+    if kind == "grey":
+        return pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB)
+
+
+def _plane(pixels: np.ndarray, where: str) -> Plane:
+    plane = mask_plane(pixels)
+    if isinstance(plane, Message):
+        raise InputError(where, [plane])
+    return plane
+
+
+@contextmanager
+def _raw(data: bytes) -> Iterator[Any]:
+    import rawpy  # 0.1 s, and a library that few captures need
+
+    try:
+        with rawpy.imread(BytesIO(data)) as raw:
+            yield raw
+    except rawpy.LibRawError as error:
+        raise ValueError(str(error)) from error
+
+
+def heif_header(data: bytes) -> Any:
+    """Opens a HEIC file without decoding it. Raises InputError if the extra ``heic`` is not installed."""
+    try:
+        import pi_heif
+    except ModuleNotFoundError:
+        raise InputError("picture", [compose("heic-not-installed", remedy=how_to_install("heic"))]) from None
+    return pi_heif.open_heif(BytesIO(data))
+
+
+def _in_srgb(pixels: ImageRgb, profile: bytes) -> ImageRgb:
+    """Converts colours of another profile (Display P3, Adobe RGB) to sRGB. An unreadable profile is treated as sRGB."""
+    from PIL import ImageCms
+
+    try:
+        source = ImageCms.ImageCmsProfile(BytesIO(profile))
+        if "srgb" in ImageCms.getProfileDescription(source).lower():
+            return pixels
+        into = ImageCms.createProfile("sRGB")
+        turned = ImageCms.profileToProfile(Image.fromarray(pixels), source, into, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError):
+        return pixels
+    return pixels if turned is None else np.array(turned)

@@ -1,0 +1,233 @@
+"""cameras.json: what is written is read back; every fault is named; the rig knows its centre and its front."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.camera import Camera, Distortion, Intrinsics
+from rig.errors import InputError
+from rig.formats.cameras.cameras_json import document_from_rig, read_rig, rig_from_document, write_rig
+from rig.geometry import RigidTransform, look_at, rotation_from_vector
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+
+CENTRE = np.array([30.0, -20.0, 50.0])
+
+
+def fan(turn: RigidTransform | None = None) -> Rig:
+    """Eleven cameras from -75 to 75 degrees around CENTRE; ``turn`` puts the whole rig into another world frame."""
+    cameras = []
+    for i, angle in enumerate(np.radians(np.linspace(-75, 75, 11))):
+        place = CENTRE + 1000.0 * np.array([np.sin(angle), 0.2 * (-1) ** i, np.cos(angle)])
+        pose = look_at(place, CENTRE, np.array([0.0, 1.0, 0.0]))
+        pose = pose if turn is None else pose @ turn.inverse()
+        lens = Distortion(-0.1 - 0.001 * i, 0.03, 1e-4, -2e-4, 0.002)
+        covariance = 1e-6 * np.diag([1.0, 1, 1, 1e4, 1e4, 2e4]) if i % 2 else None
+        intrinsics = Intrinsics(1024 + i, 768, 1500.0 + i, 1501.5, 510.25, 384.75, lens)
+        cameras.append(Camera(f"cam{i:02}", intrinsics, pose, covariance))
+    return Rig(tuple(cameras))
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    rig = fan()
+    write_rig(rig, tmp_path / "cameras.json")
+    again = read_rig(tmp_path / "cameras.json")
+    assert again.names == rig.names
+    for one, other in zip(rig, again, strict=True):
+        assert one.intrinsics == other.intrinsics
+        # the reader turns every matrix into the nearest rotation: rounding only
+        np.testing.assert_allclose(one.camera_from_world.rotation, other.camera_from_world.rotation, atol=1e-14)
+        np.testing.assert_array_equal(one.camera_from_world.translation, other.camera_from_world.translation)
+        assert (one.covariance is None) == (other.covariance is None)
+    np.testing.assert_array_equal(rig["cam01"].covariance, again["cam01"].covariance)
+
+
+def test_the_contract_s_example_is_read() -> None:
+    entry = {
+        "name": "cam00", "width": 1024, "height": 768,
+        "intrinsics": {"fx": 1500.0, "fy": 1500.0, "cx": 511.5, "cy": 383.5},
+        "distortion": {"model": "brown-conrady", "k1": 0, "k2": 0, "p1": 0, "p2": 0, "k3": 0},
+        "camera_from_world": {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [0, 0, 1200]},
+    }  # fmt: skip
+    entries = [entry | {"name": name} for name in ("cam00", "a.b-c_d", "7")]
+    rig = rig_from_document({"format": "eigenhead-cameras/1", "unit": "mm", "cameras": entries})
+    np.testing.assert_array_equal(rig["cam00"].project(np.zeros((1, 3))), [[511.5, 383.5]])
+
+
+def fault(path: str, value: Any) -> Any:
+    """A document with one value changed (deleted if ``...``), as a test case that bears its name."""
+    document = copy.deepcopy(document_from_rig(fan()))
+    place: Any = document
+    keys = [int(key) if key.isdigit() else key for key in path.split(".")]
+    for key in keys[:-1]:
+        place = place[key]
+    if value is ...:
+        del place[keys[-1]]
+    else:
+        place[keys[-1]] = value
+    return document
+
+
+NAN, INF = float("nan"), float("inf")
+MIRROR = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("format", "eigenhead-cameras/9", "format is 'eigenhead-cameras/9'"),
+        ("format", ..., "format is None"),
+        ("unit", "m", "unit is 'm', wanted 'mm'"),
+        ("cameras.3", "camera", "cameras[3] is no object"),
+        ("cameras.3.name", ..., "cameras[3].name None is no name"),
+        ("cameras.3.name", "../etc", "may hold only"),
+        ("cameras.3.name", ".hidden", "may not start with '.'"),
+        ("cameras.3.name", "caméra", "may hold only ASCII"),
+        ("cameras.3.name", "x" * 65, "is no name of 1 to 64 characters"),
+        ("cameras.3.name", "cam04", "camera 'cam04' occurs 2 times"),
+        ("cameras.3.width", 0, "cam03.width is 0"),
+        ("cameras.3.width", 1e9, "cam03.width is 1000000000.0"),
+        ("cameras.3.height", 767.5, "cam03.height is 767.5"),
+        ("cameras.3.height", True, "cam03.height is True"),
+        ("cameras.3.height", NAN, "cam03.height is nan"),
+        ("cameras.3.height", INF, "cam03.height is inf"),
+        ("cameras.3.intrinsics", ..., "cam03.intrinsics is missing or no object: wanted are fx, fy, cx, cy by name"),
+        ("cameras.3.intrinsics.fx", NAN, "cam03.intrinsics.fx is nan"),
+        ("cameras.3.intrinsics.fx", "1500", "cam03.intrinsics.fx is '1500'"),
+        ("cameras.3.intrinsics.fy", -1500.0, "cam03.intrinsics: fx and fy must be positive"),
+        ("cameras.3.intrinsics.cx", 10**400, "cam03.intrinsics.cx is 1000"),
+        ("cameras.3.intrinsics.cy", ..., "cam03.intrinsics.cy is None"),
+        ("cameras.3.distortion", [0, 0], "cam03.distortion is missing or no object: wanted are k1, k2, p1, p2, k3"),
+        ("cameras.3.distortion.model", "fisheye", "cam03.distortion.model is 'fisheye'"),
+        ("cameras.3.distortion.k1", None, "cam03.distortion.k1 is None"),
+        ("cameras.3.camera_from_world.rotation", MIRROR, "a mirrored frame"),
+        ("cameras.3.camera_from_world.rotation", [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "is not orthonormal"),
+        ("cameras.3.camera_from_world.rotation", [[1, 0], [0, 1]], "not 3 x 3 numbers"),
+        ("cameras.3.camera_from_world.rotation", [0.1, 0.2, 0.3], "of a rotation vector write the matrix"),
+        ("cameras.3.camera_from_world.rotation", [[0.1], [0.2], [0.3]], "of a rotation vector write the matrix"),
+        ("cameras.3.camera_from_world.rotation", [[NAN] * 3] * 3, "rotation holds a value that is no"),
+        ("cameras.3.camera_from_world.translation", [0, NAN, 0], "translation holds a value that is no"),
+        ("cameras.3.camera_from_world.translation", [0, 10**400, 0], "translation holds a value that is no"),
+        ("cameras.3.camera_from_world.translation", "here", "translation is missing or not 3 numbers"),
+        ("cameras.3.covariance", np.eye(5).tolist(), "covariance is missing or not 6 x 6"),
+        ("cameras.3.covariance", (-np.eye(6)).tolist(), "not symmetric and positive semi-definite"),
+        ("cameras.3.covariance", np.triu(np.ones((6, 6))).tolist(), "not symmetric and positive semi-definite"),
+    ],
+)
+def test_a_fault_is_named(path: str, value: Any, words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        rig_from_document(fault(path, value))
+    assert len(caught.value.faults) == 1
+    assert words in caught.value.faults[0].text
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("key", ["format", "unit"])
+def test_a_value_of_any_length_is_told_cut(key: str) -> None:
+    with pytest.raises(InputError) as refused:
+        rig_from_document(document_from_rig(fan()) | {key: "x" * 100_000})
+    assert len(str(refused.value)) < 200
+
+
+def test_the_distortion_may_be_absent() -> None:
+    rig = rig_from_document(fault("cameras.3.distortion", ...))
+    assert rig["cam03"].intrinsics.distortion.is_zero
+
+
+@pytest.mark.parametrize("count", [0, 2, 65])
+def test_three_to_sixty_four_cameras_work(count: int) -> None:
+    entries = [document_from_rig(fan())["cameras"][0] | {"name": f"c{i}"} for i in range(count)]
+    with pytest.raises(InputError, match=f"{count} cameras; between 3 and 64 work"):
+        rig_from_document({"format": "eigenhead-cameras/1", "cameras": entries})
+
+
+def test_every_fault_is_named_not_only_the_first() -> None:
+    document = fault("cameras.3.intrinsics.fx", NAN)
+    document["unit"] = "m"
+    document["cameras"][5]["camera_from_world"]["translation"] = None
+    with pytest.raises(InputError) as caught:
+        rig_from_document(document)
+    assert len(caught.value.faults) == 3
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"cameras": {}}', "[" * 100_000, '{"cameras": 1e999}'])
+def test_no_text_escapes_as_another_error(text: str, tmp_path: Path) -> None:
+    (tmp_path / "cameras.json").write_text(text)
+    with pytest.raises(InputError):
+        read_rig(tmp_path / "cameras.json")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
+def test_cameras_are_read_in_the_encodings_of_windows(tmp_path: Path, encoding: str) -> None:
+    text = json.dumps(document_from_rig(default_layout()))
+    (tmp_path / "cameras.json").write_text(text, encoding=encoding)
+    assert read_rig(tmp_path / "cameras.json").names == default_layout().names
+
+
+def test_bytes_that_are_no_text_and_a_missing_file(tmp_path: Path) -> None:
+    (tmp_path / "cameras.json").write_bytes(b"\xff\xfe\x00")
+    for name, words in (("cameras.json", "cannot be read as JSON"), ("absent.json", "No such file")):
+        with pytest.raises(InputError, match=words):
+            read_rig(tmp_path / name)
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda children: st.lists(children, max_size=4) | st.dictionaries(st.text(max_size=5), children, max_size=4),
+    max_leaves=8,
+)
+
+
+@given(
+    value=json_values,
+    path=st.sampled_from(
+        ["cameras", "cameras.0", "cameras.0.intrinsics", "cameras.0.distortion", "cameras.0.camera_from_world"]
+        + ["cameras.0.width", "cameras.0.covariance", "cameras.0.camera_from_world.rotation", "unit"]
+    ),
+)
+def test_any_value_anywhere_is_a_rig_or_an_input_error(value: Any, path: str) -> None:
+    document = fault(path, value)
+    try:
+        rig = rig_from_document(document)
+    except InputError:
+        return
+    assert json.dumps(document_from_rig(rig), allow_nan=False)
+
+
+@pytest.mark.parametrize("turn", [np.zeros(3), np.array([np.pi, 0.0, 0.0]), np.array([0.5, -2.0, 1.0])])
+def test_centre_and_front_do_not_lean_on_the_world_s_axes(turn: np.ndarray) -> None:
+    world_from_world = RigidTransform(rotation_from_vector(turn), np.array([100.0, 2000.0, -300.0]))
+    rig = fan(world_from_world)
+    np.testing.assert_allclose(rig.centre_world(), world_from_world.apply(CENTRE), atol=1e-5)
+    assert rig.front_camera() == "cam05"
+
+
+def test_subset_keeps_the_order_and_lookup_fails_loudly() -> None:
+    rig = fan().subset(["cam07", "cam02", "nobody"])
+    assert rig.names == ("cam02", "cam07")
+    assert len(rig) == 2
+    assert "cam02" in rig
+    assert "cam03" not in rig
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("m", "1000"), ("cm", "10"), ("Inch", "25.4")])
+def test_a_unit_that_is_known_is_refused_with_its_factor(unit: str, factor: str) -> None:
+    document: dict[str, Any] = document_from_rig(fan()) | {"unit": unit}
+    with pytest.raises(InputError, match=f"multiply the translations by {factor} and write 'mm'"):
+        rig_from_document(document)
+
+
+def test_what_is_wrong_in_every_camera_is_said_once() -> None:
+    document = json.loads(json.dumps(document_from_rig(fan())))
+    for camera in document["cameras"]:
+        camera["camera_from_world"]["rotation"] = [0.1, 0.2, 0.3]
+    with pytest.raises(InputError) as caught:
+        rig_from_document(document)
+    (fault,) = caught.value.faults
+    assert "write the matrix (cv2.Rodrigues); the same is true of 10 more (cam01, " in str(fault)

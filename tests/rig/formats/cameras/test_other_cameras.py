@@ -1,0 +1,411 @@
+"""Foreign rig files: what is written is read back the same, by us and by pycolmap; damage always ends in InputError."""
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rig.camera import Camera, Distortion, Intrinsics
+from rig.errors import InputError
+from rig.formats.cameras.cameras_file import FORMATS, find_rig_file, read_rig_file, rig_file_parts, write_rig_file
+from rig.formats.cameras.cameras_json import write_rig
+from rig.formats.cameras.colmap import write_colmap
+from rig.formats.cameras.opencv_toml import write_aniposelib, write_caliscope
+from rig.formats.pictures.images import write_image
+from rig.geometry import look_at
+from rig.recorded_lens import RecordedLens
+from rig.rig import Rig
+from tests.support.shared_data import shared
+
+POINTS = np.random.default_rng(4).uniform(-80.0, 80.0, (20, 3))
+
+
+def fan(count: int = 5) -> Rig:
+    cameras = []
+    for i, azimuth in enumerate(np.linspace(-1.2, 1.2, count)):
+        centre = np.array([900 * np.sin(azimuth), 90.0 * i - 150, 900 * np.cos(azimuth)])
+        lens = Distortion(-0.11 + 0.02 * i, 0.05, 1e-3 * i, -7e-4, 0.013)
+        intrinsics = Intrinsics(1024 + i, 768, 1500.0 + i, 1510.0, 511.5 + i, 380.25, lens)
+        cameras.append(Camera(f"cam{i:02d}", intrinsics, look_at(centre, np.zeros(3), np.array([0.0, 1.0, 0.0]))))
+    return Rig(tuple(cameras))
+
+
+def write(kind: str, rig: Rig, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    match kind:
+        case "ours":
+            write_rig(rig, folder / "cameras.json")
+        case "colmap text":
+            write_colmap(rig, folder / "sparse" / "0")
+        case "colmap binary":
+            write_colmap(rig, folder, binary=True)
+        case "caliscope":
+            write_caliscope(rig, folder / "camera_array.toml")
+        case "aniposelib":
+            write_aniposelib(rig, folder / "calibration.toml")
+
+
+NAMES = {
+    "eigenhead": "cameras.json",
+    "colmap": "sparse/0",
+    "colmap-text": "sparse/0",
+    "caliscope": "camera_array.toml",
+    "aniposelib": "calibration.toml",
+    "metashape": "cameras.xml",
+    "realitycapture": "images",
+    "realitycapture-csv": "cameras.csv",
+    "nerfstudio": "transforms.json",
+    "opencv-yaml": ".",
+    "blender": "cameras.py",
+}
+
+
+def square(rig: Rig) -> Rig:
+    """The rig with square pixels, which is all that some formats know."""
+    lenses = [replace(camera.intrinsics, fy=camera.intrinsics.fx) for camera in rig]
+    return Rig(tuple(replace(c, intrinsics=lens) for c, lens in zip(rig, lenses, strict=True)))
+
+
+OTHERS = ("metashape", "realitycapture", "realitycapture-csv", "nerfstudio", "opencv-yaml")
+KINDS = ("ours", "colmap text", "colmap binary", "caliscope", "aniposelib")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_written_is_read_back(kind: str, tmp_path: Path) -> None:
+    rig = fan()
+    write(kind, rig, tmp_path)
+    (tmp_path / "board.toml").write_text('kind = "checkerboard"\n')  # no rig: must not be taken for one
+    path = find_rig_file(tmp_path)
+    assert path is not None
+    back = read_rig_file(path)
+    assert back.names == rig.names
+    for ours, theirs in zip(rig, back, strict=True):
+        assert theirs.intrinsics.width == ours.intrinsics.width
+        np.testing.assert_allclose(theirs.project(POINTS), ours.project(POINTS), atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_format_is_written_and_found_again(kind: str, tmp_path: Path) -> None:
+    rig = square(fan()) if kind == "realitycapture-csv" else fan()
+    write_rig_file(rig, tmp_path / NAMES[kind], kind)
+    for camera in rig:  # some formats leave the size to the pictures
+        pixels = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+        write_image(tmp_path / "images" / f"{camera.name}.png", pixels)
+    file = find_rig_file(tmp_path)
+    if kind == "blender":
+        assert file is None
+        return
+    assert file is not None
+    back = read_rig_file(file)
+    assert sorted(back.names) == sorted(rig.names)
+    for camera in rig:
+        np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-6)
+        assert back[camera.name].intrinsics.width == camera.intrinsics.width
+    assert all(part.is_file() for part in rig_file_parts(file))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+@pytest.mark.parametrize("vectors", [True, False])
+def test_opencv_matrices_in_one_file(unit: float, vectors: bool, tmp_path: Path) -> None:
+    """As who calibrated with OpenCV writes K, dist, R and T by FileStorage, in mm or in metres."""
+    rig = fan()
+    file = cv2.FileStorage(str(tmp_path / "studio.yaml"), cv2.FILE_STORAGE_WRITE)
+    for camera in rig:
+        pose = camera.camera_from_world
+        file.write(f"K_{camera.name}", camera.intrinsics.matrix())
+        file.write(f"dist_{camera.name}", camera.intrinsics.distortion.opencv())
+        file.write(f"R_{camera.name}", cv2.Rodrigues(pose.rotation)[0] if vectors else pose.rotation)
+        file.write(f"T_{camera.name}", pose.translation / unit)
+        pixels = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+        write_image(tmp_path / "images" / f"{camera.name}.png", pixels)
+    file.release()
+    (tmp_path / "compose.yaml").write_text("services: {}\n")  # no rig, and before it by name
+    path = find_rig_file(tmp_path)
+    assert path == tmp_path / "studio.yaml"
+    back = read_rig_file(tmp_path / "studio.yaml")
+    for camera in rig:
+        np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-6)
+
+
+def test_a_yaml_of_opencv_without_cameras_says_what_is_wanted(tmp_path: Path) -> None:
+    (tmp_path / "board.yml").write_text("%YAML:1.0\n---\nsquare: 25.\n")
+    with pytest.raises(InputError, match=r"board\.yml: holds no camera; wanted are K_<name>, dist_<name>, R_<name>"):
+        read_rig_file(tmp_path / "board.yml")
+
+
+def test_an_unknown_format_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'ply' is none of eigenhead, colmap"):
+        write_rig_file(fan(), tmp_path / "x", "ply")
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_pycolmap_loads_what_is_exported(binary: bool, tmp_path: Path) -> None:
+    rig = fan()
+    write_colmap(rig, tmp_path, binary=binary)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert len(model.images) == len(rig)
+    for image in model.images.values():
+        camera = rig[Path(image.name).stem]
+        theirs = np.array([image.project_point(point) for point in POINTS])
+        np.testing.assert_allclose(theirs - 0.5, camera.project(POINTS), atol=1e-8)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_models_written_by_pycolmap_are_read(binary: bool, tmp_path: Path) -> None:
+    rig = fan()
+    write_colmap(rig, tmp_path / "in")
+    model = pycolmap.Reconstruction(str(tmp_path / "in"))
+    out = tmp_path / "capture" / "sparse" / "0"
+    out.mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(str(out))
+    path = find_rig_file(tmp_path / "capture")
+    assert path is not None
+    back = read_rig_file(path)
+    assert sorted(back.names) == sorted(rig.names)
+    for camera in rig:
+        np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-8)
+
+
+def bent(lens: RecordedLens) -> Rig:
+    """The fan with a foreign lens before every camera."""
+    return Rig(
+        tuple(replace(c, intrinsics=replace(c.intrinsics, distortion=Distortion()), recorded=lens) for c in fan())
+    )
+
+
+FISHEYE = RecordedLens("kannala-brandt", (-0.02, 0.004, -0.001, 0.0002))
+RATIONAL = RecordedLens("rational", (0.1, -0.02, 1e-3, -5e-4, 0.003, 0.2, 0.01, 0.001))
+
+
+@pytest.mark.parametrize(
+    ("lens", "kind"),
+    [(FISHEYE, k) for k in ("eigenhead", "colmap", "colmap-text", "caliscope", "metashape", "nerfstudio")]
+    + [(RATIONAL, k) for k in ("eigenhead", "colmap", "aniposelib", "opencv-yaml")],
+)
+def test_foreign_lenses_go_out_and_in(lens: RecordedLens, kind: str, tmp_path: Path) -> None:
+    write_rig_file(bent(lens), tmp_path / NAMES[kind], kind)
+    file = find_rig_file(tmp_path)
+    assert file is not None
+    for camera in read_rig_file(file):
+        assert camera.recorded is not None
+        assert camera.recorded.model == lens.model
+        np.testing.assert_allclose(camera.recorded.coefficients, lens.coefficients, rtol=1e-12)
+        np.testing.assert_allclose(camera.project(POINTS), bent(lens)[camera.name].project(POINTS), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("lens", "kind"),
+    [(RATIONAL, "metashape"), (RATIONAL, "nerfstudio"), (FISHEYE, "opencv-yaml"), (FISHEYE, "realitycapture")],
+)
+def test_a_lens_that_a_format_does_not_have_is_refused(lens: RecordedLens, kind: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cam00"):
+        write_rig_file(bent(lens), tmp_path / NAMES[kind], kind)
+
+
+@pytest.mark.parametrize("lens", [FISHEYE, RATIONAL], ids=["OPENCV_FISHEYE", "FULL_OPENCV"])
+def test_pycolmap_bends_foreign_lenses_alike(lens: RecordedLens, tmp_path: Path) -> None:
+    write_colmap(bent(lens), tmp_path)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    for image in model.images.values():
+        camera = bent(lens)[Path(image.name).stem]
+        theirs = np.array([image.project_point(point) for point in POINTS]) - 0.5
+        ours = lens.distorted(camera.project(POINTS), camera.intrinsics.matrix())
+        np.testing.assert_allclose(theirs, ours, atol=1e-7)
+
+
+def test_simple_colmap_models_and_folders_of_images(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text(
+        "# c\n1 SIMPLE_PINHOLE 640 480 700 320 240\n2 RADIAL 640 480 710 320 240 0.1 -0.2\n"
+    )
+    poses = "".join(f"{i} 1 0 0 0 {i} 0 900 {1 + i % 2} cam{i}/shot.jpg\n10.5 11.5 -1\n" for i in range(3))
+    (tmp_path / "images.txt").write_text(poses)
+    rig = read_rig_file(tmp_path / "cameras.txt")
+    assert rig.names == ("cam0", "cam1", "cam2")
+    assert rig["cam0"].intrinsics == Intrinsics(640, 480, 700.0, 700.0, 319.5, 239.5)
+    assert rig["cam1"].intrinsics.distortion == Distortion(0.1, -0.2)
+
+
+def test_the_published_caliscope_file(tmp_path: Path) -> None:
+    rig = read_rig_file(shared("data/multicam-board/camera_array.toml"))
+    assert rig.names == ("cam_0", "cam_1", "cam_2", "cam_3")
+    np.testing.assert_allclose(rig["cam_0"].camera_from_world.translation, [171.2599, -32.3454, 1208.3865], atol=1e-3)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("", 1.0), ("", 1000.0), ('unit = "mm"', 1.0), ('unit = "m"', 1000.0)])
+def test_the_unit_of_an_aniposelib_file(unit: str, scale: float, tmp_path: Path) -> None:
+    rig = fan(3)
+    metres = tuple(
+        replace(c, camera_from_world=replace(c.camera_from_world, translation=c.camera_from_world.translation / scale))
+        for c in rig
+    )
+    path = tmp_path / "calibration.toml"
+    write_aniposelib(Rig(metres), path)
+    path.write_text(path.read_text().replace('unit = "mm"', unit))
+    back = read_rig_file(path)
+    np.testing.assert_allclose(back["cam01"].camera_from_world.translation, rig["cam01"].camera_from_world.translation)
+
+
+def corrupted(kind: str, folder: Path) -> Path:
+    """A rig file with one or more faults, named by the key of the table below."""
+    write("colmap text" if "text" in kind else "colmap binary" if "binary" in kind else "aniposelib", fan(), folder)
+    path = find_rig_file(folder)
+    assert path is not None
+    images = path.with_name(f"images{path.suffix}")
+    match kind:
+        case "binary: truncated cameras":
+            path.write_bytes(path.read_bytes()[:-30])
+        case "binary: truncated images":
+            images.write_bytes(images.read_bytes()[:-3])
+        case "binary: empty":
+            path.write_bytes(b"")
+        case "binary: a huge count":
+            path.write_bytes(struct.pack("<Q", 1 << 60) + path.read_bytes()[8:])
+        case "binary: a huge count of points":
+            images.write_bytes(images.read_bytes()[:-8] + struct.pack("<Q", 1 << 62))
+        case "binary: NaN focal length":
+            data = bytearray(path.read_bytes())
+            data[8 + 24 : 8 + 32] = struct.pack("<d", float("nan"))
+            path.write_bytes(data)
+        case "binary: fisheye":
+            data = bytearray(path.read_bytes())
+            data[12:16] = struct.pack("<i", 7)  # FOV
+            path.write_bytes(data)
+        case "binary: no images file":
+            images.unlink()
+        case "text: NaN translation":
+            images.write_text(
+                images.read_text().replace("1 cam00", "1 cam00").replace(" 1 cam00.png", " 1 cam00.png", 1)
+            )
+            first, *rest = images.read_text().splitlines()[2:]
+            words = first.split()
+            words[5] = "nan"
+            images.write_text("\n".join([" ".join(words), *rest]))
+        case "text: zero quaternion":
+            first, *rest = images.read_text().splitlines()[2:]
+            words = first.split()
+            words[1:5] = ["0"] * 4
+            images.write_text("\n".join([" ".join(words), *rest]))
+        case "text: unknown camera":
+            images.write_text(images.read_text().replace("3 cam02.png", "77 cam02.png"))
+        case "text: a parameter is missing":
+            path.write_text(path.read_text().replace(" 0.0 0.0 0.0\n", " 0.0 0.0\n", 1))
+        case "text: too many images":
+            line = images.read_text().splitlines()[2]
+            images.write_text("\n\n".join([line] * 100))
+        case "toml: broken":
+            path.write_text("[cam_0\n")
+        case "toml: NaN rotation and a missing matrix":
+            text = path.read_text().replace("rotation = [", "rotation = [nan, ", 1)
+            path.write_text(text.replace("matrix", "motrix", 2).replace("motrix", "matrix", 1))
+        case "toml: a fisheye of five coefficients":
+            path.write_text(path.read_text().replace('name = "cam01"', 'name = "cam01"\nfisheye = true'))
+    return path
+
+
+FAULTS = {
+    "binary: truncated cameras": ["promises|truncated"],
+    "binary: truncated images": ["truncated"],
+    "binary: empty": ["truncated"],
+    "binary: a huge count": ["promises 1152921504606846976"],
+    "binary: a huge count of points": ["promises 4611686018427387904"],
+    "binary: NaN focal length": ["cam00.intrinsics.fx"],
+    "binary: fisheye": ["number 7"],
+    "binary: no images file": ["is missing: copy all files of the model"],
+    "text: NaN translation": ["cam00.camera_from_world.translation"],
+    "text: zero quaternion": ["cam00.camera_from_world.rotation"],
+    "text: unknown camera": ["'cam02' names camera 77"],
+    "text: a parameter is missing": ["has 11 parameters"],
+    "text: too many images": ["images; a rig has at most"],
+    "toml: broken": ["cannot be understood"],
+    "toml: NaN rotation and a missing matrix": ["matrix is missing", "rotation"],
+    "toml: a fisheye of five coefficients": [r"cam01.distortions must be at most 4 coefficients \(k1 k2 k3 k4\)"],
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_each_fault_is_named(kind: str, tmp_path: Path) -> None:
+    path = corrupted(kind, tmp_path)
+    for expected in FAULTS[kind]:
+        with pytest.raises(InputError, match=expected):
+            read_rig_file(path)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    kind=st.sampled_from(KINDS[1:] + OTHERS),
+    which=st.integers(0, 1),
+    cut=st.integers(0, 2000),
+    at=st.integers(0, 2000),
+    patch=st.binary(max_size=12),
+)
+def test_no_damage_escapes_as_another_error(
+    kind: str, which: int, cut: int, at: int, patch: bytes, tmp_path: Path
+) -> None:
+    path = whole_file(kind, tmp_path / kind)
+    damaged = path.with_name(path.name.replace("cameras", "images")) if which and "colmap" in kind else path
+    if which and kind == "opencv-yaml":
+        damaged = path.with_name("extri.yml")
+    data = damaged.read_bytes()
+    data = data[:at] + patch + data[at + len(patch) :]
+    damaged.write_bytes(data[: len(data) - cut] if cut < len(data) // 2 else data)
+    try:
+        rig = read_rig_file(path)
+    except InputError:
+        return
+    assert all(np.isfinite(camera.camera_from_world.rotation).all() for camera in rig)
+
+
+def whole_file(kind: str, folder: Path) -> Path:
+    """A rig's file of that kind, not damaged yet."""
+    if kind in OTHERS:
+        write_rig_file(square(fan(3)), folder / NAMES[kind], kind)
+        for camera in fan(3):
+            write_image(folder / "images" / f"{camera.name}.jpg", np.zeros((768, 1024), np.uint8))
+        found = find_rig_file(folder)
+        assert found is not None
+        return found
+    write(kind, fan(3), folder)
+    path = {"colmap text": folder / "sparse/0/cameras.txt", "colmap binary": folder / "cameras.bin"}.get(kind)
+    return path or folder / ("camera_array.toml" if kind == "caliscope" else "calibration.toml")
+
+
+def test_opencv_yaml_of_plain_lists_is_read_and_words_in_place_of_numbers_are_named(tmp_path: Path) -> None:
+    """As written by hand, or cut off within a matrix."""
+    rig, path = fan(3), tmp_path / "studio.yml"
+    lines = ["%YAML:1.0", "---"]
+    for camera in rig:
+        pose, name = camera.camera_from_world, camera.name
+        rows = {f"K_{name}": camera.intrinsics.matrix(), f"Rot_{name}": pose.rotation}
+        lines += [f"{key}: [{', '.join(str(row.tolist()) for row in matrix)}]" for key, matrix in rows.items()]
+        lines += [f"dist_{name}: {camera.intrinsics.distortion.opencv().tolist()}"]
+        lines += [f"T_{name}: {pose.translation.tolist()}"]
+        lines += [f"W_{name}: {camera.intrinsics.width}", f"H_{name}: {camera.intrinsics.height}"]
+    path.write_text("\n".join(lines) + "\n")
+    back = read_rig_file(path)
+    for camera in rig:
+        np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-6)
+    words = [f"{line.split(':')[0]}: east" if line.startswith(("T_", "Rot_cam01")) else line for line in lines]
+    path.write_text("\n".join(words) + "\n")
+    with pytest.raises(InputError, match="T_cam00 is missing or no list of 3 numbers"):
+        read_rig_file(path)
+
+
+def test_a_csv_that_a_spreadsheet_saved_with_semicolons_is_read(tmp_path: Path) -> None:
+    rig, path = square(fan()), tmp_path / "cameras.csv"
+    for camera in rig:
+        blank = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+        write_image(tmp_path / "images" / f"{camera.name}.png", blank)
+    write_rig_file(rig, path, "realitycapture-csv")
+    plain = read_rig_file(path)
+    path.write_text("\ufeff" + path.read_text().replace(",", ";").replace(".", ",").replace(",png", ".png"), "utf-8")
+    assert find_rig_file(tmp_path) == path
+    saved = read_rig_file(path)
+    assert saved.names == plain.names
+    for one, other in zip(saved, plain, strict=True):
+        np.testing.assert_allclose(one.project(POINTS), other.project(POINTS))

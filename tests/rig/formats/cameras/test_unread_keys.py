@@ -1,0 +1,75 @@
+"""Keys of cameras.json that nobody reads are named, once, and stop nothing."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rig.formats.cameras.cameras_json import FORMAT, document_from_rig, read_rig
+from rig.formats.cameras.unread_keys import unread_keys, unread_keys_of
+from rig.formats.captures.capture_folder import read_capture
+from rig.studio.scene.layout import default_layout
+from tests.support.services import small_capture
+
+
+def test_what_this_program_writes_is_read_whole() -> None:
+    assert unread_keys_of(document_from_rig(default_layout())) == ()
+
+
+@pytest.mark.parametrize(
+    ("place", "key"),
+    [((), "units"), (("cameras",), "covarianse"), (("cameras", "intrinsics"), "skew"),
+     (("cameras", "distortion"), "k4"), (("cameras", "camera_from_world"), "scale")],
+)  # fmt: skip
+def test_a_key_that_is_not_read_is_named_with_its_place(place: tuple[str, ...], key: str) -> None:
+    document = json.loads(json.dumps(document_from_rig(default_layout())))
+    entry = document
+    for part in place:
+        entry = entry[part][3] if part == "cameras" else entry[part]
+    entry[key] = 1.0
+    (remark,) = unread_keys_of(document)
+    assert f"the key {'.'.join((*place, key))!r} is not read" in remark.text
+
+
+def test_what_all_cameras_have_alike_is_said_once() -> None:
+    document = json.loads(json.dumps(document_from_rig(default_layout())))
+    for camera in document["cameras"]:
+        camera["owner"] = "x"
+    (remark,) = unread_keys_of(document)
+    assert f"'cameras.owner' of {len(document['cameras'])} cameras" in remark.text
+
+
+@pytest.mark.parametrize("key", ["\ud800", "\x1b[31m", "\a", "a" * 1000])
+def test_a_key_of_any_signs_can_be_printed(key: str) -> None:
+    (remark,) = unread_keys_of({"format": FORMAT, key: 1})
+    assert remark.text.isprintable()
+    assert len(remark.text.encode()) < 200
+
+
+def test_a_thousand_keys_are_a_few_lines() -> None:
+    assert len(unread_keys_of({"format": FORMAT} | {f"key{i}": 0 for i in range(1000)})) == 9
+
+
+def test_a_capture_with_such_a_key_is_read_and_says_so(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    path = folder / "cameras.json"
+    document = json.loads(path.read_text())
+    document["cameras"][0]["covarianse"] = [[0.0]]
+    path.write_text(json.dumps(document))
+    assert len(read_rig(path)) == 3
+    capture, _ = read_capture(folder)
+    assert [r for r in capture.remarks if r.code == "unknown-key" and "'cameras.covarianse' is not read" in r.text]
+
+
+def test_each_lens_model_has_its_own_keys() -> None:
+    document = json.loads(json.dumps(document_from_rig(default_layout())))
+    document["cameras"][0]["distortion"] = {"model": "kannala-brandt", "k1": 0, "k2": 0, "k3": 0, "k4": 0}
+    assert unread_keys_of(document) == ()
+    document["cameras"][0]["distortion"]["p1"] = 0
+    assert len(unread_keys_of(document)) == 1
+
+
+def test_files_of_other_programs_and_damaged_ones_are_not_judged(tmp_path: Path) -> None:
+    (tmp_path / "camera_array.toml").write_text("[cam]\nport = 1\n")
+    (tmp_path / "cameras.json").write_text("{")
+    assert unread_keys(tmp_path / "camera_array.toml") == unread_keys(tmp_path / "cameras.json") == ()

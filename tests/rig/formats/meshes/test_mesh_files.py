@@ -1,0 +1,178 @@
+"""Mesh files: trimesh reads what we write, bytes are those of docs/capture-format.md, and damage ends in InputError."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.colour_space import linear_from_srgb, srgb_from_linear
+from rig.errors import InputError
+from rig.formats.meshes.glb import glb_bytes, write_glb
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.formats.meshes.obj import obj_bytes
+from rig.formats.meshes.ply import ply_bytes, read_head_ply, write_ply
+from rig.mesh import Mesh, boundary_edges, face_normals
+
+RNG = np.random.default_rng(0)
+BALL = trimesh.creation.icosphere(subdivisions=2, radius=90.0)
+COLOURS = RNG.integers(0, 256, (len(BALL.vertices), 3), dtype=np.uint8)
+MESH = Mesh(np.asarray(BALL.vertices, dtype=float), np.asarray(BALL.faces, dtype=np.int32), COLOURS)
+QUALITY = RNG.uniform(0, 2, len(BALL.vertices)).astype(np.float32)
+VIEWS = RNG.integers(0, 12, len(BALL.vertices), dtype=np.uint8)
+
+
+def ply(comments: tuple[str, ...] = ()) -> bytes:
+    return ply_bytes(MESH, normals=MESH.normals(), colours=COLOURS, quality=QUALITY, views=VIEWS, comments=comments)
+
+
+def test_normals_of_a_ball_point_outwards() -> None:
+    # The five or six facets around a vertex lean up to 11 degrees from the sphere, to all sides; what is left of their
+    # mean comes from their unequal areas, 15 % at most.
+    directions = MESH.vertices / np.linalg.norm(MESH.vertices, axis=1, keepdims=True)
+    assert (MESH.normals() * directions).sum(axis=1).min() > np.cos(np.radians(0.15 * 11.0))
+    area = 0.5 * np.linalg.norm(face_normals(MESH.vertices, MESH.faces), axis=1).sum()
+    assert area == pytest.approx(BALL.area)
+
+
+def test_a_face_without_area_gives_a_unit_normal_all_the_same() -> None:
+    flat = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32))
+    np.testing.assert_array_equal(flat.normals(), [[0, 0, 1]] * 3)
+
+
+def test_boundary_edges() -> None:
+    assert len(boundary_edges(MESH.faces)) == 0
+    opened = MESH.faces[1:]
+    missing = {(int(a), int(b)) for a, b in zip(MESH.faces[0], np.roll(MESH.faces[0], -1), strict=True)}
+    assert {(int(b), int(a)) for a, b in boundary_edges(opened)} == missing
+
+
+def test_trimesh_reads_our_ply(tmp_path: Path) -> None:
+    write_ply(tmp_path / "head.ply", MESH, normals=MESH.normals(), colours=COLOURS, quality=QUALITY, views=VIEWS)
+    loaded = trimesh.load(tmp_path / "head.ply", process=False)
+    assert isinstance(loaded, trimesh.Trimesh)
+    np.testing.assert_array_equal(loaded.vertices, MESH.vertices.astype(np.float32))
+    np.testing.assert_array_equal(loaded.faces, MESH.faces)
+    np.testing.assert_allclose(loaded.vertex_normals, MESH.normals(), atol=1e-6)
+    np.testing.assert_array_equal(read_mesh(tmp_path / "head.ply").colours, COLOURS)
+    data = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_array_equal(np.ravel(data["quality"]), QUALITY)
+    np.testing.assert_array_equal(np.ravel(data["views"]), VIEWS)
+
+
+def test_the_header_is_the_contract_s_and_the_bytes_are_the_same_twice() -> None:
+    data = ply(("unit mm", "frame world"))
+    header = data[: data.index(b"end_header\n")].decode().splitlines()
+    assert header[:4] == ["ply", "format binary_little_endian 1.0", "comment unit mm", "comment frame world"]
+    names = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "quality", "views"]
+    kinds = ["float"] * 6 + ["uchar"] * 3 + ["float", "uchar"]
+    wanted = [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=True)]
+    assert header[5:16] == wanted
+    assert data == ply(("unit mm", "frame world"))
+    row = struct.unpack_from("<6f3BfB", data, data.index(b"end_header\n") + len("end_header\n"))
+    np.testing.assert_allclose(row[:3], MESH.vertices[0], rtol=1e-6)
+    assert row[6:9] == tuple(COLOURS[0])
+
+
+def test_trimesh_reads_our_glb(tmp_path: Path) -> None:
+    write_glb(tmp_path / "head.glb", MESH, normals=MESH.normals(), colours=COLOURS)
+    loaded = trimesh.load(tmp_path / "head.glb", force="mesh", process=False)
+    assert isinstance(loaded, trimesh.Trimesh)
+    np.testing.assert_allclose(loaded.vertices, MESH.vertices / 1000.0, atol=1e-8)  # glTF wants metres
+    np.testing.assert_array_equal(loaded.faces, MESH.faces)
+
+
+def test_the_glb_is_well_formed() -> None:
+    data = glb_bytes(MESH, normals=MESH.normals(), colours=COLOURS)
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    document = json.loads(data[20 : 20 + size])
+    assert (size % 4, kind) == (0, b"JSON")
+    payload_size, payload_kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert (payload_kind, 28 + size + payload_size) == (b"BIN\0", len(data))
+    for accessor, view in zip(document["accessors"], document["bufferViews"], strict=True):
+        components = {"VEC3": 3, "VEC4": 4, "SCALAR": 1}[accessor["type"]]
+        width = {5126: 4, 5125: 4, 5123: 2}[accessor["componentType"]]
+        assert view["byteLength"] == accessor["count"] * components * width
+        assert view["byteOffset"] % 4 == 0
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    place = document["bufferViews"][attributes["COLOR_0"]]["byteOffset"] + 28 + size
+    red = struct.unpack_from("<H", data, place)[0] / 65535
+    assert red == pytest.approx(float(linear_from_srgb(np.array(COLOURS[0, 0] / 255.0))), abs=1e-5)
+
+
+def test_obj_round_trip(tmp_path: Path) -> None:
+    (tmp_path / "head.obj").write_bytes(obj_bytes(MESH))
+    again = read_mesh(tmp_path / "head.obj")
+    np.testing.assert_allclose(again.vertices, MESH.vertices, atol=6e-5)  # four decimals are written
+    np.testing.assert_array_equal(again.faces, MESH.faces)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_read_mesh_gives_geometry_and_colours_back(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"head{suffix}"
+    path.write_bytes(ply() if suffix == ".ply" else glb_bytes(MESH, normals=MESH.normals(), colours=COLOURS))
+    again = read_mesh(path)
+    unit = 1.0 if suffix == ".ply" else 1000.0
+    np.testing.assert_allclose(unit * again.vertices, MESH.vertices, atol=1e-4)
+    np.testing.assert_array_equal(again.faces, MESH.faces)
+    if suffix == ".ply":
+        np.testing.assert_array_equal(again.colours, COLOURS)
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("head.stl", b"solid"),
+        ("empty.ply", b""),
+        ("cut.ply", ply()[:2000]),
+        ("noise.ply", b"ply\nformat nonsense"),
+        ("cut.glb", glb_bytes(MESH, normals=MESH.normals(), colours=COLOURS)[:300]),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\n"),
+        ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    ],
+)
+def test_damage_ends_in_input_error(name: str, data: bytes, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=name):
+        read_mesh(tmp_path / name)
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
+    properties = {"normals": MESH.normals(), "colours": COLOURS, "quality": QUALITY, "views": VIEWS}
+    with pytest.raises(UnicodeEncodeError):
+        write_ply(tmp_path / "head.ply", MESH, **properties, comments=("a comment must be ASCII, é is not",))
+    assert list(tmp_path.iterdir()) == []
+
+
+@given(value=st.floats(0.0, 1.0))
+def test_srgb_and_back(value: float) -> None:
+    # 1e-4: the two branches of IEC 61966-2-1 meet with a step of 3e-8 in linear light, magnified near black by 12.92
+    assert float(srgb_from_linear(linear_from_srgb(np.array(value)))) == pytest.approx(value, abs=1e-4)
+
+
+def test_srgb_of_the_standard() -> None:
+    # mid-grey: 18 % linear light is 46.1 % of the sRGB scale
+    assert float(srgb_from_linear(np.array(0.18))) == pytest.approx(0.4613, abs=1e-3)
+    np.testing.assert_allclose(linear_from_srgb(np.array([0.0, 1.0])), [0.0, 1.0])
+
+
+def test_our_reader_gives_what_was_written_and_names_half_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "head.ply"
+    write_ply(path, MESH, normals=MESH.normals(), colours=COLOURS, quality=QUALITY, views=VIEWS)
+    mesh, quality = read_head_ply(path)
+    np.testing.assert_array_equal(mesh.vertices, MESH.vertices.astype(np.float32))
+    np.testing.assert_array_equal(mesh.faces, MESH.faces)
+    np.testing.assert_array_equal(mesh.colours, COLOURS)
+    np.testing.assert_array_equal(quality, QUALITY.astype(np.float32))
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match="bytes of vertices and faces"):
+        read_head_ply(path)
+    path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(InputError, match=r"no head\.ply of ours"):
+        read_head_ply(path)

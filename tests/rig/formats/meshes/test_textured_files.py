@@ -1,0 +1,133 @@
+"""Textured and printable meshes: other programs read what we write, and the same input is the same bytes."""
+
+import io
+import json
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from rig.formats.meshes.glb import Skin, glb_bytes
+from rig.formats.meshes.obj import mtl_bytes, textured_obj_bytes
+from rig.formats.meshes.ply import ply_bytes, read_head_ply
+from rig.formats.meshes.printing import stl_bytes, threemf_bytes
+from rig.formats.meshes.usdz import usdz_bytes
+from rig.mesh import Mesh
+
+BALL = trimesh.creation.icosphere(subdivisions=2, radius=90.0)
+MESH = Mesh(np.asarray(BALL.vertices, dtype=float), np.asarray(BALL.faces, dtype=np.int32))
+NORMALS = MESH.normals()
+UV = np.random.default_rng(0).uniform(0, 0.5, (len(MESH.vertices), 2))
+PICTURE = np.full((64, 64, 3), (10, 40, 200), np.uint8)
+PICTURE[32:] = 90  # the lower half, v > 0.5
+
+
+def image(suffix: str) -> bytes:
+    return cv2.imencode(suffix, PICTURE)[1].tobytes()
+
+
+def document(data: bytes) -> dict:
+    size = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + size])
+
+
+@pytest.mark.parametrize(("suffix", "mime"), [(".jpg", "image/jpeg"), (".png", "image/png"), (".webp", "image/webp")])
+def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
+    extras = {"version": "1", "unit": "m"}
+    data = glb_bytes(MESH, normals=NORMALS, skin=Skin(UV, image(suffix), mime), extras=extras)
+    loaded = trimesh.load(io.BytesIO(data), file_type="glb", force="mesh", process=False)
+    assert isinstance(loaded, trimesh.Trimesh)
+    visual: Any = loaded.visual
+    np.testing.assert_allclose(loaded.vertices * 1000, MESH.vertices, atol=1e-4)
+    np.testing.assert_allclose(visual.uv, UV * (1, -1) + (0, 1), atol=1e-6)  # trimesh's v is upwards
+    header = document(data)
+    assert header["asset"]["extras"] == extras
+    assert header["images"][0]["mimeType"] == mime
+    assert ("EXT_texture_webp" in header.get("extensionsRequired", [])) == (suffix == ".webp")
+    assert "COLOR_0" not in header["meshes"][0]["primitives"][0]["attributes"]
+    assert 0 < header["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"] < 1
+
+
+def test_trimesh_reads_a_textured_obj_with_its_material(tmp_path: Path) -> None:
+    data = textured_obj_bytes(MESH, normals=NORMALS, uv=UV, faces_uv=MESH.faces, library="head.mtl")
+    (tmp_path / "head.obj").write_bytes(data)
+    (tmp_path / "head.mtl").write_bytes(mtl_bytes("head.png"))
+    (tmp_path / "head.png").write_bytes(image(".png"))
+    loaded = trimesh.load(tmp_path / "head.obj", force="mesh", process=False)
+    assert isinstance(loaded, trimesh.Trimesh)
+    visual: Any = loaded.visual
+    np.testing.assert_allclose(loaded.triangles, MESH.vertices[MESH.faces], atol=1e-3)
+    np.testing.assert_allclose(visual.uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-5)
+    assert visual.material.image.size == (64, 64)
+    assert data.count(b"\nvn ") == len(MESH.vertices)
+
+
+def test_trimesh_reads_texture_coordinates_of_a_ply_and_we_its_mesh(tmp_path: Path) -> None:
+    count = len(MESH.vertices)
+    attributes = {
+        "colours": np.zeros((count, 3), np.uint8),
+        "quality": np.ones(count),
+        "views": np.ones(count, np.uint8),
+    }
+    data = ply_bytes(MESH, normals=NORMALS, corner_uv=UV[MESH.faces], comments=["TextureFile head.png"], **attributes)
+    (tmp_path / "head.ply").write_bytes(data)
+    (tmp_path / "head.png").write_bytes(image(".png"))
+    loaded = trimesh.load(tmp_path / "head.ply", force="mesh", process=False)
+    assert isinstance(loaded, trimesh.Trimesh)
+    visual: Any = loaded.visual
+    assert visual.kind == "texture"
+    np.testing.assert_allclose(visual.uv[loaded.faces], (UV * (1, -1) + (0, 1))[MESH.faces], atol=1e-6)
+    mesh, _ = read_head_ply(tmp_path / "head.ply")
+    np.testing.assert_array_equal(mesh.faces, MESH.faces)
+
+
+def test_stl_and_3mf_hold_the_closed_mesh() -> None:
+    loaded = trimesh.load(io.BytesIO(stl_bytes(MESH)), file_type="stl")
+    assert isinstance(loaded, trimesh.Trimesh)
+    assert loaded.is_watertight
+    assert loaded.volume == pytest.approx(BALL.volume, rel=1e-5)
+    data = threemf_bytes(MESH)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        root = ElementTree.fromstring(archive.read("3D/3dmodel.model"))
+        assert {"[Content_Types].xml", "_rels/.rels"} < {*archive.namelist()}
+    space = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
+    assert root.get("unit") == "millimeter"
+    vertices = [[float(node.get(axis, "")) for axis in "xyz"] for node in root.iter(space + "vertex")]
+    faces = [[int(node.get(corner, "")) for corner in ("v1", "v2", "v3")] for node in root.iter(space + "triangle")]
+    np.testing.assert_allclose(vertices, MESH.vertices, atol=6e-5)
+    np.testing.assert_array_equal(faces, MESH.faces)
+    assert data == threemf_bytes(MESH)
+
+
+def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
+    pxr: Any = pytest.importorskip("pxr.Usd")
+    UsdGeom: Any = pytest.importorskip("pxr.UsdGeom")
+    UsdShade: Any = pytest.importorskip("pxr.UsdShade")
+
+    parts = {"normals": NORMALS, "uv": UV, "faces_uv": MESH.faces, "image": image(".jpg"), "suffix": ".jpg"}
+    data = usdz_bytes(MESH, **parts)
+    assert data == usdz_bytes(MESH, **parts)
+    path = tmp_path / "head.usdz"
+    path.write_bytes(data)
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            start = entry.header_offset + 30 + len(entry.filename) + len(entry.extra)
+            assert (entry.compress_type, start % 64) == (zipfile.ZIP_STORED, 0)
+    stage = pxr.Stage.Open(str(path))
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/head/mesh"))
+    np.testing.assert_allclose(np.array(shape.GetPointsAttr().Get()) * 1000, MESH.vertices, atol=1e-4)
+    coordinates = UsdGeom.PrimvarsAPI(shape).GetPrimvar("st")
+    np.testing.assert_allclose(
+        np.array(coordinates.ComputeFlattened()), (UV * (1, -1) + (0, 1))[MESH.faces].reshape(-1, 2), atol=1e-6
+    )
+    material, _ = UsdShade.MaterialBindingAPI(shape.GetPrim()).ComputeBoundMaterial()
+    assert material.GetPath() == "/head/skin"
+    picture = UsdShade.Shader(stage.GetPrimAtPath("/head/skin/texture"))
+    assert picture.GetInput("file").Get().resolvedPath.endswith("[texture.jpg]")
