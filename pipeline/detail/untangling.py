@@ -1,10 +1,12 @@
 """Repairs a head's mesh so that no triangle is turned over, folded onto its neighbour, or passes through another.
 
 Expressions, kernel modes and displacements move vertices one by one, regardless of the surface: closed lips pass
-through each other, lids that close fold behind the brow, an ear sinks into the head. Each such spot is replaced by the
-membrane through its surroundings (every vertex the mean of its neighbours): loops shrink to nothing, and two sheets
-that went through each other separate, as their borders are separate. If a spot is not clean then, it is enlarged by
-rings of triangles. All other vertices stay where they are; most of these spots lie in slits that nobody sees.
+through each other, lids that close fold behind the brow, an ear sinks into the head. Each such spot first gets the
+shape of the model's clean mean head, laid on this head: the displacement from it is replaced by the membrane through
+the displacements about the spot (every vertex has the mean of its neighbours), so that an ear remains an ear. If a spot
+is not clean then, it is enlarged by rings of triangles. What is still not clean becomes a membrane itself: loops shrink
+to nothing, and two sheets that went through each other separate, as their borders are separate. All other vertices stay
+where they are; most of these spots lie in slits that nobody sees.
 """
 
 from dataclasses import dataclass
@@ -14,15 +16,20 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 
+from pipeline.compute.array_cache import cached_arrays
 from pipeline.detail.sparse_factor import factorised
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.net_kernels import component_of
+from pipeline.geometry.procrustes import procrustes
 from pipeline.head_model.model import HeadModel
 from rig.mesh import Mesh, face_normals
 
 MAX_FOLD_DEG = 100.0  # between the normals of triangles that share an edge
 RINGS = (1, 1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 33, 41, 50)  # about a spot that was spoilt so many times; heads of random
 # shapes and expressions need 5 to 8 of them
+REST_RINGS = (1, 2, 3, 5)  # the same while spots get the mean head's shape. Larger ones move more vertices, and those
+# that are not clean by then seldom are later (docs/lab-notes/meshes.md)
+PLACED_BY = 32  # every so-many-th vertex places the mean head; of so few, BLAS sums alike with any number of threads
 ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles cut off is a part of their loop or lens
 
 
@@ -34,6 +41,21 @@ class Topology:
     faces: Int[np.ndarray, "f 3"]
     pairs: Int[np.ndarray, "e 2"]
     beside: sparse.csr_array  # (v, v)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshFaults:
+    """Counts what is wrong with a mesh.
+
+    Attributes:
+        turned: triangles that face against the mean normal of their corners.
+        folded: edges whose triangles' normals are more than ``MAX_FOLD_DEG`` apart.
+        crossing: triangles that another one passes through, neighbours over an edge excepted.
+    """
+
+    turned: int
+    folded: int
+    crossing: int
 
 
 def topology_of(faces: Int[np.ndarray, "f 3"], count: int) -> Topology:
@@ -65,27 +87,65 @@ def untangled_head(
         vertices: full level, mm.
         deviation_mm: standard deviation of each vertex.
     """
-    clean = untangled(vertices, head_topology(model))
+    clean = untangled(vertices, head_topology(model), clean_mean_head(model))
     moved_mm = np.linalg.norm(clean - vertices, axis=1)
     return Mesh(clean, model.levels["full"].faces), np.hypot(deviation_mm, moved_mm)
 
 
-def untangled(vertices: Float[np.ndarray, "v 3"], topology: Topology) -> Float[np.ndarray, "v 3"]:
-    """Returns the vertices with every degenerate spot smoothed. The result is tested in single precision, as files
-    store it."""
-    out, faces = vertices.astype(np.float32, order="C").astype(float), topology.faces
-    times, touched = np.zeros(len(out), int), np.zeros(len(out), bool)
-    spoilt = spoilt_faces(out, topology)
-    while spoilt.any() and times.max() < len(RINGS):
-        times[np.unique(faces[spoilt])] += 1
-        spot = _with_enclosed(_with_rings(times, spoilt, faces), faces)
+@lru_cache(maxsize=2)
+def clean_mean_head(model: HeadModel) -> Float[np.ndarray, "v 3"]:
+    """Returns the full level of the model's mean head (head frame, mm) without degenerate triangles."""
+
+    def make() -> dict[str, np.ndarray]:
+        return {"vertices": untangled(model.vertices(np.zeros(0)), head_topology(model))}
+
+    inputs = (model.mean, model.levels["full"].faces)
+    return cached_arrays("clean-mean-head", inputs, make, made_by=(crossing_faces, component_of, HeadModel))["vertices"]
+
+
+def untangled(
+    vertices: Float[np.ndarray, "v 3"], topology: Topology, rest: Float[np.ndarray, "v 3"] | None = None
+) -> Float[np.ndarray, "v 3"]:
+    """Returns the vertices with every degenerate spot mended. The result is tested in single precision, as files
+    store it.
+
+    Args:
+        vertices: mm.
+        topology: of the mesh.
+        rest: a shape of the same mesh without degenerate triangles, in any frame and scale; spots get its shape where
+            that makes them clean. None makes membranes of all spots.
+    """
+    out = vertices.astype(np.float32, order="C").astype(float)
+    spoilt, touched = spoilt_faces(out, topology), np.zeros(len(out), bool)
+    if spoilt.any() and rest is not None:
+        placed = procrustes(rest[::PLACED_BY], out[::PLACED_BY]).apply(rest)
+        out, spoilt, spot = _mended(out, spoilt, topology, placed, REST_RINGS)
+        touched |= spot
+    out, spoilt, spot = _mended(out, spoilt, topology, np.zeros_like(out), RINGS)
+    return np.where((touched | spot)[:, None], out, vertices)
+
+
+def _mended(
+    vertices: Float[np.ndarray, "v 3"],
+    spoilt: Bool[np.ndarray, " f"],
+    topology: Topology,
+    shape: Float[np.ndarray, "v 3"],
+    rings: tuple[int, ...],
+) -> tuple[Float[np.ndarray, "v 3"], Bool[np.ndarray, " f"], Bool[np.ndarray, " v"]]:
+    """Gives spots the shape ``shape``, displaced as their surroundings are, each at most as often as ``rings`` has
+    entries: how far it reaches at each time. Returns the vertices in single precision, the triangles that are still
+    spoilt, and the vertices that were moved."""
+    out, times, touched = vertices.copy(), np.zeros(len(vertices), int), np.zeros(len(vertices), bool)
+    while spoilt.any() and times.max() < len(rings):
+        times[np.unique(topology.faces[spoilt])] += 1
+        spot = _with_enclosed(_with_rings(times, spoilt, topology.faces, rings), topology.faces)
         if spot.all():
             break
         rows = np.flatnonzero(spot)
-        out[rows] = _membrane(out, rows, topology).astype(np.float32)
+        out[rows] = (shape[rows] + _membrane(out - shape, rows, topology)).astype(np.float32)
         touched |= spot
         spoilt = spoilt_faces(out, topology, spot)
-    return np.where(touched[:, None], out, vertices)
+    return out, spoilt, touched
 
 
 def spoilt_faces(
@@ -104,6 +164,24 @@ def turned_faces(
     against a neighbour. If ``active`` is not None, only those triangles and their neighbours are tested."""
     faces, count = topology.faces, len(vertices)
     near = np.ones(len(faces), bool) if active is None else _around(_around(active, faces, count), faces, count)
+    turned, folded = _turned_and_folded(vertices, topology, near)
+    turned[folded] = True
+    # At the border of what was looked at, means lack triangles.
+    return turned if active is None else turned & _around(active, faces, count)
+
+
+def mesh_faults(vertices: Float[np.ndarray, "v 3"], topology: Topology) -> MeshFaults:
+    """Counts what is wrong with a mesh. Nothing that the model's own mean head has is excepted."""
+    turned, folded = _turned_and_folded(vertices, topology, np.ones(len(topology.faces), bool))
+    return MeshFaults(int(turned.sum()), len(folded), int(crossing_faces(vertices, topology.faces).sum()))
+
+
+def _turned_and_folded(
+    vertices: Float[np.ndarray, "v 3"], topology: Topology, near: Bool[np.ndarray, " f"]
+) -> tuple[Bool[np.ndarray, " f"], Int[np.ndarray, "e 2"]]:
+    """Returns which triangles face against the mean normal of their corners, and the pairs of triangles that are folded
+    at their common edge; of those in ``near`` alone."""
+    faces, count = topology.faces, len(vertices)
     rows, pairs = np.flatnonzero(near), topology.pairs
     triangle_normals = face_normals(vertices, faces[rows])
     corners = faces[rows].ravel()
@@ -116,11 +194,9 @@ def turned_faces(
         triangle_normals
         / np.maximum(np.sqrt(np.einsum("fk,fk->f", triangle_normals, triangle_normals)), 1e-12)[:, None]
     )
-    pairs = pairs if active is None else pairs[near[pairs[:, 0]] & near[pairs[:, 1]]]
+    pairs = pairs if near.all() else pairs[near[pairs[:, 0]] & near[pairs[:, 1]]]
     cosine = np.einsum("ek,ek->e", unit[pairs[:, 0]], unit[pairs[:, 1]])
-    turned[pairs[cosine < np.cos(np.radians(MAX_FOLD_DEG))]] = True
-    # At the border of what was looked at, means lack triangles.
-    return turned if active is None else turned & _around(active, faces, count)
+    return turned, pairs[cosine < np.cos(np.radians(MAX_FOLD_DEG))]
 
 
 def _around(chosen: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"], count: int) -> Bool[np.ndarray, " f"]:
@@ -135,12 +211,15 @@ def _any_corner(vertex: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -
 
 
 def _with_rings(
-    times: Int[np.ndarray, " v"], spoilt: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"]
+    times: Int[np.ndarray, " v"],
+    spoilt: Bool[np.ndarray, " f"],
+    faces: Int[np.ndarray, "f 3"],
+    rings: tuple[int, ...],
 ) -> Bool[np.ndarray, " v"]:
-    """Returns the vertices of all spots: the corners of the spoilt triangles and the rings about them. The number of
-    rings (``RINGS``) grows with how often a corner was spoilt."""
+    """Returns the vertices of all spots: the corners of the spoilt triangles and the ``rings`` about them, whose number
+    grows with how often a corner was spoilt."""
     spot, reach = np.unique(faces[spoilt]), np.zeros(len(times), int)
-    reach[spot] = 1 + np.array(RINGS)[np.minimum(times[spot], len(RINGS)) - 1]
+    reach[spot] = 1 + np.array(rings)[np.minimum(times[spot], len(rings)) - 1]
     for _ in range(int(reach.max()) - 1):
         part = faces[_any_corner(reach > 1, faces)]
         np.maximum.at(reach, part.ravel(), np.repeat(reach[part].max(axis=1) - 1, 3))

@@ -33,6 +33,7 @@ from pipeline.research.surface.eyeballs import eyeballs
 from pipeline.research.surface.hair_shells import hair_shells
 from pipeline.research.surface.hidden import hidden
 from pipeline.research.surface.light import light
+from pipeline.research.surface.meshes import meshes
 from pipeline.research.surface.pores import pores
 from pipeline.research.surface.relief import relief
 from pipeline.research.surface.repeat import repeat
@@ -73,7 +74,7 @@ class Options:
         simplex: how many subjects of a table the simplex fits too.
         captures: whether the captures of the shared folder are used besides the studio's heads.
         openmvs: folder of the programs of OpenMVS.
-        folders: captures, of people and relief; of scaling, those to run a job on.
+        folders: captures, of people and relief; of scaling, those to run a job on; of meshes, results.
         only: which rows of people, growth, wrap and hair-shell to run.
         detail: level of detail of people.
         job: command that scaling runs.
@@ -318,6 +319,12 @@ def _hair_shell(task: Task) -> Outcome:
         )
 
 
+def _meshes(task: Task) -> Outcome:
+    models = {"default": task.head, "ict": _facekit(task.shared)}
+    count = {"subjects": task.subjects} if task.subjects else {}
+    return meshes(models, task.options.folders, report=task.report, folder=task.folder, **count)
+
+
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
     return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
@@ -357,6 +364,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "eyeballs": _eyeballs,
     "wrap": _wrap,
     "hair-shell": _hair_shell,
+    "meshes": _meshes,
     "scaling": _scaling,
     "growth": _growth,
     "scale": _scale,

@@ -27,8 +27,8 @@ def experiments(
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
             "exchanges, false-alarms, posterior, views, repeat, relief, pores, span, detail, hidden, expressions, "
-            "visible, people, planted, surfaces, texture, light, templates, shapes, eyeballs, wrap, hair-shell, "
-            "scaling, growth, scale or real."
+            "visible, people, planted, surfaces, texture, light, templates, shapes, eyeballs, meshes, wrap, "
+            "hair-shell, scaling, growth, scale or real."
         ),
     ],
     *,
@@ -36,7 +36,8 @@ def experiments(
         list[Path] | None,
         typer.Argument(
             help="real: captures, or photographs alone, of more views than are used. people: captures with a truth "
-            "beside them, relief: any captures; those of --shared by default. scaling: captures, scan-a by default."
+            "beside them, relief: any captures; those of --shared by default. scaling: captures, scan-a by default. "
+            "meshes: results with a head.ply."
         ),
     ] = None,
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
@@ -82,8 +83,8 @@ def experiments(
 
 
 def _check_options(name: str, folders: list[Path] | None, only: list[str] | None, detail: str | None) -> None:
-    if folders and name not in ("people", "relief", "scaling"):
-        raise typer.BadParameter("only real, people, relief and scaling take folders", param_hint="FOLDERS")
+    if folders and name not in ("people", "relief", "scaling", "meshes"):
+        raise typer.BadParameter("only real, people, relief, scaling and meshes take folders", param_hint="FOLDERS")
     if only and name not in ("people", "growth", "wrap", "hair-shell"):
         raise typer.BadParameter("only people, growth, wrap and hair-shell take it", param_hint="--only")
     if detail and name != "people":

@@ -1,6 +1,8 @@
 """Spoilt triangles are found as a plain test of every pair finds them, and heads come out clean of them: planted folds,
 sheets pushed through each other, random heads that make random faces under hostile displacements."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import scipy.sparse as sparse
@@ -9,7 +11,10 @@ from scipy.sparse.linalg import splu
 from pipeline.detail.nodes import solving_nodes
 from pipeline.detail.smooth_field import smooth_field
 from pipeline.detail.untangling import (
+    MeshFaults,
+    clean_mean_head,
     head_topology,
+    mesh_faults,
     spoilt_faces,
     topology_of,
     turned_faces,
@@ -20,13 +25,17 @@ from pipeline.fusion.crossings import crossing_faces
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings
+from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import face_normals, vertex_normals
 from tests.support.subdivided_spheres import subdivided_sphere
 
+COARSE_SEEDS = 10
 SEEDS_A_TEST = 10  # a slow test has five minutes, also beside others
 EXPRESSIONS = 5  # at once, each up to its full weight
 HOSTILE_MM, LENGTH_MM = 1.5, 5.0  # standard deviation of a displacement along the normals, twice what the fine stage
 # takes for likely, and over which it fades, the fine stage's own
+
+Displacement = Callable[[np.random.Generator], np.ndarray]
 
 
 def test_turned_and_folded_triangles_are_those_that_a_plain_test_finds() -> None:
@@ -72,41 +81,88 @@ def test_a_dent_that_comes_out_behind_is_taken_back_and_the_rest_stays() -> None
     np.testing.assert_array_equal(clean[far], pushed[far])
 
 
+def test_a_spot_gets_the_shape_at_rest_where_that_is_clean_and_is_flattened_without_one() -> None:
+    vertices, faces, _ = subdivided_sphere()
+    bump = np.exp(-((np.linalg.norm(vertices[:, :2], axis=1) / 20.0) ** 2)) * (vertices[:, 2] > 0)
+    rest = vertices * (1.0 + 0.3 * bump)[:, None]
+    place = Similarity(1.1, rotation_from_vector(np.array([0.3, -0.2, 0.5])), np.array([10.0, -700.0, 90.0]))
+    moved, topology = place.apply(rest), topology_of(faces, len(rest))
+    top = np.argsort(-bump)[:40]
+    folded = moved.copy()
+    folded[top] = np.random.default_rng(1).permutation(moved[top])
+    assert spoilt_faces(folded, topology).any()
+    clean, flat = untangled(folded, topology, rest), untangled(folded, topology)
+    for result in (clean, flat):
+        assert mesh_faults(result, topology) == MeshFaults(0, 0, 0)
+    assert np.linalg.norm(clean - moved, axis=1).max() < 0.1
+    assert np.linalg.norm(flat - moved, axis=1).max() > 1.0
+
+
 @pytest.fixture(scope="module")
 def wide_model() -> HeadModel:
     return model_basis(load_model(), Settings())  # eigenheads, kernel and expressions
 
 
-def check_clean(model: HeadModel, seed: int) -> None:
-    """A random head with a random face, as a fit has it; then under a displacement that knows no surface."""
-    rng = np.random.default_rng(seed)
+@pytest.fixture(scope="module")
+def hostile(wide_model: HeadModel) -> Displacement:
+    """Draws smooth displacements along the normals (mm, full level) that know no surface."""
+    mean, fine = wide_model.vertices(np.zeros(0)), solving_nodes(wide_model).fine
+    field = smooth_field(fine.shape @ mean, fine.faces, LENGTH_MM)
+    factor = splu(sparse.csc_array(field.operator), permc_spec="MMD_AT_PLUS_A")
+
+    def draw(rng: np.random.Generator) -> np.ndarray:
+        white = np.sqrt(field.mass / field.precision_scale) * rng.standard_normal(len(field.mass))
+        return HOSTILE_MM * (fine.operator @ factor.solve(white))
+
+    return draw
+
+
+def random_face(model: HeadModel, rng: np.random.Generator) -> np.ndarray:
+    """Coefficients of a random head with a random face, as a fit has it."""
     coefficients = np.clip(rng.standard_normal(len(model.modes)), -2.5, 2.5)
     coefficients[model.posed] = 0.0
     coefficients[rng.choice(model.posed, EXPRESSIONS, replace=False)] = rng.uniform(0.0, 1.0, EXPRESSIONS)
-    fitted, faces = model.vertices(coefficients), model.levels["full"].faces
-    fine = solving_nodes(model).fine
-    field = smooth_field(fine.shape @ fitted, fine.faces, LENGTH_MM)
-    white = np.sqrt(field.mass / field.precision_scale) * rng.standard_normal(len(field.mass))
-    unit = splu(sparse.csc_array(field.operator), permc_spec="MMD_AT_PLUS_A").solve(white)
-    hostile = fitted + HOSTILE_MM * (fine.operator @ unit)[:, None] * vertex_normals(fitted, faces)
-    for vertices in (fitted, hostile):
-        mesh, deviation_mm = untangled_head(model, vertices, np.full(len(vertices), 0.3))
-        stored = mesh.vertices.astype(np.float32).astype(float)
-        assert not spoilt_faces(stored, head_topology(model)).any(), seed
-        moved_mm = np.linalg.norm(mesh.vertices - vertices, axis=1)
-        np.testing.assert_allclose(deviation_mm, np.sqrt(0.3**2 + moved_mm**2))
-        assert (moved_mm == 0.0).mean() > 0.5, seed  # spots, not the head
+    return coefficients
 
 
-def test_the_mean_head_and_a_few_random_ones_come_out_clean(wide_model: HeadModel) -> None:
-    mean = wide_model.vertices(np.zeros(0))
-    assert spoilt_faces(mean, head_topology(wide_model)).any()  # its lips touch
-    assert not spoilt_faces(untangled(mean, head_topology(wide_model)), head_topology(wide_model)).any()
-    check_clean(wide_model, 0)
+def check_clean(model: HeadModel, seed: int, hostile: Displacement) -> None:
+    """A random head with a random face comes out clean; every other one under a displacement that knows no surface."""
+    rng = np.random.default_rng(seed)
+    vertices = model.vertices(random_face(model, rng))
+    if seed % 2:
+        vertices += hostile(rng)[:, None] * vertex_normals(vertices, model.levels["full"].faces)
+    mesh, deviation_mm = untangled_head(model, vertices, np.full(len(vertices), 0.3))
+    stored = mesh.vertices.astype(np.float32).astype(float)
+    assert mesh_faults(stored, head_topology(model)) == MeshFaults(0, 0, 0), seed
+    moved_mm = np.linalg.norm(mesh.vertices - vertices, axis=1)
+    np.testing.assert_allclose(deviation_mm, np.sqrt(0.3**2 + moved_mm**2))
+    assert (moved_mm == 0.0).mean() > 0.5, seed  # spots, not the head
+
+
+def test_the_mean_head_and_a_few_random_ones_come_out_clean(wide_model: HeadModel, hostile: Displacement) -> None:
+    topology = head_topology(wide_model)
+    assert spoilt_faces(wide_model.vertices(np.zeros(0)), topology).any()  # its lips touch
+    assert mesh_faults(clean_mean_head(wide_model), topology) == MeshFaults(0, 0, 0)
+    for seed in (0, 1):
+        check_clean(wide_model, seed, hostile)
+
+
+def test_random_heads_and_expressions_come_out_clean_on_a_coarse_level(wide_model: HeadModel) -> None:
+    level = wide_model.levels["p95"]
+    topology = topology_of(level.faces, level.count)
+    rest, spoilt = untangled(wide_model.vertices(np.zeros(0), "p95"), topology), 0
+    for seed in range(COARSE_SEEDS):
+        vertices = wide_model.vertices(random_face(wide_model, np.random.default_rng(seed)), "p95")
+        clean = untangled(vertices, topology, rest)
+        assert mesh_faults(clean.astype(np.float32).astype(float), topology) == MeshFaults(0, 0, 0), seed
+        spoilt += spoilt_faces(vertices, topology).any()
+    assert spoilt > COARSE_SEEDS / 2
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(1, 201, SEEDS_A_TEST))
-def test_two_hundred_random_heads_and_expressions_come_out_clean(wide_model: HeadModel, first: int) -> None:
+@pytest.mark.parametrize("first", range(2, 202, SEEDS_A_TEST))
+def test_two_hundred_random_heads_and_expressions_come_out_clean(
+    wide_model: HeadModel, hostile: Displacement, first: int
+) -> None:
     for seed in range(first, first + SEEDS_A_TEST):
-        check_clean(wide_model, seed)
+        check_clean(wide_model, seed, hostile)
