@@ -115,7 +115,7 @@ def full_size_pictures(folder: Path, kept: Path) -> ReadImage:
     ``kept``."""
     root = capture_root(folder)
     read = read_rig_of(find_rig_file(root) or kept / CAMERAS)
-    return full_size_reader(root, read.rig, read.left_out)
+    return full_size_reader(root, read.rig, [*read.left_out])
 
 
 def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: Progress) -> tuple[ReportWarning, ...]:

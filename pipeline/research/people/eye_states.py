@@ -116,8 +116,8 @@ def painted_mesh(
     faces = model.levels["full"].faces
     for side in SIDES:
         inner, outer = (marks[f"{corner}_{side}"] for corner in ("endocanthion", "exocanthion"))
-        while _edge_mm(head, faces, (inner + outer) / 2, np.linalg.norm(outer - inner) / 2) > PAINTED_MM:
-            head, faces = subdivide(head, faces)
+        while _edge_mm(head, faces, (inner + outer) / 2, float(np.linalg.norm(outer - inner)) / 2) > PAINTED_MM:
+            head, faces, *_ = subdivide(head, faces)
     return Mesh(head, faces)
 
 

@@ -24,6 +24,8 @@ RAW = {
     "pipeline/model_building/training/build.py": 2,
     "pipeline/research/people/eye_states.py": 1,
     "pipeline/research/surface/light.py": 2,
+    "pipeline/research/surface/hair_shells.py": 1,
+    "pipeline/research/surface/meshes.py": 1,
     "pipeline/research/peers/openmvs.py": 5,
     "pipeline/research/people/people.py": 1,
     "pipeline/research/people/people_subjects.py": 1,

@@ -47,7 +47,8 @@ def test_skin_is_divided_and_moved_within_the_radius_alone() -> None:
     near = found.faces[(off[found.faces] < 0.5 * RADIUS_MM).all(axis=1)]
     edges = np.linalg.norm(found.places[near[:, 0]] - found.places[near[:, 1]], axis=1)
     assert np.median(edges) <= EDGE_MM
-    area = np.cross(*(found.places[found.faces[:, k]] - found.places[found.faces[:, 0]] for k in (1, 2)))[:, 2]
+    first, second = (found.places[found.faces[:, k]] - found.places[found.faces[:, 0]] for k in (1, 2))
+    area = np.cross(first, second)[:, 2]
     np.testing.assert_allclose(area.sum() / 2, 16.0**2)  # nothing is lost, nothing lies twice
 
 
