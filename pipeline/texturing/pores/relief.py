@@ -221,8 +221,8 @@ class Patches:
     def repeating(self, first: Spectra, second: Spectra) -> tuple[Float32[np.ndarray, "n p q"], np.ndarray]:
         """Returns Wiener's weight of each wave in the mean of two sets of views, and the power that repeats and all
         power, by octave."""
-        common = (first * np.conj(second)).real
-        either = first.real**2 + first.imag**2 + second.real**2 + second.imag**2
+        common = np.real(first * np.conj(second))
+        either = np.abs(first) ** 2 + np.abs(second) ** 2
         weight, powers = np.zeros(self.per_mm.shape, np.float32), np.zeros((OCTAVES, 2))
         for octave in range(OCTAVES):
             inside = self.octave == octave
