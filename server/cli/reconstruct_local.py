@@ -76,7 +76,7 @@ def flame_lines(document: "ReportDocument", out: Path) -> list[str]:
     """Returns what is printed of a FLAME model's fit: its file, and what the model leaves of the head."""
     from rig.formats.meshes.flame_param import FILE
 
-    figures = (document["template"] or {}).get("flame")
+    figures = (document.get("template") or {}).get("flame")
     if figures is None:
         return []
     median, most = figures["residual_median_mm"], figures["residual_p95_mm"]

@@ -374,7 +374,6 @@ class Jobs:
         state = STATES[row.status]
         progress: EventDocument = event.document if event is not None and state == "running" else {}
         request = request_of(row)
-        attributes = row.attributes or {}
         return Job(
             id=row.workflow_id,
             name="" if request is None else request.get("name", ""),
@@ -385,7 +384,7 @@ class Jobs:
             error=failure(row) if state == "failed" else None,
             notice=idle[row.queue_name] if state == "queued" else self._lost(row.workflow_id, state),
             capture_id=None if request is None else request["capture_id"],
-            session=attributes.get("session"),
+            session=(row.attributes or {}).get("session"),
             model=None if request is None else request.get("model"),
             settings={} if request is None else request.get("settings") or {},
             restart_of=None if request is None else request.get("restart_of"),

@@ -10,7 +10,7 @@ from server.http.app import create_app
 from server.http.routes.operations import DOCS
 from server.settings import ServiceSettings
 
-NO_BODY = {"204", "206", "304"}
+NO_BODY = {"204", "206", "304", "307"}
 TUS_BODILESS = {"tus_create", "tus_head"}  # the protocol's answers are headers alone
 STREAM = "job_events"
 
