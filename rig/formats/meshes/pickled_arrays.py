@@ -90,7 +90,7 @@ class _Array(_StandIn):
 
 def _decoded(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray | None:
     of = kind.decoded() if isinstance(kind, _Type) else None
-    if of is None or isinstance(raw, list):
+    if of is None or not isinstance(raw, str | bytes | bytearray):  # bytes(n) of a number would be n zeros
         return None
     data = raw.encode("latin1") if isinstance(raw, str) else bytes(raw)
     sizes = tuple(int(size) for size in shape)
@@ -136,6 +136,7 @@ _BY_NAME: dict[tuple[str, str], type[_StandIn]] = {
     ("_reconstruct", "numpy"): _Empty,
     ("_frombuffer", "numpy"): _FromBuffer,
     ("encode", "_codecs"): _Encoded,
+    ("bytes", "__builtin__"): _Encoded,  # of an empty array
     ("_reconstructor", "copy_reg"): _Empty,
     ("_reconstructor", "copyreg"): _Empty,
     ("object", "__builtin__"): _Inert,
