@@ -17,6 +17,8 @@ NOSE_MARGIN_MM = 4.0
 MOUTH_MARGIN_MM, MOUTH_HALF_HEIGHT_MM = 6.0, 16.0
 EAR_BEHIND_MM, EAR_BEFORE_MM, EAR_HALF_HEIGHT_MM, EAR_INSIDE_MM = 36.0, 4.0, 33.0, 12.0
 NECK_BELOW_TRAGION_MM = 30.0
+FOREHEAD_ABOVE_GLABELLA_MM = (8.0, 45.0)  # above the brows, which move, and below most hairlines
+BRIDGE_HALF_WIDTH_MM, BRIDGE_BELOW_NASION_MM, BRIDGE_DEPTH_MM = 8.0, 12.0, 14.0
 
 
 @lru_cache(maxsize=2)  # models are few, jobs are many
@@ -48,6 +50,19 @@ def head_regions(model: HeadModel) -> dict[str, Bool[np.ndarray, " v"]]:
         "neck": neck,
         "cranium": ~(face | ears | neck),
     }
+
+
+def stable_region(model: HeadModel) -> Bool[np.ndarray, " v"]:
+    """Returns which vertices of the full level lie over bone that neither expression nor jaw, weight or teeth move
+    much: the forehead above the brows and the bridge of the nose. Heads of two visits are aligned on it."""
+    vertices = model.vertices(np.zeros(0))
+    at = {name: vertices[row] for name, row in model.landmarks.items()}
+    low, high = at["glabella"][1] + np.array(FOREHEAD_ABOVE_GLABELLA_MM)
+    side, depth = abs(at["frontotemporale_left"][0]), at["frontotemporale_left"][2]
+    forehead = (np.abs(vertices[:, 0]) < side) & (vertices[:, 1] > low) & (vertices[:, 1] < high)
+    bridge = (np.abs(vertices[:, 0]) < BRIDGE_HALF_WIDTH_MM) & (vertices[:, 1] <= low)
+    bridge &= vertices[:, 1] > at["nasion"][1] - BRIDGE_BELOW_NASION_MM
+    return (forehead & (vertices[:, 2] > depth - 5.0)) | (bridge & (vertices[:, 2] > at["nasion"][2] - BRIDGE_DEPTH_MM))
 
 
 def _within(

@@ -156,15 +156,38 @@ def _searched(measured: Measured, reference: Reference, rng: np.random.Generator
     """Returns the best starting motions among all rotations: many are tried briefly with few points, fewer of them
     longer with more."""
     head = np.flatnonzero(~measured.regions["neck"])
-    chosen = head[_drawn(measured.areas[head], ROUNDS[-1].points, rng)]
-    vertices = measured.mesh_world.vertices
-    middle = vertices[chosen].mean(axis=0)
-    points, normals = vertices[chosen] - middle, measured.mesh_world.normals()[chosen]
-    surface, facing = _surface_points(reference, rng)
-    tree = KDTree(np.concatenate([surface, TURN_MM * facing], axis=1))
+    chosen = head[drawn(measured.areas[head], ROUNDS[-1].points, rng)]
+    surface, facing = surface_points(reference, rng)
     parts = np.asarray(kmeans2(surface, PARTS, minit="++", rng=rng)[0])
     places = np.stack([surface.mean(axis=0), (surface.min(axis=0) + surface.max(axis=0)) / 2, *parts])
     turns = Rotation.create_group("I").as_matrix()  # no turn is farther than 45 degrees from one of the sixty
+    points, normals = measured.mesh_world.vertices[chosen], measured.mesh_world.normals()[chosen]
+    return search_motions(points, normals, surface, facing, turns=turns, places=places)
+
+
+def search_motions(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    surface: Float[np.ndarray, "m 3"],
+    facing: Float[np.ndarray, "m 3"],
+    *,
+    turns: Float[np.ndarray, "t 3 3"],
+    places: Float[np.ndarray, "p 3"],
+) -> list[Similarity]:
+    """Returns the best starting motions of points in random order: every turn with the points' middle at every place is
+    tried briefly with few of them, fewer motions longer with more.
+
+    Args:
+        points: of the head, with their ``normals``.
+        normals: unit.
+        surface: points of the reference, with their normals ``facing``.
+        facing: unit.
+        turns: rotations to begin with.
+        places: where the points' middle may lie.
+    """
+    middle = points.mean(axis=0)
+    points = points - middle
+    tree = KDTree(np.concatenate([surface, TURN_MM * facing], axis=1))
     rotations, translations = np.repeat(turns, len(places), axis=0), np.tile(places, (len(turns), 1))
     for stage in ROUNDS:
         some = slice(0, stage.points)
@@ -203,15 +226,16 @@ def _closest_points(
     return means, rotations, translations
 
 
-def _surface_points(
+def surface_points(
     reference: Reference, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Returns points drawn over the reference by area (middles of triangles), and their normals."""
     corners = reference.index.corners
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    chosen = _drawn(area, SURFACE_POINTS, rng)
+    chosen = drawn(area, SURFACE_POINTS, rng)
     return corners[chosen].mean(axis=1), reference.index.normals(chosen)
 
 
-def _drawn(weights: Float[np.ndarray, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
+def drawn(weights: Float[np.ndarray, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
+    """Returns at most ``count`` different rows, drawn by their weights."""
     return rng.choice(len(weights), min(count, int((weights > 0).sum())), replace=False, p=weights / weights.sum())

@@ -1,22 +1,16 @@
 """The certificate: two A4 pages, the figures and their limits, then the pictures and what each figure means."""
 
-from collections.abc import Sequence
 from datetime import UTC, datetime
 
-import cv2
 import numpy as np
-from fpdf import FPDF
 
-from pipeline.results.overlays import Resized
+from pipeline.results.pdf_page import BAD, FAINT, GOOD, LINE_MM, MARGIN_MM, WIDTH_MM, PdfPage, jpeg_of
 from pipeline.verification.judgement import FORM_SHARE, Judgement
 from pipeline.verification.limits import Check
 from pipeline.verification.pictures import AZIMUTHS_DEG, Pictures, legend
 from pipeline.verification.report import VerificationReport
 
-MARGIN_MM, WIDTH_MM, LINE_MM = 16.0, 178.0, 5.0  # A4 less its margins
-INK, FAINT, GOOD, BAD = (30, 30, 30), (110, 110, 110), (20, 110, 60), (178, 24, 43)
 TOLD = 8  # captures that page one has room for
-JPEG_QUALITY = 92
 FIGURES = {  # name of the limit: (words, digits, unit)
     "face_rms_mm": ("Deviation of the face, RMS, worst capture", 3, "mm"),
     "features_rms_mm": ("Deviation of eyes, nose and mouth, RMS, the worst of them", 3, "mm"),
@@ -40,37 +34,9 @@ NOTES = (
 )
 
 
-class _Page(FPDF):
-    """Draws A4 pages with the certificate's margins and fonts; characters outside Latin-1 become question marks."""
-
-    def __init__(self) -> None:
-        super().__init__(unit="mm", format="A4")
-        self.set_margins(MARGIN_MM, MARGIN_MM, MARGIN_MM)
-        self.set_auto_page_break(False)
-
-    def line_of(self, text: str, *, size: float = 9, bold: bool = False, ink: tuple[int, int, int] = INK) -> None:
-        self.set_font("Helvetica", style="B" if bold else "", size=size)
-        self.set_text_color(*ink)
-        self.multi_cell(WIDTH_MM, LINE_MM * size / 9, latin(text), align="L", new_x="LMARGIN", new_y="NEXT")
-
-    def table_of(
-        self, header: Sequence[str], rows: Sequence[Sequence[str]], widths_mm: Sequence[float], inks: dict[int, tuple]
-    ) -> None:
-        """Draws a table. ``inks``: colour of the last cell, by row."""
-        for number, row in enumerate([header, *rows], -1):
-            self.set_font("Helvetica", style="B" if number < 0 else "", size=8.5)
-            for column, (text, width) in enumerate(zip(row, widths_mm, strict=True)):
-                last = column == len(row) - 1
-                self.set_text_color(*(inks.get(number, INK) if last else INK))
-                align = "L" if column == 0 else "R"
-                self.cell(width, LINE_MM, latin(text), border="B", align=align)
-            self.ln(LINE_MM)
-        self.ln(LINE_MM / 2)
-
-
 def certificate_pdf(report: VerificationReport, judgement: Judgement, pictures: Pictures) -> bytes:
     """Returns the certificate as a PDF of two pages. The same report and pictures give the same bytes."""
-    pdf = _Page()
+    pdf = PdfPage()
     pdf.set_creation_date(datetime.fromisoformat(report["date"]).replace(tzinfo=UTC))
     pdf.set_title("eigenhead: verification of a studio")
     pdf.add_page()
@@ -80,7 +46,7 @@ def certificate_pdf(report: VerificationReport, judgement: Judgement, pictures: 
     return bytes(pdf.output())
 
 
-def _figures_page(pdf: _Page, report: VerificationReport, judgement: Judgement) -> None:
+def _figures_page(pdf: PdfPage, report: VerificationReport, judgement: Judgement) -> None:
     pdf.line_of("Verification of a studio against a reference scan", size=16, bold=True)
     open_ = sum(check.passed is None for check in judgement.checks)
     verdict = ("PASSED" if judgement.passed else "NOT PASSED") + (f", {open_} figure(s) not judged" if open_ else "")
@@ -107,7 +73,7 @@ def _check_row(check: Check) -> tuple[str, str, str, str]:
     return words, found, f"{check.limit:g} {unit}", verdict
 
 
-def _regions_table(pdf: _Page, report: VerificationReport) -> None:
+def _regions_table(pdf: PdfPage, report: VerificationReport) -> None:
     pdf.line_of("Error by region, mm: what all captures have in common, and how they scatter", size=11, bold=True)
     rows = []
     for name, of in report["repeated"].items():
@@ -120,7 +86,7 @@ def _regions_table(pdf: _Page, report: VerificationReport) -> None:
     pdf.table_of(header, rows, (22, 19.5, 19.5, 19.5, 19.5, 19.5, 19.5, 19.5, 19.5), {})
 
 
-def _captures_table(pdf: _Page, report: VerificationReport) -> None:
+def _captures_table(pdf: PdfPage, report: VerificationReport) -> None:
     pdf.line_of("Captures, each by its own best fit", size=11, bold=True)
     rows = []
     for name, of in list(report["captures"].items())[:TOLD]:
@@ -138,7 +104,7 @@ def _captures_table(pdf: _Page, report: VerificationReport) -> None:
         pdf.line_of(f"and {more} more in report.json", ink=FAINT)
 
 
-def _distances_table(pdf: _Page, report: VerificationReport) -> None:
+def _distances_table(pdf: PdfPage, report: VerificationReport) -> None:
     """Draws the table of landmark distances, mean of all captures, with as many rows as fit on the page."""
     captures = list(report["captures"].values())
     names = list(captures[0]["distances"])
@@ -155,7 +121,7 @@ def _distances_table(pdf: _Page, report: VerificationReport) -> None:
     pdf.table_of(("", "measured", "reference", "error"), rows[: max(room, 0)], (82, 32, 32, 32), {})
 
 
-def _pictures_page(pdf: _Page, pictures: Pictures) -> None:
+def _pictures_page(pdf: PdfPage, pictures: Pictures) -> None:
     pdf.line_of("Reference, result and error", size=14, bold=True)
     width = WIDTH_MM / len(AZIMUTHS_DEG)
     for title, row in (
@@ -166,10 +132,10 @@ def _pictures_page(pdf: _Page, pictures: Pictures) -> None:
         pdf.line_of(title, bold=True)
         top, height = pdf.get_y(), width * row[0].shape[0] / row[0].shape[1]
         for column, image in enumerate(row):
-            pdf.image(_encoded(image), x=MARGIN_MM + column * width, y=top, w=width)
+            pdf.image(jpeg_of(image), x=MARGIN_MM + column * width, y=top, w=width)
         pdf.set_y(top + height)
     top = pdf.get_y()
-    pdf.image(_encoded(legend()), x=MARGIN_MM + 39, y=top, w=100, h=4)
+    pdf.image(jpeg_of(legend()), x=MARGIN_MM + 39, y=top, w=100, h=4)
     pdf.set_y(top + 4)
     pdf.set_font("Helvetica", size=8)
     for share, text in ((0.0, f"-{pictures.end_mm:g} inside"), (0.5, "0"), (1.0, f"+{pictures.end_mm:g} outside")):
@@ -178,14 +144,3 @@ def _pictures_page(pdf: _Page, pictures: Pictures) -> None:
     pdf.ln(LINE_MM + 1)
     for note in NOTES:
         pdf.line_of(note, size=7.5, ink=FAINT)
-
-
-def _encoded(image: Resized) -> bytes:
-    _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return jpeg.tobytes()
-
-
-def latin(text: str) -> str:
-    """Returns the text with every character outside Latin-1, which the PDF's fonts lack, replaced by a question
-    mark."""
-    return text.encode("latin-1", "replace").decode("latin-1")

@@ -50,7 +50,7 @@ def is_result(folder: Path) -> bool:
 def identity_of(folder: Path) -> ResultIdentity:
     """Returns which model made a result. Raises InputError if report.json is missing, damaged or does not say it."""
     try:
-        model = _report(folder)["model"]
+        model = read_report(folder)["model"]
         return ResultIdentity(str(model["name"]), str(model["sha256"]))
     except (KeyError, TypeError) as error:
         raise InputError(f"{folder.name}/report.json", [f"lacks {error}"]) from error
@@ -59,7 +59,7 @@ def identity_of(folder: Path) -> ResultIdentity:
 def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
     """Reads a result folder that was made with ``model``. Raises InputError that names each file or field that does not
     fit."""
-    report = _report(folder)
+    report = read_report(folder)
     mesh, stated_mm = read_head_ply(folder / "head.ply")
     full = model.levels["full"]
     if len(mesh.vertices) != full.count or not np.array_equal(mesh.faces, full.faces):
@@ -86,7 +86,7 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
     )
 
 
-def _report(folder: Path) -> ReportDocument:
+def read_report(folder: Path) -> ReportDocument:
     """Returns the decoded report.json of a result; its contents are not checked. Raises InputError."""
     try:
         return json.loads((folder / "report.json").read_text(encoding="utf-8"))

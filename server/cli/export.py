@@ -1,4 +1,4 @@
-"""Implements ``eigenhead export``, which writes a capture for other programs."""
+"""Implements ``eigenhead export``, which writes a capture or a result for other programs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,21 +6,39 @@ from typing import Annotated
 import typer
 
 from server.cli.answers import Json, Overwrite, Overwrites, answer, chosen, prepare_folder, progress_bar, warn
+from server.cli.clinic import axes_choices
 
 app = typer.Typer(rich_markup_mode=None)
 
 
-def _dataset_formats() -> tuple[str, ...]:
+SLICER = "slicer"
+
+
+def _forms() -> tuple[str, ...]:
     from rig.formats.cameras.dataset_json import DATASET_FORMATS
 
-    return DATASET_FORMATS
+    return (*DATASET_FORMATS, SLICER)
 
 
-@app.command(epilog="Example: eigenhead export shots/anna --as nerfstudio --result heads/anna --out sets/anna")
+def _planes() -> tuple[str, ...]:
+    from pipeline.clinic.anatomical_frame import PLANES
+
+    return PLANES
+
+
+@app.command(
+    epilog="Example: eigenhead export shots/anna --as nerfstudio --result heads/anna --out sets/anna   For 3D Slicer: "
+    "eigenhead export heads/anna --as slicer --plane frankfurt --out clinic/anna"
+)
 def export(
-    capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
-    form: Annotated[str, chosen("nerfstudio or gaussian-avatars.", _dataset_formats, "--as")],
-    out: Annotated[Path, typer.Option(help="The folder of the data set.", file_okay=False)],
+    capture: Annotated[
+        Path,
+        typer.Argument(
+            help="A capture folder, or a .zip, .tar or .tar.gz of one; for slicer a result folder.", exists=True
+        ),
+    ],
+    form: Annotated[str, chosen("nerfstudio, gaussian-avatars or slicer.", _forms, "--as")],
+    out: Annotated[Path, typer.Option(help="The folder that is written.", file_okay=False)],
     *,
     result: Annotated[
         Path | None,
@@ -31,12 +49,40 @@ def export(
         ),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
+    axes: Annotated[str, chosen("For slicer: LPS (the default) or RAS.", axes_choices)] = "LPS",
+    plane: Annotated[str, chosen("For slicer: head (the default), or frankfurt.", _planes)] = "head",
+    marked: Annotated[
+        Path | None,
+        typer.Option(
+            help="For slicer: porion and orbitale, marked over an export without a plane, .mrk.json.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Write a capture as a data set for other programs.
+    """Write a capture or a head for other programs.
 
-    Undistorted pictures, masks and cameras in metres."""
+    A capture as a data set: undistorted pictures, masks and cameras in metres. A head for 3D Slicer: mesh and landmarks
+    in a patient's axes, mm."""
+    if form == SLICER:
+        _export_patient(capture, out, axes, plane, marked=marked, overwrite=overwrite, json_out=json_out)
+        return
+    _export_dataset(capture, out, form, result=result, settings=settings, overwrite=overwrite, json_out=json_out)
+
+
+def _export_dataset(
+    capture: Path,
+    out: Path,
+    form: str,
+    *,
+    result: Path | None,
+    settings: Path | None,
+    overwrite: bool,
+    json_out: bool,
+) -> None:
+    """Writes a capture as a data set."""
     from typing import cast
 
     from pipeline.settings import settings_from_document
@@ -63,3 +109,34 @@ def export(
         + (f", without {', '.join(made.left_out)}" if made.left_out else "")
     )
     answer(document, json_out, [f"{out}  {seen}"])
+
+
+def _export_patient(
+    result: Path, out: Path, axes: str, plane: str, *, marked: Path | None, overwrite: bool, json_out: bool
+) -> None:
+    """Writes a result's head in a patient's axes."""
+    from typing import cast
+
+    from pipeline.clinic.anatomical_frame import frankfurt_axes, head_axes
+    from pipeline.clinic.patient_files import FRAME_FILE, marked_points, write_patient_files
+    from pipeline.clinic.visit import read_visit
+    from rig.formats.meshes.markups import Axes
+
+    if (out / FRAME_FILE).exists() and not overwrite:
+        raise Overwrites(out / FRAME_FILE)
+    patient_axes = cast(Axes, axes)
+    visit = read_visit(result)
+    points = marked_points(marked, visit, patient_axes)
+    in_plane = plane == "frankfurt" or marked is not None
+    frame = (
+        frankfurt_axes(visit.measured, patient_axes, points) if in_plane else head_axes(visit.measured, patient_axes)
+    )
+    prepare_folder(out)
+    document = write_patient_files(out, visit, frame)
+    lines = [f"{out}  {frame.axes}, {'Frankfurt plane' if in_plane else 'the attitude of the head frame'}"]
+    if frame.tilt_deg is not None:
+        lines.append(
+            f"the head frame is tilted by {frame.tilt_deg:+.1f} degrees (standard deviation {frame.tilt_std_deg:.1f})"
+        )
+        lines += [f"  {name}: {source}" for name, source in frame.sources.items()]
+    answer(document | {"out": str(out)}, json_out, lines)

@@ -1,4 +1,4 @@
-"""Reads meshes of other programs: PLY, OBJ and GLB, through trimesh."""
+"""Reads meshes of other programs: PLY, OBJ, GLB and, where it is asked for, STL, through trimesh."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,9 @@ from rig.image import ImageRgb
 from rig.mesh import Mesh
 from rig.messages.message import compose
 
+MESH_ENDINGS = (".ply", ".obj", ".glb")
+SURFACE_ENDINGS = (*MESH_ENDINGS, ".stl")  # STL has neither colours nor joined vertices
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexturedMesh:
@@ -22,9 +25,9 @@ class TexturedMesh:
     image: ImageRgb | None = None
 
 
-def read_mesh(path: Path) -> Mesh:
-    """Reads PLY, OBJ or GLB in the file's own units. Raises InputError."""
-    return _mesh(_loaded(path), path)
+def read_mesh(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Mesh:
+    """Reads PLY, OBJ, GLB or what else ``endings`` names, in the file's own units. Raises InputError."""
+    return _mesh(_loaded(path, endings), path)
 
 
 def read_textured_mesh(path: Path) -> TexturedMesh:
@@ -40,11 +43,11 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
     return TexturedMesh(mesh, uv, np.ascontiguousarray(np.asarray(picture.convert("RGB"), np.uint8)))
 
 
-def _loaded(path: Path) -> Any:
+def _loaded(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Any:
     import trimesh
 
-    if path.suffix.lower() not in (".ply", ".obj", ".glb"):
-        raise InputError(path.name, [compose("no-mesh-ending")])
+    if path.suffix.lower() not in endings:
+        raise InputError(path.name, [compose("no-mesh-ending" if endings == MESH_ENDINGS else "no-surface-ending")])
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh lets the parsers' own errors through, of any class

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
@@ -93,6 +93,19 @@ def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
     along its normal.
 
     Raises InputError for a file that is truncated or another program's."""
+    vertices, faces = _head_rows(path)
+    places = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(float)
+    colours = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
+    return Mesh(places, faces.astype(np.int32), colours), vertices["quality"].astype(float)
+
+
+def read_view_counts(path: Path) -> UInt8[np.ndarray, " v"]:
+    """Reads of a head.ply how many images coloured each vertex; 0 where it was filled. Raises InputError."""
+    return _head_rows(path)[0]["views"].copy()
+
+
+def _head_rows(path: Path) -> tuple[np.ndarray, Int[np.ndarray, "f 3"]]:
+    """Reads the records of the vertices (``PLY_VERTEX``) and the corners of the faces. Raises InputError."""
     try:
         header, end, body = path.read_bytes().partition(b"end_header\n")
     except OSError as error:
@@ -109,6 +122,4 @@ def read_head_ply(path: Path) -> tuple[Mesh, Float[np.ndarray, " v"]]:
         raise InputError(path.name, [compose("ply-bytes", held=len(body), wanted=wanted)])
     vertices = np.frombuffer(body, PLY_VERTEX, counts[0])
     faces = np.frombuffer(body, face, counts[1], counts[0] * PLY_VERTEX.itemsize)["corners"]
-    places = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(float)
-    colours = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
-    return Mesh(places, faces.astype(np.int32), colours), vertices["quality"].astype(float)
+    return vertices, faces

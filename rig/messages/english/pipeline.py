@@ -191,4 +191,10 @@ TEMPLATES = {
     "mask-alone-ready": "{share:.1%} of the mask is where the other cameras see nothing: correct the mask, or those of the others where they leave something out",
     "mask-incomplete-ready": "the mask lacks {share:.1%} of what the other cameras show: correct the mask",
     "cameras-scaled": "the cameras were scaled by {factor:.4g}: {scale}",
+    "report-unread": "is no report.json that can be read ({reason})",
+    "marks-too-few": "names {found} of the 26 landmarks; at least {needed} are needed",
+    "landmarks-lacking": "lacks the landmarks {names}",
+    "no-frankfurt-plane": "has no Frankfurt plane: its porions are {width_mm:.0f} mm apart and the orbitalia {reach_mm:.0f} mm before them; are the marked points named rightly, and in the same axes?",
+    "not-same-person": "is {off_mm:.1f} mm off {earlier} on forehead and bridge of the nose: are both heads of one person, in mm?",
+    "surface-not-this-head": "does not have the face of {head} (scatter after the best fit: {off_mm:.1f} mm): is it this person's surface, in mm, facing outwards, and are its axes right (--axes)? Else give its landmarks (--landmarks)",
 }

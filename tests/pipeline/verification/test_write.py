@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.verification.certificate import certificate_pdf, latin
+from pipeline.results.pdf_page import latin
+from pipeline.verification.certificate import certificate_pdf
 from pipeline.verification.judgement import judge
 from pipeline.verification.limits import Limits
 from pipeline.verification.measured import ResultIdentity

@@ -1,0 +1,54 @@
+"""Pages of a PDF: A4, in the fonts that every reader has, with lines, tables and pictures."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from fpdf import FPDF
+
+from pipeline.results.overlays import Resized
+
+MARGIN_MM, WIDTH_MM, LINE_MM = 16.0, 178.0, 5.0  # A4 less its margins
+INK, FAINT, GOOD, BAD = (30, 30, 30), (110, 110, 110), (20, 110, 60), (178, 24, 43)
+JPEG_QUALITY = 92
+
+
+class PdfPage(FPDF):
+    """Draws A4 pages with a document's margins and fonts; characters outside Latin-1 become question marks."""
+
+    def __init__(self) -> None:
+        super().__init__(unit="mm", format="A4")
+        self.set_margins(MARGIN_MM, MARGIN_MM, MARGIN_MM)
+        self.set_auto_page_break(False)
+
+    def line_of(self, text: str, *, size: float = 9, bold: bool = False, ink: tuple[int, int, int] = INK) -> None:
+        """Draws a line or, where it is too long, several."""
+        self.set_font("Helvetica", style="B" if bold else "", size=size)
+        self.set_text_color(*ink)
+        self.multi_cell(WIDTH_MM, LINE_MM * size / 9, latin(text), align="L", new_x="LMARGIN", new_y="NEXT")
+
+    def table_of(
+        self, header: Sequence[str], rows: Sequence[Sequence[str]], widths_mm: Sequence[float], inks: dict[int, tuple]
+    ) -> None:
+        """Draws a table. ``inks``: colour of the last cell, by row."""
+        for number, row in enumerate([header, *rows], -1):
+            self.set_font("Helvetica", style="B" if number < 0 else "", size=8.5)
+            for column, (text, width) in enumerate(zip(row, widths_mm, strict=True)):
+                last = column == len(row) - 1
+                self.set_text_color(*(inks.get(number, INK) if last else INK))
+                align = "L" if column == 0 else "R"
+                self.cell(width, LINE_MM, latin(text), border="B", align=align)
+            self.ln(LINE_MM)
+        self.ln(LINE_MM / 2)
+
+
+def jpeg_of(image: Resized) -> bytes:
+    """Returns a picture as the bytes of a JPEG file."""
+    _, jpeg = cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return jpeg.tobytes()
+
+
+def latin(text: str) -> str:
+    """Returns the text with every character outside Latin-1, which the PDF's fonts lack, replaced by a question
+    mark."""
+    return text.encode("latin-1", "replace").decode("latin-1")

@@ -1,0 +1,136 @@
+"""Implements ``eigenhead compare`` and ``register``: two visits of a person, and a head on the surface of a CT."""
+
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder
+
+if TYPE_CHECKING:
+    from pipeline.clinic.comparison import Comparison
+
+app = typer.Typer(rich_markup_mode=None)
+
+Result = Annotated[Path, typer.Argument(help="A result folder.", exists=True, file_okay=False)]
+Model = Annotated[
+    str | None, typer.Option(help="The head model's name or file, if not the one that report.json names.")
+]
+
+
+def axes_choices() -> tuple[str, ...]:
+    """Returns the names of a patient's axes."""
+    from rig.formats.meshes.markups import AXES
+
+    return AXES
+
+
+@app.command(epilog="Example: eigenhead compare heads/anna-march heads/anna-june --out compared/anna")
+def compare(
+    earlier: Annotated[Path, typer.Argument(help="The earlier result folder.", exists=True, file_okay=False)],
+    later: Annotated[Path, typer.Argument(help="The later one, of the same person.", exists=True, file_okay=False)],
+    out: Annotated[Path, typer.Option(help="The folder of the comparison.", file_okay=False)],
+    *,
+    model: Model = None,
+    overwrite: Overwrite = False,
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """Compare two results of one person.
+
+    Both are aligned on the forehead and the bridge of the nose. Writes the signed distances as PLY, GLB, picture and
+    tables, and a PDF; what is below two combined standard deviations is grey."""
+    if (out / "compare.json").exists() and not overwrite:
+        raise Overwrites(out / "compare.json")
+    from pipeline.clinic.comparison import compare as compare_visits
+    from pipeline.clinic.comparison_files import write_comparison
+    from pipeline.clinic.visit import read_visit
+
+    comparison = compare_visits(read_visit(earlier, model), read_visit(later, model))
+    prepare_folder(out)
+    document = write_comparison(out, comparison, date.today().isoformat())
+    answer(document | {"out": str(out)}, json_out, _comparison_lines(comparison, out))
+
+
+def _comparison_lines(comparison: "Comparison", out: Path) -> list[str]:
+    fit, whole = comparison.fit, comparison.regions["whole"]
+    changed = [
+        f"  {name}: {of.changed_share:.0%} of it, {of.largest_mm:+.2f} mm at most, {of.volume_ml:+.2f} ml"
+        for name, of in comparison.regions.items()
+        if name != "whole" and of.changed_share > 0.0
+    ]
+    lengths = [
+        f"  {name}: {of.change_mm:+.1f} mm (standard deviation {of.std_mm:.1f})"
+        for name, of in comparison.lengths.items()
+        if of.is_sure and of.std_mm is not None
+    ]
+    return [
+        str(out / "comparison.pdf"),
+        f"aligned on forehead and bridge of the nose: scatter {fit.std_mm:.3f} mm, {fit.kept_share:.0%} of it used",
+        f"changed by more than two standard deviations: {whole.changed_share:.1%} of the surface",
+        *changed,
+        *(lengths or ["no measurement changed by more than two standard deviations"]),
+        str(out / "difference.png"),
+    ]
+
+
+@app.command(epilog="Example: eigenhead register heads/anna cbct/anna-skin.stl --axes LPS --out registered/anna")
+def register(
+    result: Result,
+    surface: Annotated[
+        Path,
+        typer.Argument(help="The skin of a CT or CBCT, .ply, .obj, .glb or .stl, in mm.", exists=True, dir_okay=False),
+    ],
+    out: Annotated[Path, typer.Option(help="The folder of the registered head.", file_okay=False)],
+    *,
+    axes: Annotated[
+        str | None, chosen("Of the surface, LPS or RAS; by default what its header states, else LPS.", axes_choices)
+    ] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of the surface, .mrk.json, .json, .pp or .ljson: three or more of docs/models.md.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
+    model: Model = None,
+    overwrite: Overwrite = False,
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """Lay a head on the surface of a CT or CBCT.
+
+    A rigid fit of the face; what contradicts the rest (swelling, a chin rest, the surfaces of skull and airways) has no
+    part in it. Writes the head and its landmarks in the surface's frame, and what is left between the two."""
+    if (out / "registration.json").exists() and not overwrite:
+        raise Overwrites(out / "registration.json")
+    from typing import cast
+
+    from pipeline.clinic.registration import register as register_head
+    from pipeline.clinic.registration_files import write_registration
+    from pipeline.clinic.surface import read_surface
+    from pipeline.clinic.surface_landmarks import read_surface_landmarks
+    from pipeline.clinic.visit import read_visit
+    from rig.formats.meshes.markups import Axes
+
+    patient = read_surface(surface, cast(Axes | None, axes))
+    marks = None if landmarks is None else read_surface_landmarks(landmarks, patient.axes)
+    found = register_head(read_visit(result, model), patient, marks)
+    prepare_folder(out)
+    document = write_registration(out, found)
+    answer(document | {"out": str(out)}, json_out, _registration_lines(document, out))
+
+
+def _registration_lines(document: dict[str, Any], out: Path) -> list[str]:
+    figures, surface = document["figures"], document["surface"]
+    stated = "as its header states" if surface["axes_stated"] else "which it does not state"
+    return [
+        str(out / "head.ply"),
+        f"axes {surface['axes']}, {stated}; started from {document['start']}",
+        f"residual of the face: {figures['median_mm']:.3f} mm (median), {figures['rms_mm']:.3f} (RMS), "
+        f"{figures['p95_mm']:.3f} (95 %); {figures['covered_share']:.0%} of it is on the surface",
+        f"of the {figures['kept_share']:.0%} that the fit used: {figures['kept_std_mm']:.3f} mm (standard deviation)",
+        str(out / "residual.ply"),
+    ]

@@ -1,0 +1,75 @@
+"""The commands of a clinic, on result folders that hold what they read."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.head_model.model import load_model
+from rig.formats.meshes.ply import write_ply
+from rig.mesh import Mesh
+from server.cli.main import app
+
+LEFT_MM = (400.0, 30.0, -50.0)  # of the rig from the head: the world frame is the head's, moved
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("heads") / "anna"
+    model = load_model()
+    vertices = model.vertices(np.zeros(0)) + LEFT_MM
+    mesh = Mesh(vertices, model.levels["full"].faces)
+    count = len(vertices)
+    write_ply(
+        folder / "head.ply", mesh, normals=mesh.normals(), colours=np.full((count, 3), 150, np.uint8),
+        quality=np.full(count, 0.2), views=np.ones(count, np.uint8),
+    )  # fmt: skip
+    report = {
+        "model": {"name": model.name, "sha256": "0" * 64},
+        "world_from_head": {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": list(LEFT_MM)},
+        "landmarks": {
+            name: {"position": vertices[row].tolist(), "std": [1.0, 2.0, 2.0]} for name, row in model.landmarks.items()
+        },
+        "measurements": {"nose_breadth": {"value": 34.0, "std": 1.0}},
+        "warnings": [],
+    }
+    (folder / "report.json").write_text(json.dumps(report))
+    return folder
+
+
+def test_an_export_says_which_plane_and_by_what(result: Path, tmp_path: Path) -> None:
+    words = ["export", str(result), "--as", "slicer", "--axes", "RAS", "--plane", "frankfurt", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert "RAS, Frankfurt plane" in done.output
+    assert "porion_left: tragion" in done.output
+    frame = json.loads((tmp_path / "frame.json").read_text())
+    [markup] = json.loads((tmp_path / "landmarks.mrk.json").read_text())["markups"]
+    assert frame["axes"] == markup["coordinateSystem"] == "RAS"
+    tragions = [np.array(p["position"]) for p in markup["controlPoints"] if p["label"].startswith("tragion")]
+    np.testing.assert_allclose(tragions[0] + tragions[1], 0.0, atol=1e-9)
+    assert markup["controlPoints"][0]["description"].startswith("standard deviation 3.000 mm")
+    again = CliRunner().invoke(app, words)
+    assert "frame.json is there already" in str(again.exception)
+
+
+def test_a_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
+    for words in (["export", str(tmp_path), "--as", "slicer"], ["compare", str(tmp_path), str(tmp_path)]):
+        done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
+        assert done.exit_code == 1
+        assert "report.json: cannot be read" in str(done.exception)
+        assert not (tmp_path / "out").exists()
+
+
+def test_axes_that_nobody_knows_are_wrong_usage(result: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["export", str(result), "--as", "slicer", "--axes", "XYZ", "--out", str(tmp_path)])
+    assert done.exit_code == 2
+    assert "none of LPS, RAS" in done.output
+
+
+def test_a_comparison_that_is_there_is_not_written_over(result: Path, tmp_path: Path) -> None:
+    (tmp_path / "compare.json").write_text("{}")
+    done = CliRunner().invoke(app, ["compare", str(result), str(result), "--out", str(tmp_path)])
+    assert "compare.json is there already" in str(done.exception)
