@@ -32,7 +32,7 @@ from server.errors import NotFound
 from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.records import CaptureRecord
-from server.wire.batch_files import TableFormat, send_sheet, send_table
+from server.wire.batch_files import SheetFormat, TableFormat, send_sheet, send_table
 from server.wire.multipart import receive_calibration_pictures, receive_capture
 from server.wire.send_file import send_archive, send_file
 
@@ -256,10 +256,10 @@ def batch_table(who: Reader, batch_id: str, form: TableFormat) -> Response:
     return send_table(who[0], batch_id, form)
 
 
-@pages.get("/console/batches/{batch_id}/sheet.html")
-def batch_sheet(who: Reader, batch_id: str) -> Response:
-    """Returns the contact sheet of a batch: an HTML page with views of each head. Raises NotFound."""
-    return send_sheet(who[0], batch_id)
+@pages.get("/console/batches/{batch_id}/sheet.{form}")
+def batch_sheet(who: Reader, batch_id: str, form: SheetFormat) -> Response:
+    """Returns the contact sheet of a batch, as an HTML page or a PDF. Raises NotFound."""
+    return send_sheet(who[0], batch_id, form)
 
 
 @pages.get("/console/calibrations/{calibration_id}/report.html")
