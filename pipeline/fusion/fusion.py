@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import KDTree
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
@@ -22,6 +21,7 @@ from pipeline.fusion.refinement import Measured, refine_vertices
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
 from pipeline.fusion.skin import drawn_to_skin
 from pipeline.fusion.view_stack import stack_views
+from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
@@ -162,5 +162,5 @@ def _subject(
     if head is None or (volume > 0).sum() < 2:
         return piece[faces[:, 0]] == np.argmax(volume)
     solid = np.flatnonzero(volume[piece] > 0)
-    nearest = KDTree(vertices[solid]).query(head[::HEAD_STRIDE])[1]
-    return piece[faces[:, 0]] == np.bincount(piece[solid[nearest]]).argmax()
+    near = nearest(PointTree.of(vertices[solid]), head[::HEAD_STRIDE])[1]
+    return piece[faces[:, 0]] == np.bincount(piece[solid[near]]).argmax()

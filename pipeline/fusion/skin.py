@@ -11,11 +11,12 @@ only its smoothness counts. So the larger that mean, the more of it is left wher
 """
 
 import numpy as np
-import scipy.sparse as sparse
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int32, Int64
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.refinement_kernels import blurred_over_mesh
+from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh
 
@@ -51,42 +52,38 @@ def drawn_to_skin(
         deviation_mm: standard deviation along the normal of the vertices that a view sees.
     """
     vertices = mesh_world.vertices.copy()
-    same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * mean_around(mesh_world.faces, deviation_mm, skin))
+    beside = neighbours(mesh_world.faces, len(vertices))
+    same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * mean_around(beside, deviation_mm, skin))
     reach = FARTHEST * float(same_mm.max(initial=SAME_MM))
     low, high = head_skin_world.vertices.min(axis=0) - reach, head_skin_world.vertices.max(axis=0) + reach
     candidates = np.flatnonzero((skin > 0.0) & ((vertices > low) & (vertices < high)).all(axis=1))
     if not len(candidates) or not len(head_skin_world.faces):
         return mesh_world
-    normals = mesh_world.normals()[candidates]
+    normals = normals_of(mesh_world)[candidates]
     hit = SurfaceIndex(head_skin_world.vertices, head_skin_world.faces).closest(vertices[candidates], CANDIDATES)
     same = (hit.distances <= FARTHEST * same_mm[candidates]) & ((hit.normals * normals).sum(axis=1) >= 0.0)
     agreement, shown = np.zeros(len(vertices)), np.zeros(len(vertices))
     agreement[candidates] = same * np.exp(-((hit.distances / same_mm[candidates]) ** 2))
     shown[candidates] = skin[candidates]
-    around = mean_around(mesh_world.faces, agreement, shown)[candidates]
+    around = mean_around(beside, agreement, shown)[candidates]
     consent = np.clip((around - CONSENT[0]) / (CONSENT[1] - CONSENT[0]), 0.0, 1.0)
     near = agreement[candidates]
     share = skin[candidates] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
     apart, compared = np.zeros(len(vertices)), np.zeros(len(vertices))
     apart[candidates] = ((hit.points - vertices[candidates]) * hit.normals).sum(axis=1)
     compared[candidates] = skin[candidates] * same
-    offset = mean_around(mesh_world.faces, compared.astype(bool) * np.clip(apart, -same_mm, same_mm), compared)[
-        candidates
-    ]
+    offset = mean_around(beside, compared.astype(bool) * np.clip(apart, -same_mm, same_mm), compared)[candidates]
     left = offset * (1.0 - np.exp(-((offset / OFFSET_MM) ** 2)))
     vertices[candidates] += share[:, None] * (hit.points - vertices[candidates] - left[:, None] * hit.normals)
     return Mesh(vertices, mesh_world.faces)
 
 
 def mean_around(
-    faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, " v"], weight: Float[np.ndarray, " v"]
+    beside: tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]],
+    values: Float[np.ndarray, " v"],
+    weight: Float[np.ndarray, " v"],
 ) -> Float[np.ndarray, " v"]:
     """Returns, for each vertex of a closed mesh, the weighted mean of the values over its surroundings
-    (``SURROUNDINGS`` steps); about 0 where no weight is near."""
-    starts, indices = neighbours(faces, len(values))
-    beside = sparse.csr_array((np.ones(len(indices)), indices, starts), shape=(len(values), len(values)))
-    count = np.maximum(np.diff(starts), 1)[:, None]
-    both = np.stack([weight * values, weight], axis=1)
-    for _ in range(SURROUNDINGS):
-        both = 0.5 * (both + (beside @ both) / count)
+    (``SURROUNDINGS`` steps); about 0 where no weight is near. ``beside`` are its ``neighbours``."""
+    both = blurred_over_mesh(np.stack([weight * values, weight], axis=1).astype(float), *beside, SURROUNDINGS)
     return both[:, 0] / np.maximum(both[:, 1], 1e-6)
