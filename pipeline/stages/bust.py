@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
 from pipeline.fusion.signed_distance import NoSurface
-from pipeline.fusion.skin import part_of
+from pipeline.fusion.skin import measured_skin
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.normals import normals_of, vertex_normals
 from pipeline.geometry.raster import depth_maps
@@ -77,7 +77,7 @@ def shape_bust(
     if fused is None:
         return Staged(None)
     displaced = refined.displaced
-    skin = None if displaced is None else part_of(refined.mesh_world, displaced.observed)
+    skin = None if displaced is None else measured_skin(refined.mesh_world, refined.deviation_mm, displaced.observed)
     return Staged(finished(fused, depth.votes, skin))
 
 
