@@ -147,13 +147,15 @@ def meeting_triangles(
     points = np.concatenate([vertices[name] for name in inner.parts])
     starts = np.cumsum([0, *(len(vertices[name]) for name in inner.parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(inner.parts.values(), starts, strict=False)])
-    corners, own = mesh[triangles], points[faces]
-    middles, long = corners.mean(axis=1), np.linalg.norm(own - np.roll(own, 1, axis=1), axis=2).max()
+    corners, sides = mesh[triangles], points[faces]
+    middles, long = corners.mean(axis=1), np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2).max()
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1) + long
     out = np.zeros(len(triangles), bool)
-    near = np.flatnonzero(KDTree(points).query(middles)[0] < reach)
+    tree = KDTree(points)
+    near = np.flatnonzero(tree.query(middles)[0] < reach)
     if len(near):
-        beside = KDTree(middles[near]).query(points)[0] < reach[near].max()
+        beside = np.zeros(len(points), bool)
+        beside[np.concatenate(tree.query_ball_point(middles[near], reach[near])).astype(int)] = True
         about = faces[beside[faces].any(axis=1)] + len(mesh)
         whole = np.concatenate([triangles[near], about])
         active = np.arange(len(whole)) >= len(near)

@@ -43,13 +43,13 @@ def placed(
     faces: np.ndarray,
     *,
     more: np.ndarray | None = None,
-    own: bool = True,
+    joined: bool = False,
 ) -> InnerMouth:
-    """The parts of that level; ``more`` are vertices, of a part of their own or not, which no shape moves."""
+    """The parts of that level; ``more`` are vertices, of a part of their own or joined, which no shape moves."""
     skin, shapes = skin_of(model, mean)
     loose = np.full(len(skin), -1)
     if more is not None:
-        skin, loose = np.concatenate([skin, more]), np.append(loose, np.full(len(more), 0 if own else -1))
+        skin, loose = np.concatenate([skin, more]), np.append(loose, np.full(len(more), -1 if joined else 0))
         shapes = {name: np.concatenate([shape, np.zeros_like(more)]) for name, shape in shapes.items()}
     full = {"jawOpen": model.levels["full"].operator @ model.expressions.moved({"jawOpen": 1.0})}
     return placed_inner_mouth(skin, faces, shapes, marks, jaw_motions(marks, mean, full), loose)
@@ -116,11 +116,11 @@ def test_nothing_is_added_behind_sealed_lips_beside_own_teeth_or_where_there_is_
     assert placed(model, mean, landmarks, np.asarray(model.levels["p95"].faces)).absence == "mouth-sealed"
     middle = landmarks["stomion"]
     teeth = middle + np.array([[-20.0, 3.0, -25.0], [20.0, 3.0, -25.0], [0.0, 3.0, -12.0]])
-    own = placed(model, mean, landmarks, np.append(faces, [[count, count + 1, count + 2]], axis=0), more=teeth)
-    assert (own.absence, own.parts) == ("own-parts", {})
+    beside = placed(model, mean, landmarks, np.append(faces, [[count, count + 1, count + 2]], axis=0), more=teeth)
+    assert (beside.absence, beside.parts) == ("own-parts", {})
     wall = middle + np.array([[-15.0, -9.0, -28.0], [15.0, -9.0, -28.0], [0.0, 15.0, -28.0]])
     none = placed(
-        model, mean, landmarks, np.append(faces, [[count, count + 1, count + 2]], axis=0), more=wall, own=False
+        model, mean, landmarks, np.append(faces, [[count, count + 1, count + 2]], axis=0), more=wall, joined=True
     )
     assert none.absence == "no-room"
 
