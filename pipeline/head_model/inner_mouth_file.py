@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -46,7 +47,7 @@ def load_inner_mouth() -> tuple[dict[str, InnerPart], Mapping[str, Float[np.ndar
 
 def save_inner_mouth(path: Path, parts: Mapping[str, InnerPart], anchors: Mapping[str, Float[np.ndarray, " 3"]]) -> str:
     """Writes the file and returns its sha256. Raises OSError."""
-    arrays = {"anchors": np.array([anchors[name] for name in ANCHORS], np.float32)}
+    arrays: dict[str, Any] = {"anchors": np.array([anchors[name] for name in ANCHORS], np.float32)}
     for name, part in parts.items():
         arrays |= {
             f"{name}_vertices": part.mesh.vertices.astype(np.float32),

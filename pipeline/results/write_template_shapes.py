@@ -9,6 +9,7 @@ import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -98,7 +99,7 @@ def _part(
     return Mesh(animated.neutral[rows], number[inside].astype(np.int32), colours[rows])
 
 
-def _inner_arrays(animated: AnimatedMesh) -> dict[str, np.ndarray]:
+def _inner_arrays(animated: AnimatedMesh) -> dict[str, Any]:
     """Returns teeth and tongue as one mesh; ``inner_parts`` says of each vertex which part it belongs to."""
     inner, vertices, faces, numbers, moves = animated.inner, [], [], [], []
     for number, (name, part) in enumerate(inner.parts.items()):
