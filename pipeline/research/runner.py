@@ -32,6 +32,7 @@ from pipeline.research.speed.scaling import JobCommand, scaling
 from pipeline.research.surface.eyeballs import eyeballs
 from pipeline.research.surface.hair_shells import hair_shells
 from pipeline.research.surface.hidden import hidden
+from pipeline.research.surface.inner_mouth import inner_mouths
 from pipeline.research.surface.light import light
 from pipeline.research.surface.meshes import meshes
 from pipeline.research.surface.pores import pores
@@ -304,6 +305,10 @@ def _eyeballs(task: Task) -> Outcome:
     return eyeballs(_facekit(task.shared), report=task.report, folder=task.folder)
 
 
+def _inner_mouth(task: Task) -> Outcome:
+    return inner_mouths(_facekit(task.shared), report=task.report, folder=task.folder)
+
+
 def _wrap(task: Task) -> Outcome:
     only = task.options.only
     scans = {name: path for name, path in _truths(task.shared).items() if not only or name in only}
@@ -362,6 +367,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "templates": _templates,
     "shapes": _shapes,
     "eyeballs": _eyeballs,
+    "inner-mouth": _inner_mouth,
     "wrap": _wrap,
     "hair-shell": _hair_shell,
     "meshes": _meshes,

@@ -1,13 +1,15 @@
 """``head-NAME.glb`` and ``head-NAME-shapes.npz`` of a result: the template's mesh without expression, with shapes.
 
 Head frame; the GLB in metres, the archive in mm. Vertices keep the template's order; in the GLB, eyeballs are parts of
-their own (``extras.rows`` of a node says which vertices it has; eyeballs that the mesh lacks are added and have none).
+their own (``extras.rows`` of a node says which vertices it has). Eyeballs, teeth and a tongue that the mesh lacks are
+added, and have none.
 """
 
 import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -17,15 +19,17 @@ from pipeline.head_model.visemes import VISEMES
 from pipeline.results.metadata import asset_extras
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.templates.animated import AnimatedMesh, animated_mesh
+from pipeline.templates.inner_mouth import WITH_JAW
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.glb import glb_bytes
 from rig.formats.meshes.morph_glb import with_morphs
-from rig.formats.meshes.pivot_glb import with_pivots
+from rig.formats.meshes.pivot_glb import NECK, MovingPart, with_pivots
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh, vertex_normals
 
 FORMAT = "eigenhead-shapes/1"
+JAW = "jaw"
 
 
 def write_template_shapes(
@@ -51,6 +55,7 @@ def write_template_shapes(
     )
     name = f"head-{template.name}"
     extras = asset_extras(result) | {"template": template.name, "template_sha256": template.source_sha256}
+    extras |= {"inner_mouth": animated.inner.absence or "added"}
     data = animated_glb(animated, triangles, colours, blendshape_rig.weights, extras)
     write_atomically(folder / f"{name}.glb", data)
     write_atomically(folder / f"{name}-shapes.npz", _archive(animated, template, blendshape_rig))
@@ -75,7 +80,11 @@ def animated_glb(
     parts = {name: _part(animated, triangles, colours, part) for name, part in animated.eyeballs.items()}
     named = {"head": rows.tolist()} | {name: part.tolist() for name, part in animated.eyeballs.items()}
     parts |= {name: eyeball.mesh() for name, eyeball in animated.added.items()}
-    return with_pivots(glb, animated.pivots, parts, named if turning.any() else {})
+    inner = {
+        name: MovingPart(JAW if name in WITH_JAW else NECK, part, animated.inner.moves[name], weights)
+        for name, part in animated.inner.parts.items()
+    }
+    return with_pivots(glb, animated.pivots, parts, named if turning.any() else {}, inner)
 
 
 def _part(
@@ -90,7 +99,27 @@ def _part(
     return Mesh(animated.neutral[rows], number[inside].astype(np.int32), colours[rows])
 
 
+def _inner_arrays(animated: AnimatedMesh) -> dict[str, Any]:
+    """Returns teeth and tongue as one mesh; ``inner_parts`` says of each vertex which part it belongs to."""
+    inner, vertices, faces, numbers, moves = animated.inner, [], [], [], []
+    for number, (name, part) in enumerate(inner.parts.items()):
+        faces.append(part.faces + sum(len(each) for each in vertices))
+        vertices.append(part.vertices)
+        numbers.append(np.full(len(part.vertices), number, np.uint8))
+        still = np.zeros_like(part.vertices)
+        moves.append(np.stack([inner.moves[name].get(shape, still) for shape in animated.shapes]))
+    if not vertices:
+        return {}
+    return {
+        "inner_vertices": np.concatenate(vertices).astype(np.float32),
+        "inner_triangles": np.concatenate(faces).astype(np.int32),
+        "inner_parts": np.concatenate(numbers),
+        "inner_displacements": np.concatenate(moves, axis=1).astype(np.float32),
+    }
+
+
 def _archive(animated: AnimatedMesh, template: Template, blendshape_rig: BlendshapeRig) -> bytes:
+    moved = {name for moves in animated.inner.moves.values() for name in moves}
     meta = {
         "format": FORMAT,
         "template": template.name,
@@ -99,13 +128,14 @@ def _archive(animated: AnimatedMesh, template: Template, blendshape_rig: Blendsh
         "unit": "mm",
         "names": list(animated.shapes),
         "weights": dict(blendshape_rig.weights),
-        "without_counterpart": list(blendshape_rig.missing),
+        "without_counterpart": [name for name in blendshape_rig.missing if name not in moved],
         "visemes": {name: dict(mixture) for name, mixture in VISEMES.items()},
         "pivots": {name: pivot.tolist() for name, pivot in animated.pivots.items()},
         "eyeballs": {
             name: {"radius_mm": eyeball.radius_mm, "gaze": eyeball.gaze.tolist()}
             for name, eyeball in animated.added.items()
         },
+        "inner_mouth": {"parts": list(animated.inner.parts), "absence": animated.inner.absence},
     }
     packed = io.BytesIO()
     np.savez_compressed(
@@ -114,5 +144,6 @@ def _archive(animated: AnimatedMesh, template: Template, blendshape_rig: Blendsh
         neutral=animated.neutral.astype(np.float32),
         displacements=np.stack(list(animated.shapes.values())).astype(np.float32),
         triangles=template.mesh.triangles().astype(np.int32),
+        **_inner_arrays(animated),
     )
     return packed.getvalue()

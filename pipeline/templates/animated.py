@@ -1,5 +1,5 @@
 """A registered mesh that can be animated: Apple's 52 shapes and the visemes on it, without crossing, its pivots, and
-eyeballs where its eyes are open and it has none."""
+eyeballs, teeth and a tongue where its eyes are open and its lips part and it has none."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,8 +11,9 @@ from pipeline.head_model.visemes import VISEMES, mixed
 from pipeline.templates.carrying import SurfaceBinding
 from pipeline.templates.contact import RestSurface, kept_apart, rest_surface
 from pipeline.templates.eyeballs import Eyeball, lifted, placed_eyeballs
-from pipeline.templates.pivots import EYE_REACH_MM, Points, pivots
-from pipeline.templates.shape_carrying import Neutral, carried_shapes
+from pipeline.templates.inner_mouth import InnerMouth, kept_off_teeth, placed_inner_mouth
+from pipeline.templates.pivots import EYE_REACH_MM, Points, jaw_motions, pivots
+from pipeline.templates.shape_carrying import Neutral, carried_shapes, loose_parts
 
 LIDS = "eye"  # what the names of shapes that close or move lids begin with
 
@@ -26,6 +27,7 @@ class AnimatedMesh:
     pivots: Mapping[str, Float[np.ndarray, " 3"]]
     eyeballs: Mapping[str, Int[np.ndarray, " b"]]  # rows of the mesh, by pivot
     added: Mapping[str, Eyeball] = field(default_factory=dict)  # eyeballs that the mesh lacks, by pivot
+    inner: InnerMouth = field(default_factory=InnerMouth)  # teeth and tongue that the mesh lacks
 
 
 def animated_mesh(
@@ -36,7 +38,8 @@ def animated_mesh(
     shapes: Mapping[str, Float[np.ndarray, "v 3"]],
     landmark_rows: Mapping[str, int],
 ) -> AnimatedMesh:
-    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots and eyeballs.
+    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots, eyeballs, teeth and
+    tongue.
 
     Args:
         surface_binding: how the model carries the mesh.
@@ -65,7 +68,10 @@ def animated_mesh(
     shapes_of_mesh = parted_shapes(rest_surface(mesh, triangles), carried)
     if added:
         shapes_of_mesh = {name: lifted(mesh, triangles, shape, added) for name, shape in shapes_of_mesh.items()}
-    return AnimatedMesh(mesh, shapes_of_mesh, found, eyes, added)
+    loose = np.where(surface_binding.wholes >= 0, -1, loose_parts(surface_binding, triangles, len(mesh)))
+    jaw = jaw_motions(landmarks, vertices, shapes)
+    inner = placed_inner_mouth(mesh, triangles, shapes_of_mesh, landmarks, jaw, loose)
+    return AnimatedMesh(mesh, kept_off_teeth(mesh, triangles, shapes_of_mesh, inner), found, eyes, added, inner)
 
 
 def parted_shapes(

@@ -59,8 +59,8 @@ def carried_shapes(
     names = list(shapes)
     mesh, count = neutral.mesh, len(neutral.mesh)
     edges = _edges(triangles)
-    parts = connected_components(_matrix(edges, np.ones(len(edges)), count), directed=False)[1]
-    joined = np.isin(parts, np.unique(parts[surface_binding.skin]))
+    parts = loose_parts(surface_binding, triangles, count)
+    joined = parts < 0
     attachment, off, facing = bind_vertices(mesh, vertex_normals(mesh, triangles), neutral.vertices, neutral.faces)
     attachment = _with_skin(attachment, surface_binding)
     moves = np.stack([_moved(attachment, neutral, shapes[name]) for name in names], axis=1)  # (t, shapes, 3)
@@ -76,6 +76,16 @@ def carried_shapes(
         with_jaw = jaw[rows] if in_mouth(landmarks, mesh[rows]) and not ball else 0.0
         moves[rows] = with_jaw if standing is None else standing
     return {name: moves[:, k] for k, name in enumerate(names)}
+
+
+def loose_parts(
+    surface_binding: SurfaceBinding, triangles: Int[np.ndarray, "g 3"], count: int
+) -> Int[np.ndarray, " t"]:
+    """Returns the number of the part of its own that each vertex of a mesh belongs to, -1 of what is joined to the
+    skin."""
+    edges = _edges(triangles)
+    parts = connected_components(_matrix(edges, np.ones(len(edges)), count), directed=False)[1]
+    return np.where(np.isin(parts, np.unique(parts[surface_binding.skin])), -1, parts)
 
 
 def _edges(triangles: Int[np.ndarray, "g 3"]) -> Int[np.ndarray, "e 2"]:

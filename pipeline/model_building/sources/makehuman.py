@@ -76,15 +76,15 @@ class Source:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Base:
-    """Holds the base mesh: all vertices in MakeHuman units (those of helper geometry too), and the quads of the
-    skin."""
+    """Holds the base mesh: all vertices in MakeHuman units (those of helper geometry too), and the quads of one
+    group: the skin, or a helper's."""
 
     vertices: Float[np.ndarray, "V 3"]
     quads: Int[np.ndarray, "Q 4"]
 
 
-def read_base(source: Source) -> Base:
-    """Returns the base mesh. Only faces of the group ``body`` are skin."""
+def read_base(source: Source, chosen: str = "body") -> Base:
+    """Returns the base mesh with the faces of a group. Only those of ``body`` are skin."""
     source.names()
     ((_, raw),) = source.read(["3dobjs/base.obj"])
     vertices, quads, group = [], [], ""
@@ -94,7 +94,7 @@ def read_base(source: Source) -> Base:
             vertices.append([float(x) for x in rest[:3]])
         elif word == "g":
             group = rest[0]
-        elif word == "f" and group == "body":
+        elif word == "f" and group == chosen:
             quads.append([int(corner.split("/")[0]) - 1 for corner in rest])
     return Base(np.array(vertices), np.array(quads, np.int32))
 

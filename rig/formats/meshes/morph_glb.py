@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.formats.meshes.glb_document import appended_view, closed_glb, opened_glb
-from rig.mesh import vertex_normals
+from rig.mesh import Mesh, vertex_normals
 
 LEAST_MM = 0.005  # smaller displacements are left out
 LEAST_TURN = 1e-3  # smaller changes of a unit normal are left out
@@ -33,7 +33,21 @@ def with_morphs(
         weights: by name, those that the mesh is shown with.
     """
     document, payload = opened_glb(glb)
-    primitive = document["meshes"][0]["primitives"][0]
+    append_targets(document, payload, 0, Mesh(vertices, faces), morphs, weights=weights)
+    return closed_glb(document, payload)
+
+
+def append_targets(
+    document: dict[str, Any],
+    payload: bytearray,
+    number: int,
+    mesh: Mesh,
+    morphs: Mapping[str, Float[np.ndarray, "v 3"]],
+    *,
+    weights: Mapping[str, float],
+) -> None:
+    """Appends morph targets to mesh ``number`` of a document, whose one primitive is the given mesh (mm)."""
+    vertices, faces = mesh.vertices, mesh.faces
     normals, targets = vertex_normals(vertices, faces), []
     for displacement in morphs.values():
         turned = vertex_normals(vertices + displacement, faces) - normals
@@ -43,10 +57,10 @@ def with_morphs(
                 "NORMAL": _sparse(document, payload, turned, LEAST_TURN, bounds=False),
             }
         )
-    primitive["targets"] = targets
-    document["meshes"][0]["weights"] = [float(weights.get(name, 0.0)) for name in morphs]
-    document["meshes"][0]["extras"] = {"targetNames": list(morphs)}
-    return closed_glb(document, payload)
+    written = document["meshes"][number]
+    written["primitives"][0]["targets"] = targets
+    written["weights"] = [float(weights.get(name, 0.0)) for name in morphs]
+    written["extras"] = {"targetNames": list(morphs)}
 
 
 def _sparse(

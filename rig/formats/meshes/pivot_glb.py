@@ -1,10 +1,11 @@
-"""Adds the points that a head's parts turn about, and eyeballs that can turn, to a binary glTF.
+"""Adds the points that a head's parts turn about, eyeballs that can turn, and teeth and tongue, to a binary glTF.
 
 The nodes: ``neck`` over all others, at the joint of skull and spine; under it ``head`` (the mesh that was there), and a
 node at every other pivot, ``jaw``, ``eye_right``, ``eye_left``. A part's vertices are relative to its pivot, so that
-turning its node turns the part."""
+turning its node turns the part. Teeth and tongue are nodes under the pivot that they move with."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,32 @@ from jaxtyping import Float
 from rig.colour_space import linear_from_srgb
 from rig.formats.meshes.glb import FLOAT, INDICES, UINT, USHORT, VERTICES
 from rig.formats.meshes.glb_document import appended_view, closed_glb, opened_glb
+from rig.formats.meshes.morph_glb import append_targets
 from rig.mesh import Mesh
 
 NECK = "neck"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingPart:
+    """Holds a part under a pivot: its mesh (mm, in the head's frame), its displacements by name (mm, at weight 1), and
+    the weights that it is shown with."""
+
+    pivot: str
+    mesh: Mesh
+    morphs: Mapping[str, Float[np.ndarray, "v 3"]]
+    weights: Mapping[str, float]
+
+
+NONE: Mapping[str, MovingPart] = {}
+
+
 def with_pivots(
-    glb: bytes, pivots_mm: Mapping[str, Float[np.ndarray, " 3"]], parts: Mapping[str, Mesh], rows: Mapping[str, Any]
+    glb: bytes,
+    pivots_mm: Mapping[str, Float[np.ndarray, " 3"]],
+    parts: Mapping[str, Mesh],
+    rows: Mapping[str, Any],
+    moving: Mapping[str, MovingPart] = NONE,
 ) -> bytes:
     """Returns a GLB of this project, of one mesh, with nodes at pivots and with parts.
 
@@ -28,6 +48,7 @@ def with_pivots(
         pivots_mm: by name, ``neck`` among them, in the mesh's frame, mm.
         parts: the meshes (mm, in that frame) of some pivots, with colours.
         rows: what ``extras.rows`` of a node says: which vertices of a file its mesh has.
+        moving: parts by name that become nodes of their own.
     """
     document, payload = opened_glb(glb)
     neck = pivots_mm[NECK] / 1000.0
@@ -47,9 +68,29 @@ def with_pivots(
     for node in document["nodes"]:
         if node["name"] in rows:
             node["extras"] = {"rows": rows[node["name"]]}
+    for name, part in moving.items():
+        number = _append_moving(document, payload, name, part, pivots_mm[part.pivot])
+        if part.pivot == NECK:
+            children.append(number)
+        else:
+            above = next(node for node in document["nodes"] if node["name"] == part.pivot)
+            above.setdefault("children", []).append(number)
     document["nodes"].append({"name": NECK, "translation": neck.tolist(), "children": children})
     document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
     return closed_glb(document, payload)
+
+
+def _append_moving(
+    document: dict[str, Any], payload: bytearray, name: str, part: MovingPart, pivot_mm: Float[np.ndarray, " 3"]
+) -> int:
+    """Appends the node of a part, whose vertices are relative to its pivot, and returns its number."""
+    about = Mesh(part.mesh.vertices - pivot_mm, part.mesh.faces, part.mesh.colours)
+    document["meshes"].append({"name": name, "primitives": [_primitive(document, payload, about)]})
+    number = len(document["meshes"]) - 1
+    if part.morphs:
+        append_targets(document, payload, number, about, part.morphs, weights=part.weights)
+    document["nodes"].append({"name": name, "mesh": number})
+    return len(document["nodes"]) - 1
 
 
 def _primitive(document: dict[str, Any], payload: bytearray, mesh: Mesh) -> dict[str, Any]:

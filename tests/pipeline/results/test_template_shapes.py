@@ -37,10 +37,10 @@ def result() -> Reconstruction:
     return replace(made, evidence=replace(made.evidence, blendshape_rig=shapes))
 
 
-def written(result: Reconstruction, folder: Path, *, morphs: bool) -> set[str]:
+def written(result: Reconstruction, folder: Path, *, morphs: bool, lips_part: bool = False) -> set[str]:
     outputs = OutputSettings(surface="head", formats=("ply",), template="low", morphs=morphs, neutral=not morphs)
     chosen = replace(result, settings=Settings(outputs=outputs))
-    write_result(folder, chosen, Capture({}), ready_template(load_model()))
+    write_result(folder, chosen, Capture({}), ready_template(load_model(), lips_part=lips_part))
     return {path.name for path in folder.iterdir()}
 
 
@@ -55,6 +55,8 @@ def test_shapes_are_written_where_morphs_are_asked_for(result: Reconstruction, t
         neutral, displacements = file["neutral"], file["displacements"]
     assert (meta["format"], meta["frame"], meta["unit"]) == ("eigenhead-shapes/1", "head", "mm")
     assert meta["names"] == [*NAMES, *VISEMES]
+    assert meta["without_counterpart"] == ["tongueOut"]
+    assert meta["inner_mouth"] == {"parts": [], "absence": "mouth-sealed"}
     assert meta["visemes"]["viseme_aa"]["jawOpen"] == 0.6
     model, level = load_model(), load_model().levels["p95"]
     np.testing.assert_allclose(neutral[: level.count], 1.1 * model.vertices(np.zeros(0), "p95"), atol=0.05)
@@ -71,3 +73,20 @@ def test_shapes_are_written_where_morphs_are_asked_for(result: Reconstruction, t
     assert set(nodes) == {"head", "jaw", "eye_left", "eye_right", "neck"}
     assert nodes["eye_left"]["extras"]["rows"] == list(range(level.count, len(neutral)))
     assert nodes["head"]["extras"]["rows"] == list(range(level.count))
+
+
+def test_teeth_and_tongue_are_written_where_lips_part(result: Reconstruction, tmp_path: Path) -> None:
+    written(result, tmp_path, morphs=True, lips_part=True)
+    with np.load(tmp_path / "head-low-shapes.npz") as file:
+        meta, arrays = json.loads(file["meta"].tobytes()), {name: file[name] for name in file.files}
+    parts = ["teeth_upper", "teeth_lower", "tongue"]
+    assert meta["inner_mouth"] == {"parts": parts, "absence": None}
+    assert meta["without_counterpart"] == []
+    assert sorted(np.unique(arrays["inner_parts"])) == [0, 1, 2]
+    opened = arrays["inner_displacements"][meta["names"].index("jawOpen")]
+    assert not opened[arrays["inner_parts"] == 0].any()
+    assert (opened[arrays["inner_parts"] > 0][:, 1] < 0.0).mean() > 0.9
+    assert arrays["inner_triangles"].max() == len(arrays["inner_vertices"]) - 1
+    document, _ = opened_glb((tmp_path / "head-low.glb").read_bytes())
+    assert document["asset"]["extras"]["inner_mouth"] == "added"
+    assert [mesh["name"] for mesh in document["meshes"]] == ["head", "eye_left", *parts]
