@@ -16,6 +16,7 @@ PROBLEM_TYPES = {
     "calibration-poor": "Calibration poor",
     "camera-missing": "Camera missing",
     "capture-in-use": "Capture in use",
+    "capture-missing": "Capture missing",
     "consent-missing": "Consent missing",
     "database-unavailable": "Database unavailable",
     "deliveries-off": "Deliveries off",

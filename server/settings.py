@@ -51,6 +51,14 @@ class ServiceSettings(BaseSettings):
     deliver_hours: float = Field(
         default=72.0, gt=0, description="how long a delivery waits for a store that does not answer"
     )
+    captures_store: str | None = Field(
+        default=None,
+        pattern=OBJECT_PREFIX.pattern,
+        description="where files of captures lie, for workers without this data folder, such as s3://studio/captures/",
+    )
+    captures_bytes: int = Field(
+        default=64 << 30, ge=0, description="the most that files of captures in that store take in a data folder"
+    )
     results_store: str | None = Field(
         default=None,
         pattern=OBJECT_PREFIX.pattern,

@@ -11,13 +11,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-from scipy.spatial import KDTree
 
 from pipeline.contour_fit.clutter import CELL_PX, is_crown, within
 from pipeline.contour_fit.contour import ContourSolution, run_stage
 from pipeline.contour_fit.noise_model import with_misfit
 from pipeline.contour_fit.problem import ContourProblem, State
 from pipeline.contour_fit.rim_term import observed_rim
+from pipeline.geometry.nearest import PointTree, nearest
 
 DEPTH_MM = 4.0  # inside the outline, where the pixel shows what makes it: blur and matting end before
 MIN_SKIN = 0.7  # probability there
@@ -101,9 +101,9 @@ def bare_cells(
     bare = (rough < ROUGH_MM) & (shown > MIN_SKIN)
     row, column = np.indices(cells.shape)
     middle = CELL_PX * (np.stack([column, row], axis=-1).reshape(-1, 2) + 0.5)
-    away, nearest = KDTree(outline).query(middle, distance_upper_bound=REACH_MM * px_per_mm)
+    away, row = nearest(PointTree.of(outline), middle, within=REACH_MM * px_per_mm)
     near = np.isfinite(away)
-    cells.ravel()[near] = bare[np.asarray(nearest)[near]]
+    cells.ravel()[near] = bare[row[near]]
     return cells
 
 

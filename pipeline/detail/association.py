@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from pipeline.compute.threads import in_threads
 from pipeline.geometry.closest_point_kernels import FannedMesh, closest_at_vertices
-from pipeline.geometry.nearest import nearest
+from pipeline.geometry.fans import corners_at_vertices
+from pipeline.geometry.nearest import PointTree, nearest
 
 CANDIDATES = 4  # vertices whose triangles are tried
 
@@ -33,9 +33,8 @@ def faces_at_vertices(
 ) -> tuple[Int[np.ndarray, " v1"], Int[np.ndarray, " e"]]:
     """Returns the faces at each vertex as compressed rows, ``start`` and ``members``: those of vertex i are
     ``members[start[i]:start[i + 1]]``."""
-    corner = np.argsort(faces.ravel(), kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
-    return start.astype(np.int64), (corner // 3).astype(np.int64)
+    start, corner = corners_at_vertices(faces, count)
+    return start, corner // 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +42,7 @@ class Target:
     """Holds a head's mesh with a search tree for the closest point on it."""
 
     head: FannedMesh
-    tree: KDTree
+    tree: PointTree
     corner_mm: float  # from no place of a triangle is its nearest corner farther
 
     @classmethod
@@ -53,7 +52,7 @@ class Target:
         """Builds a target from a mesh (mm) with unit vertex normals."""
         sides = [np.linalg.norm(vertices[faces[:, j]] - vertices[faces[:, j - 1]], axis=1) for j in range(3)]
         head = FannedMesh(vertices, vertex_normals, faces, *faces_at_vertices(faces, len(vertices)))
-        return cls(head, KDTree(vertices), float(np.max(sides, initial=0.0)))
+        return cls(head, PointTree.of(vertices), float(np.max(sides, initial=0.0)))
 
     def closest(
         self,

@@ -6,19 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE
-from pipeline.geometry.nearest import nearest
+from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.normals import vertex_normals
 from pipeline.part_labels.codes import Part, codes_from_channels
 from pipeline.part_labels.votes import PartVotes, part_shares
 from pipeline.settings import FineSettings
 from pipeline.stereo.depth_map import DepthMap, points_world
 from rig.camera import Camera
-from rig.mesh import Mesh, vertex_normals
+from rig.mesh import Mesh
 
 INSIDE_MM = 4.0  # farther behind the fitted head a point shows something that neither pulls nor bounds it
 EVERY = 4  # vertices of the head stand for the others
@@ -76,7 +76,7 @@ def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 
 def _behind(points: Float[np.ndarray, "n 3"], head_world: Mesh) -> np.ndarray:
     vertices = head_world.vertices[::EVERY]
     normals = vertex_normals(head_world.vertices, head_world.faces)[::EVERY]
-    _, near = nearest(KDTree(vertices, balanced_tree=False, compact_nodes=False), points)
+    _, near = nearest(PointTree.of(vertices), points)
     return ((points - vertices[near]) * normals[near]).sum(axis=1) < -INSIDE_MM
 
 

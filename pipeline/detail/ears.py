@@ -9,16 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 from pipeline.detail.association import Target, interpolated
 from pipeline.detail.surface_points import SurfacePoints
-from pipeline.geometry.nearest import nearest
+from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
 from rig.geometry import rotation_from_vector
-from rig.mesh import vertex_normals
 
 ABOUT_MM = 25.0  # points that far from the ear may be its own
 BLEND_MM = 10.0  # over which the head follows
@@ -62,12 +61,12 @@ def with_ears_in_place(
         rows = np.flatnonzero(side)
         if not len(rows) or not len(skin.points):
             continue
-        distance, _ = nearest(KDTree(vertices[rows]), skin.points, within=ABOUT_MM)
+        distance, _ = nearest(PointTree.of(vertices[rows]), skin.points, within=ABOUT_MM)
         near = skin.chosen(np.isfinite(distance))
         if len(near.points) < MIN_POINTS:
             continue
         turned = _registered(vertices, faces, side, near, model)
-        off, _ = nearest(KDTree(vertices[rows]), vertices, within=4.0 * BLEND_MM)
+        off, _ = nearest(PointTree.of(vertices[rows]), vertices, within=4.0 * BLEND_MM)
         share = np.exp(-0.5 * (np.where(np.isfinite(off), off, 1e3) / BLEND_MM) ** 2)
         moved += share[:, None] * (turned - vertices)
     return vertices + moved

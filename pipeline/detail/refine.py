@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
@@ -36,12 +35,12 @@ from pipeline.detail.solve import (
 )
 from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.detail.untangling import untangled_head
-from pipeline.geometry.nearest import nearest
+from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
 from pipeline.settings import FineSettings
-from rig.mesh import vertex_normals
 from rig.progress import Progress
 
 SEED = 16
@@ -278,7 +277,7 @@ def with_patches(
     offset = ((place - base[vertex]) * normals).sum(axis=1)
     information = found.information / (1.0 + (found.place_mm / robust_mm) ** 2) ** 2
     at = interpolated(base[observed.corner], observed.blend)
-    alone = nearest(KDTree(base[vertex]), at, within=PATCH_REACH_MM)[0] > PATCH_REACH_MM
+    alone = nearest(PointTree.of(base[vertex]), at, within=PATCH_REACH_MM)[0] > PATCH_REACH_MM
     corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
     return Observed(
         np.concatenate([observed.corner[alone], corner]),
@@ -342,6 +341,6 @@ def field_deviation(
         square += (posterior.directions.moved(draws[:, k]) * normals).sum(axis=1) ** 2 / settings.draws
     if not observed.any():
         return deviation_mm
-    distance, _ = nearest(KDTree(base[observed]), base, within=6.0 * settings.length_mm)
+    distance, _ = nearest(PointTree.of(base[observed]), base, within=6.0 * settings.length_mm)
     near = np.exp(-0.5 * (np.where(np.isfinite(distance), distance, np.inf) / settings.length_mm) ** 2)
     return np.sqrt(near * square + (1.0 - near) * np.maximum(square, deviation_mm**2))

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from pipeline.detail.surface_points_kernels import cell_numbers, mean_points
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfacePoints:
@@ -42,20 +44,9 @@ def thinned(surface: SurfacePoints, cell_mm: float) -> SurfacePoints:
     """
     if not len(surface.points):
         return surface
-    cell = np.floor((surface.points - surface.points.min(axis=0)) / cell_mm).astype(np.int64)
-    side = np.argmax(np.abs(surface.normals), axis=1)
-    side = 2 * side + (np.take_along_axis(surface.normals, side[:, None], axis=1)[:, 0] > 0)
-    size = cell.max(axis=0) + 1
-    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-    _, group = np.unique((key * 6 + side) * 4 + surface.part, return_inverse=True)
-    information = 1.0 / surface.deviation_mm**2
-    total, count = np.bincount(group, information), np.bincount(group)
-
-    def mean(values: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-        return np.stack([np.bincount(group, information * values[:, k]) for k in range(3)], axis=1) / total[:, None]
-
-    normals = mean(surface.normals)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    part = np.zeros(len(total), np.uint8)
-    part[group] = surface.part
-    return SurfacePoints(mean(surface.points), normals / np.maximum(length, 1e-9), np.sqrt(count / total), part)
+    points, normals, deviation = (
+        np.ascontiguousarray(each, float) for each in (surface.points, surface.normals, surface.deviation_mm)
+    )
+    part = np.ascontiguousarray(surface.part)
+    numbers, group = np.unique(cell_numbers(points, normals, part, cell_mm), return_inverse=True)
+    return SurfacePoints(*mean_points(group, len(numbers), points, normals, deviation, part))

@@ -102,8 +102,11 @@ def without_coincidences(mesh: Mesh) -> Mesh:
     of its neighbours. A program that merges vertices by position would otherwise join sheets there and find the surface
     open."""
     stored = mesh.vertices.astype(np.float32)
-    _, same, count = np.unique(stored, axis=0, return_inverse=True, return_counts=True)
-    rows = np.flatnonzero(count[same.ravel()] > 1)
+    order = np.argsort(stored[:, 0])  # only what is equal there is sorted by all coordinates: a tenth of the time
+    again = np.diff(stored[order, 0]) == 0.0
+    maybe = np.sort(order[np.append(again, False) | np.append(False, again)])
+    _, same, count = np.unique(stored[maybe], axis=0, return_inverse=True, return_counts=True)
+    rows = maybe[count[same.ravel()] > 1]
     if not len(rows):
         return mesh
     vertices = mesh.vertices.copy()

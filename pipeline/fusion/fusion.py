@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import KDTree
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
@@ -20,8 +19,9 @@ from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
 from pipeline.fusion.refinement import Measured, refine_vertices
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
-from pipeline.fusion.skin import drawn_to_skin
+from pipeline.fusion.skin import HeadSkin, drawn_to_skin
 from pipeline.fusion.view_stack import stack_views
+from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
@@ -109,19 +109,19 @@ def fuse(
 
 
 @traced
-def finished(surface: DepthSurface, votes: PartVotes | None, head_skin_world: Mesh | None) -> BustSurface:
+def finished(surface: DepthSurface, votes: PartVotes | None, head: HeadSkin | None) -> BustSurface:
     """Makes the surface agree with the head, removes self-intersections, and determines what it shows.
 
     Args:
         surface: from the depth maps.
         votes: which part each point shows; None counts all that is seen as skin.
-        head_skin_world: the part of the fitted head that photographs measured; None if there is none.
+        head: the part of the fitted head that photographs measured; None if there is none.
     """
     mesh, measured = surface.mesh_world, surface.measured
     seen = measured.views > 0
-    if head_skin_world is not None:
+    if head is not None:
         skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, Part.SKIN.channel]
-        mesh = drawn_to_skin(mesh, seen * skin, head_skin_world, seen_deviation_mm(measured))
+        mesh = drawn_to_skin(mesh, seen * skin, head, seen_deviation_mm(measured))
     mesh, _ = without_crossings(mesh, surface.safe_world)
     mesh = without_coincidences(mesh)
     shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
@@ -162,5 +162,5 @@ def _subject(
     if head is None or (volume > 0).sum() < 2:
         return piece[faces[:, 0]] == np.argmax(volume)
     solid = np.flatnonzero(volume[piece] > 0)
-    nearest = KDTree(vertices[solid]).query(head[::HEAD_STRIDE])[1]
-    return piece[faces[:, 0]] == np.bincount(piece[solid[nearest]]).argmax()
+    near = nearest(PointTree.of(vertices[solid]), head[::HEAD_STRIDE])[1]
+    return piece[faces[:, 0]] == np.bincount(piece[solid[near]]).argmax()

@@ -2,9 +2,9 @@
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 
-from pipeline.geometry.nearest import nearest
+from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.normals import normals_of
 from rig.mesh import Mesh, boundary_edges
 
 THICKEST_MM = 60.0  # of hair: farther out a point belongs to something else
@@ -20,8 +20,8 @@ def distance_to_head(
     """Returns the signed distance (mm, positive outside) of points to the outside of the head's hair; -inf near the
     open border where the model ends. The thickness of the hair above each vertex is measured from the ``seen`` points
     of the surface, and interpolated where there are none."""
-    vertices, normals = head_world.vertices[::EVERY], head_world.normals()[::EVERY]
-    tree = KDTree(vertices, balanced_tree=False, compact_nodes=False)
+    vertices, normals = head_world.vertices[::EVERY], normals_of(head_world)[::EVERY]
+    tree = PointTree.of(vertices)
     thickness = _thickness(tree, normals, seen)
     far, near = nearest(tree, places)
     height = ((places - vertices[near]) * normals[near]).sum(axis=1)
@@ -30,11 +30,11 @@ def distance_to_head(
 
 
 def _thickness(
-    tree: KDTree, normals: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, "m 3"]
+    tree: PointTree, normals: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, " v"]:
     """Returns the thickness of the hair (mm) over each vertex: the mean height of the seen points above it. Vertices
     with too few points take the mean of the nearest others, weighted by the inverse square of the distance."""
-    vertices = np.asarray(tree.data)
+    vertices = tree.points
     far, near = nearest(tree, seen, within=THICKEST_MM)
     near, points = near[np.isfinite(far)], seen[np.isfinite(far)]
     height = np.maximum(((points - vertices[near]) * normals[near]).sum(axis=1), 0.0)
@@ -44,7 +44,7 @@ def _thickness(
     if len(known) < NEAREST:
         return np.zeros(len(vertices))
     blank = np.flatnonzero(count < MIN_POINTS)
-    far, near = nearest(KDTree(vertices[known]), vertices[blank], count=NEAREST)
+    far, near = nearest(PointTree.of(vertices[known]), vertices[blank], count=NEAREST)
     share = 1.0 / (far * far + EVEN_MM**2)
     thickness[blank] = (share * thickness[known[near]]).sum(axis=1) / share.sum(axis=1)
     return thickness
@@ -55,4 +55,4 @@ def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndar
     rim = np.unique(boundary_edges(head_world.faces))
     if not len(rim):
         return np.zeros(len(places), bool)
-    return nearest(KDTree(head_world.vertices[rim]), places, within=RIM_MM)[0] < RIM_MM
+    return nearest(PointTree.of(head_world.vertices[rim]), places, within=RIM_MM)[0] < RIM_MM

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from pipeline.fusion.net_kernels import component_of
 from pipeline.fusion.refinement import Measured
-from pipeline.geometry.nearest import nearest
+from pipeline.geometry.nearest import PointTree, nearest
 from rig.mesh import Mesh, face_normals
 
 MIN_MM = 0.05  # what no view shows: the calibration's own error, and the surface between vertices
@@ -40,7 +39,7 @@ def deviation_mm(mesh: Mesh, measured: Measured) -> Float[np.ndarray, " v"]:
         return out
     out[seen] = seen_deviation_mm(measured)[seen]
     known = mesh.vertices[seen][::EVERY]
-    far, _ = nearest(KDTree(known, balanced_tree=False, compact_nodes=False), mesh.vertices[~seen])
+    far, _ = nearest(PointTree.of(known), mesh.vertices[~seen])
     out[~seen] = np.minimum(EDGE_MM + SLOPE * far, MAX_MM)
     return out
 

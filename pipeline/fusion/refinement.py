@@ -10,7 +10,9 @@ from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.refinement_kernels import measure, smooth_offsets
 from pipeline.fusion.view_stack import ViewStack
-from rig.mesh import Mesh, vertex_normals
+from pipeline.geometry.fans import corners_at_vertices
+from pipeline.geometry.normals import vertex_normals
+from rig.mesh import Mesh
 
 GATE_STEPS = 1.5  # a view that is farther off shows another surface
 AGREEMENT_MM = 1.0  # of views, for the same surface
@@ -48,9 +50,8 @@ def refine_vertices(mesh_world: Mesh, views: ViewStack, step_mm: float) -> tuple
 def neighbours(faces: Int[np.ndarray, "f 3"], count: int) -> tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]]:
     """Returns the neighbours of each vertex of a closed mesh in compressed rows: where each row starts (count + 1), and
     the vertex numbers, row after row."""
-    starts = np.concatenate([[0], np.cumsum(np.bincount(faces.ravel(), minlength=count))])
-    order = np.argsort(faces.ravel(), kind="stable")  # a closed mesh has each edge once in either direction
-    return starts, np.roll(faces, -1, axis=1).ravel()[order].astype(np.int32)
+    starts, corner = corners_at_vertices(faces, count)  # a closed mesh has each edge once in either direction
+    return starts, np.roll(faces, -1, axis=1).ravel()[corner].astype(np.int32)
 
 
 def measure_vertices(mesh: Mesh, normals: Float[np.ndarray, "v 3"], views: ViewStack, gate_mm: float) -> Measured:

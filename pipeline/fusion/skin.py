@@ -6,16 +6,20 @@ the surroundings decide. If most of them agree with the head, the vertex is in a
 the rest of a highlight), and moves to the head. If not, one of the two shows something else (hair, a fold that the head
 lacks, a wrong head), and the vertex stays.
 
-What the two differ by over a whole neighbourhood is no noise of the surface: there the head has the wrong shape, and
-only its smoothness counts. So the larger that mean, the more of it is left where the surface has it.
+What the two differ by over whole neighbourhoods is no noise of the surface: the head has the wrong shape there. Where
+that is much of the skin, by what the head states about itself, the model cannot make this subject (a statue, say), its
+details are wrong as well, and the surface stays as it is.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
-import scipy.sparse as sparse
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int32, Int64
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.refinement_kernels import blurred_over_mesh
+from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh
 
@@ -26,67 +30,89 @@ SAME_MM = 1.0  # distance at which agreement has fallen to 1 / e, at least ...
 SAME_DEVIATIONS = 6.0
 SURROUNDINGS = 24  # steps of a mean over neighbours: 5 mm (standard deviation) where vertices are 1.5 mm apart
 CONSENT = (0.5, 0.75)  # mean agreement of the surroundings from which on the head counts, and counts whole
-# Mean distance of the surroundings at which 1 / e of it is given to the head. Photographs of a Buddha, whose head the
-# model cannot make: 0.33 and 1.22 mm (median, 90 %) for 0.35 and 1.32; 0.3 blurs draw-b's face (0.576 for 0.560 mm).
-OFFSET_MM = 0.5
+# The upper quartile of the distances of the two over neighbourhoods, by the head's median deviation, up to which the
+# head counts whole and from which on it counts for nothing: 0.25 to 0.33 of scan-a, draw-b and scan-a's oily version,
+# 0.40 under a beard, 0.84 of the photographs of a Buddha, whose head the model cannot make.
+WRONG_SHAPE = (0.5, 0.75)
+QUARTILE, SURELY = 0.75, 0.5  # probability from which on a vertex counts as skin there
 FARTHEST = 4.0  # times as far nothing of that share is left
 CANDIDATES = 3  # triangles looked at for each vertex: twice as fast as six, off by more than 0.01 mm in one of 100
 
 
-def part_of(head_world: Mesh, measured: Bool[np.ndarray, " v"]) -> Mesh:
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadSkin:
+    """Holds the part of the fitted head's skin that photographs measured."""
+
+    mesh_world: Mesh  # mm
+    deviation_mm: Float[np.ndarray, " v"]  # standard deviation of each vertex
+
+
+def measured_skin(
+    head_world: Mesh, deviation_mm: Float[np.ndarray, " v"], measured: Bool[np.ndarray, " v"]
+) -> HeadSkin:
     """Returns the head's triangles whose corners are all ``measured``."""
-    return Mesh(head_world.vertices, head_world.faces[measured[head_world.faces].all(axis=1)])
+    faces = head_world.faces[measured[head_world.faces].all(axis=1)]
+    return HeadSkin(Mesh(head_world.vertices, faces), deviation_mm)
 
 
 @traced
 def drawn_to_skin(
-    mesh_world: Mesh, skin: Float[np.ndarray, " v"], head_skin_world: Mesh, deviation_mm: Float[np.ndarray, " v"]
+    mesh_world: Mesh, skin: Float[np.ndarray, " v"], head: HeadSkin, deviation_mm: Float[np.ndarray, " v"]
 ) -> Mesh:
     """Moves the vertices of skin towards the closest point of the fitted head, to the weighted mean or all the way.
 
     Args:
         mesh_world: the fused surface, mm.
         skin: probability that a vertex shows skin; 0 where no view sees it.
-        head_skin_world: the part of the head's skin that photographs measured, mm.
+        head: its skin, as far as photographs measured it.
         deviation_mm: standard deviation along the normal of the vertices that a view sees.
     """
     vertices = mesh_world.vertices.copy()
-    same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * mean_around(mesh_world.faces, deviation_mm, skin))
+    beside = neighbours(mesh_world.faces, len(vertices))
+    same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * mean_around(beside, deviation_mm, skin))
     reach = FARTHEST * float(same_mm.max(initial=SAME_MM))
-    low, high = head_skin_world.vertices.min(axis=0) - reach, head_skin_world.vertices.max(axis=0) + reach
+    low, high = head.mesh_world.vertices.min(axis=0) - reach, head.mesh_world.vertices.max(axis=0) + reach
     candidates = np.flatnonzero((skin > 0.0) & ((vertices > low) & (vertices < high)).all(axis=1))
-    if not len(candidates) or not len(head_skin_world.faces):
+    if not len(candidates) or not len(head.mesh_world.faces):
         return mesh_world
-    normals = mesh_world.normals()[candidates]
-    hit = SurfaceIndex(head_skin_world.vertices, head_skin_world.faces).closest(vertices[candidates], CANDIDATES)
+    normals = normals_of(mesh_world)[candidates]
+    hit = SurfaceIndex(head.mesh_world.vertices, head.mesh_world.faces).closest(vertices[candidates], CANDIDATES)
     same = (hit.distances <= FARTHEST * same_mm[candidates]) & ((hit.normals * normals).sum(axis=1) >= 0.0)
     agreement, shown = np.zeros(len(vertices)), np.zeros(len(vertices))
     agreement[candidates] = same * np.exp(-((hit.distances / same_mm[candidates]) ** 2))
     shown[candidates] = skin[candidates]
-    around = mean_around(mesh_world.faces, agreement, shown)[candidates]
+    around = mean_around(beside, agreement, shown)[candidates]
     consent = np.clip((around - CONSENT[0]) / (CONSENT[1] - CONSENT[0]), 0.0, 1.0)
     near = agreement[candidates]
     share = skin[candidates] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
-    apart, compared = np.zeros(len(vertices)), np.zeros(len(vertices))
-    apart[candidates] = ((hit.points - vertices[candidates]) * hit.normals).sum(axis=1)
+    apart_mm, compared = np.zeros(len(vertices)), np.zeros(len(vertices))
+    apart_mm[candidates] = ((hit.points - vertices[candidates]) * hit.normals).sum(axis=1)
     compared[candidates] = skin[candidates] * same
-    offset = mean_around(mesh_world.faces, compared.astype(bool) * np.clip(apart, -same_mm, same_mm), compared)[
-        candidates
-    ]
-    left = offset * (1.0 - np.exp(-((offset / OFFSET_MM) ** 2)))
-    vertices[candidates] += share[:, None] * (hit.points - vertices[candidates] - left[:, None] * hit.normals)
+    stated_mm = (head.deviation_mm[head.mesh_world.faces[hit.triangles]] * hit.weights).sum(axis=1)
+    offset_mm = mean_around(beside, np.clip(apart_mm, -same_mm, same_mm), compared)[candidates]
+    share *= trust_of(offset_mm, stated_mm, compared[candidates])
+    vertices[candidates] += share[:, None] * (hit.points - vertices[candidates])
     return Mesh(vertices, mesh_world.faces)
 
 
+def trust_of(
+    offset_mm: Float[np.ndarray, " n"], stated_mm: Float[np.ndarray, " n"], skin: Float[np.ndarray, " n"]
+) -> float:
+    """Returns how far the head may be believed, 0 to 1, from its distance to the surface over each place's
+    surroundings, its own standard deviation there, and the probability that both show the same skin."""
+    sure = skin > SURELY
+    if not sure.any():
+        return 1.0
+    wrong = float(np.quantile(np.abs(offset_mm[sure]), QUARTILE)) / max(float(np.median(stated_mm[sure])), 1e-6)
+    return float(np.clip((WRONG_SHAPE[1] - wrong) / (WRONG_SHAPE[1] - WRONG_SHAPE[0]), 0.0, 1.0))
+
+
 def mean_around(
-    faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, " v"], weight: Float[np.ndarray, " v"]
+    beside: tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]],
+    values: Float[np.ndarray, " v"],
+    weight: Float[np.ndarray, " v"],
 ) -> Float[np.ndarray, " v"]:
     """Returns, for each vertex of a closed mesh, the weighted mean of the values over its surroundings
-    (``SURROUNDINGS`` steps); about 0 where no weight is near."""
-    starts, indices = neighbours(faces, len(values))
-    beside = sparse.csr_array((np.ones(len(indices)), indices, starts), shape=(len(values), len(values)))
-    count = np.maximum(np.diff(starts), 1)[:, None]
-    both = np.stack([weight * values, weight], axis=1)
-    for _ in range(SURROUNDINGS):
-        both = 0.5 * (both + (beside @ both) / count)
+    (``SURROUNDINGS`` steps); about 0 where no weight is near. ``beside`` are its ``neighbours``."""
+    both = blurred_over_mesh(np.stack([weight * values, weight], axis=1).astype(float), *beside, SURROUNDINGS)
     return both[:, 0] / np.maximum(both[:, 1], 1e-6)

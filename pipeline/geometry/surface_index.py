@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from pipeline.geometry.closest_point import closest_candidates
+from pipeline.geometry.nearest import PointTree, nearest
 
 _CANDIDATES = 6
 
@@ -30,7 +30,7 @@ class SurfaceIndex:
         self.faces = faces
         self.corners = vertices[faces]
         samples, self._owner = _samples(self.corners, spacing)
-        self._tree = KDTree(samples, balanced_tree=False, compact_nodes=False)
+        self._tree = PointTree.of(samples)
 
     def closest(
         self,
@@ -44,8 +44,8 @@ class SurfaceIndex:
         that faces the opposite way is chosen only if it is nearer by ``facing_mm``, so that lips that touch are kept
         apart."""
         count = min(candidates, len(self._owner))
-        nearest = self._tree.query(points, k=count, workers=-1)[1].reshape(len(points), count)
-        triangle, weights = closest_candidates(points, self._owner[nearest], self.corners, facing, facing_mm)
+        near = nearest(self._tree, points, count=count)[1].reshape(len(points), count)
+        triangle, weights = closest_candidates(points, self._owner[near], self.corners, facing, facing_mm)
         found = np.einsum("nk,nkx->nx", weights, self.corners[triangle])
         return Hits(found, triangle, weights, np.linalg.norm(points - found, axis=1), self.normals(triangle))
 

@@ -62,9 +62,9 @@ def principal_components(heads: Float[np.ndarray, "N V 3"]) -> Components:
     return Components(mean.reshape(-1, 3), modes, sigma, (centred @ units) / sigma)
 
 
-def orthogonalised(modes: Float[np.ndarray, "M V 3"]) -> tuple[Float[np.ndarray, "M V 3"], Float[np.ndarray, " M"]]:
+def orthogonalised(modes: Float[np.ndarray, "M V 3"]) -> tuple[Float[np.ndarray, "K V 3"], Float[np.ndarray, " K"]]:
     """Returns orthogonal modes that describe exactly the same Gaussian distribution of heads, and their standard
-    deviations (mm).
+    deviations (mm): as many as are independent.
 
     For z ~ N(0, I), heads are mean + A z with A = U S V^T. V^T z is N(0, I) again, so U S spans the same Gaussian: no
     variance is lost or moved, only the axes turn.

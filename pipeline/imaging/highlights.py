@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
+from pipeline.geometry.normals import facing_cosine, normals_of
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import interpolate, rasterise
@@ -91,7 +92,7 @@ def without_highlights(
     cameras = [camera for camera in rig if camera.name in images and silhouettes[camera.name].quality.usable]
     if len(cameras) < MIN_VIEWS:
         return out
-    normals = head_world.normals()
+    normals = normals_of(head_world)
     sights = map_in_threads(
         lambda k: _seen(cameras[k], images[cameras[k].name], silhouettes[cameras[k].name], head_world, normals),
         len(cameras),
@@ -171,13 +172,12 @@ def _seen(
     pixels = pixels - (box[1].start, box[0].start)
     height, width = (side.stop - side.start for side in box)
     nearest, faces_seen = rasterise(pixels, depths, head_world.faces, height, width)
-    towards = camera.centre_world - vertices
-    facing = np.einsum("vk,vk->v", towards, normals) / np.linalg.norm(towards, axis=1)
+    cosine = facing_cosine(camera.centre_world, vertices, normals)
     with np.errstate(invalid="ignore"):  # NaN is outside
         inside = (pixels >= 0.0).all(axis=1) & (pixels <= (width - 1.0, height - 1.0)).all(axis=1)
-    rows = np.flatnonzero(inside & (facing > MIN_FACING) & (depths > 0.0))
+    rows = np.flatnonzero(inside & (cosine > MIN_FACING) & (depths > 0.0))
     column, row = np.rint(pixels[rows]).astype(int).T
-    clear = depths[rows] < nearest[row, column] + HIDDEN_MM + 3.0 * pixel_mm / facing[rows]
+    clear = depths[rows] < nearest[row, column] + HIDDEN_MM + 3.0 * pixel_mm / cosine[rows]
     clear &= silhouette.distance[box][row, column] * pixel_mm < -OUTLINE_MM
     linear = np.power(np.arange(256, dtype=np.float32) / 255.0, GAMMA)[image[box]]
     smooth = cv2.GaussianBlur(linear, (0, 0), max(BLUR_MM / pixel_mm, 0.5))

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from scipy.spatial import KDTree
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
-from pipeline.geometry.nearest import nearest
+from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.projection import project_points
 from pipeline.part_labels.codes import Part, codes_from_channels
 from pipeline.part_labels.labelling import PartMap
@@ -99,5 +98,5 @@ def part_shares(votes: PartVotes, points: Float[np.ndarray, "n 3"]) -> Float[np.
     row = np.minimum(np.searchsorted(votes.keys, keys), len(votes.keys) - 1)
     lost = np.flatnonzero(votes.keys[row] != keys)
     if len(lost):
-        row[lost] = nearest(KDTree(votes.places), points[lost])[1]
+        row[lost] = nearest(PointTree.of(votes.places), points[lost])[1]
     return votes.probability[row]

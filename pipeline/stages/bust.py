@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.spatial import KDTree
 
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
 from pipeline.fusion.signed_distance import NoSurface
-from pipeline.fusion.skin import part_of
+from pipeline.fusion.skin import measured_skin
+from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.normals import normals_of, vertex_normals
 from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
@@ -18,7 +19,7 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
-from rig.mesh import Mesh, vertex_normals
+from rig.mesh import Mesh
 from rig.messages.message import compose
 
 
@@ -76,7 +77,7 @@ def shape_bust(
     if fused is None:
         return Staged(None)
     displaced = refined.displaced
-    skin = None if displaced is None else part_of(refined.mesh_world, displaced.observed)
+    skin = None if displaced is None else measured_skin(refined.mesh_world, refined.deviation_mm, displaced.observed)
     return Staged(finished(fused, depth.votes, skin))
 
 
@@ -88,7 +89,7 @@ def colour_bust(
     if surface is None:
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, surface.mesh_world
-    normals, depths = mesh.normals(), depth_maps(rig, mesh)
+    normals, depths = normals_of(mesh), depth_maps(rig, mesh)
     colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
     return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 
@@ -111,7 +112,7 @@ def push_out_hair(context: ReconstructionContext, refined: RefinedHead, bust: Bu
         return Staged(None)
     head, mesh = refined.mesh_world, bust.mesh_world
     shell = hair_shell(head, mesh, bust.surface.part)
-    near = KDTree(mesh.vertices).query(shell.vertices_world)[1]
+    near = nearest(PointTree.of(mesh.vertices), shell.vertices_world)[1]
     made = HairyHead(shell, vertex_normals(shell.vertices_world, head.faces), bust.colours[near], bust.views[near])
     beyond = shell.covered < MIN_COVERED
     return Staged(made, [compose("hair-beyond-head", share=shell.covered)] if beyond else [])

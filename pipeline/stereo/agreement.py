@@ -9,7 +9,8 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.settings import DenseSettings
 from pipeline.stereo.agreement_kernels import count_agreeing
 from pipeline.stereo.crops import Crop
-from pipeline.stereo.depth_map import DepthMap
+from pipeline.stereo.depth_map import DepthMap, placing
+from pipeline.stereo.depth_map_kernels import normals_of_known
 from pipeline.stereo.field import Field
 from pipeline.stereo.stack import Stack
 from rig.camera import Camera
@@ -67,7 +68,7 @@ def stated_deviation(
     """
     k = camera.intrinsics
     pixel_mm = np.maximum(field.depth, 1.0) / k.fx
-    slant = 1.0 + ((field.slopes / pixel_mm[:, :, None]) ** 2).sum(axis=2)  # squared secant
+    slant = 1.0 + (field.slopes[:, :, 0] / pixel_mm) ** 2 + (field.slopes[:, :, 1] / pixel_mm) ** 2  # squared secant
     pixel = PIXEL_SHARE * pixel_mm**2 / np.maximum(agreeing.astype(np.float32), 1.0) ** 2
     variance = RELIEF_SHARE * field.relief_mm**2 + slant * (APART_SHARE * apart + pixel)
     return np.sqrt(variance).astype(np.float32)
@@ -84,22 +85,9 @@ def _depth_map(
     return DepthMap(
         camera=crop.camera,
         depth_mm=np.where(known, field.depth, zero),
-        normal=np.where(known[:, :, None], normals_world(crop.camera, field), zero),
+        normal=normals_of_known(field.depth, field.slopes, known, *placing(crop.camera)[:2]),
         deviation_mm=np.where(known, deviation, np.float32(np.inf)),
         views=np.where(known, agreeing + 1, 0).astype(np.uint8),
         mask=crop.mask,
         colour=crop.colour,
     )
-
-
-def normals_world(camera: Camera, field: Field) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the unit normal (world frame, towards the camera) of the surface at each pixel, from the depths and
-    slopes of the field."""
-    k = camera.intrinsics
-    column, row = np.meshgrid(np.arange(k.width, dtype=np.float32), np.arange(k.height, dtype=np.float32))
-    x, y = (column - k.cx) / k.fx, (row - k.cy) / k.fy
-    depth = np.maximum(field.depth, 1.0)
-    z_x, z_y = field.slopes[:, :, 0] * k.fx / depth, field.slopes[:, :, 1] * k.fy / depth
-    normal = np.stack([z_x, z_y, -(1.0 + x * z_x + y * z_y)], axis=2)
-    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
-    return (normal @ camera.camera_from_world.rotation).astype(np.float32)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from pipeline.stereo.depth_map_kernels import place_known
 from rig.camera import Camera
 
 
@@ -32,8 +33,15 @@ class DepthMap:
 
 def points_world(depth_map: DepthMap) -> Float[np.ndarray, "n 3"]:
     """Returns the surface points (world frame, mm) of the known pixels, row by row."""
-    camera = depth_map.camera
-    row, column = np.nonzero(depth_map.known)
-    z, k = depth_map.depth_mm[row, column].astype(float), camera.intrinsics
-    points = np.stack([(column - k.cx) / k.fx * z, (row - k.cy) / k.fy * z, z], axis=1)
-    return camera.camera_from_world.inverse().apply(points)
+    pinhole, turn, shift = placing(depth_map.camera)
+    return place_known(depth_map.depth_mm, depth_map.deviation_mm, pinhole, turn, shift)
+
+
+def placing(
+    camera: Camera,
+) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+    """Returns what ``depth_map_kernels`` need of a camera without distortion: fx fy cx cy (px), and rotation and
+    translation (mm) of world_from_camera."""
+    k, pose = camera.intrinsics, camera.camera_from_world.inverse()
+    turn, shift = (np.ascontiguousarray(each, float) for each in (pose.rotation, pose.translation))
+    return np.array([k.fx, k.fy, k.cx, k.cy]), turn, shift

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ class Measured:
     landmarks: Mapping[str, Float[np.ndarray, " 3"]]  # world
     head_from_world: RigidTransform
     warnings: tuple[str, ...] = ()  # codes
+    expression: Mapping[str, float] = field(default_factory=dict)  # weights by the model's names
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +70,7 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
         rotation = np.array(place["rotation"], float)
         translation = place["scale"] * np.array(place["translation"], float)
         codes = tuple(str(warning["code"]) for warning in report["warnings"])
+        expression = {str(each["name"]): float(each["weight"]) for each in report["expression"]}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{name}/report.json", [f"is no report that can be read ({error!r})"]) from error
     return Measured(
@@ -80,6 +82,7 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
         landmarks=marks,
         head_from_world=RigidTransform(rotation, translation).inverse(),
         warnings=codes,
+        expression=expression,
     )
 
 

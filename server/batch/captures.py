@@ -22,7 +22,7 @@ from server.tasks.settings_file import read_settings_file, reason_of
 ARCHIVES = (".tar.gz", ".tgz", ".tar", ".zip")
 COLUMNS = ("capture", "name", "subject", "session", "settings")
 MIN_PICTURES = 3  # in a folder of photographs without cameras: fewer are no capture
-TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html")  # files of OUT, which no capture may be called
+TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html", "sheet.pdf")  # files of OUT, which no capture may be called
 MORE = "more"  # key of a row: how many cells it has beyond the columns
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 

@@ -1,7 +1,7 @@
 """Manages the folder that a batch fills: results by name, each complete or absent, and records of work in progress.
 
 NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it was made from
-heads.csv heads.parquet sheet.html
+heads.csv heads.parquet sheet.html sheet.pdf
 .batch/           claims/, attempts/ (results being made), failures/: gone when nothing is at work and none failed
 """
 

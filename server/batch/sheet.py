@@ -1,4 +1,4 @@
-"""Draws the contact sheet of a batch: one self-contained HTML file.
+"""Draws the contact sheet of a batch: one self-contained HTML file (``server.batch.sheet_pdf``: as a PDF).
 
 Each head has three views of its turntable, its name, figures and warnings. Red marks warnings that question the head
 itself, amber those about missing input, grey the rest. The sheet contains no times, so that equal results give equal
@@ -84,6 +84,23 @@ def card_class(card: Card) -> str:
     return next((kind for kind in ("severe", "warning") if kind in found), "good")
 
 
+def ranked_cards(cards: Iterable[Card]) -> list[Card]:
+    """Returns the cards in the order of the sheet: what needs attention first, then by name."""
+    order = ("failed", "severe", "warning", "good", "missing")
+    return sorted(cards, key=lambda card: (order.index(card_class(card)), card.name))
+
+
+def ranked_messages(card: Card) -> list[MessageDocument]:
+    """Returns the messages of a card, the most serious first."""
+    ranks = ("severe", "warning", "remark")
+    return sorted(card.messages, key=lambda message: ranks.index(severity(message["code"])))
+
+
+def message_class(card: Card, message: MessageDocument) -> str:
+    """Returns the class by which a message on a card is coloured."""
+    return "failed" if card.state == "failed" else severity(message["code"])
+
+
 def sheet_html(title: str, cards: Sequence[Card]) -> str:
     """Returns the sheet as HTML. Captures that need attention come first."""
     return "\n".join(sheet_lines(title, cards))
@@ -92,13 +109,11 @@ def sheet_html(title: str, cards: Sequence[Card]) -> str:
 def sheet_lines(title: str, cards: Sequence[Card]) -> Iterator[str]:
     """Yields the parts of ``sheet_html`` one by one, so that the pictures of a thousand heads are never held at
     once."""
-    order = ("failed", "severe", "warning", "good", "missing")
-    ranked = sorted(cards, key=lambda card: (order.index(card_class(card)), card.name))
     yield '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
     yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
     yield f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>"
     yield f"<h1>{html.escape(title)}</h1><p>{html.escape(summary(cards))}</p><main>"
-    yield from (_article(card) for card in ranked)
+    yield from (_article(card) for card in ranked_cards(cards))
     yield "</main></body></html>\n"
 
 
@@ -113,15 +128,15 @@ def summary(cards: Iterable[Card]) -> str:
     return f"{sum(counts.values())} captures: {', '.join(counted)}"
 
 
-def views_of(turntable: Path) -> bytes | None:
-    """Returns right profile, front and left profile from a result's turntable.png as one JPEG file. Returns None if the
-    picture cannot be read."""
+def views_of(turntable: Path, panel_px: tuple[int, int] = PANEL_PX) -> bytes | None:
+    """Returns right profile, front and left profile from a result's turntable.png as one JPEG file. ``panel_px``: width
+    and height of a view. Returns None if the picture cannot be read."""
     drawn = cv2.imread(str(turntable), cv2.IMREAD_COLOR)
     if drawn is None:
         return None
     panels = np.array_split(drawn, len(AZIMUTHS_DEG), axis=1)
     chosen = (panels[0], panels[len(panels) // 2], panels[-1])
-    small = np.hstack([cv2.resize(panel, PANEL_PX, interpolation=cv2.INTER_AREA) for panel in chosen])
+    small = np.hstack([cv2.resize(panel, panel_px, interpolation=cv2.INTER_AREA) for panel in chosen])
     encoded, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return data.tobytes() if encoded else None
 
@@ -154,9 +169,8 @@ def _content(card: Card) -> Iterator[str]:
         yield f'<div class="of">{html.escape(line)}</div>'
     if card.messages:
         yield "<ul>"
-        ranks = ("severe", "warning", "remark")
-        for message in sorted(card.messages, key=lambda message: ranks.index(severity(message["code"]))):
-            kind = "failed" if card.state == "failed" else severity(message["code"])
+        for message in ranked_messages(card):
+            kind = message_class(card, message)
             code, text = html.escape(message["code"]), html.escape(message["message"])
             yield f'<li class="{kind}"><code>{code}</code> {text}</li>'
         yield "</ul>"

@@ -16,7 +16,7 @@ from server.batch.sheet import Card, figures_of, sheet_html
 from server.batch.table import Column, Row, columns_of, row_of
 from server.batch.table_files import write_table
 
-SHEET = "sheet.html"
+SHEET, SHEET_PDF = "sheet.html", "sheet.pdf"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Outcome:
 
 
 def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]:
-    """Writes the table and the sheet of all captures of a batch, including those of other shares, and returns the
+    """Writes the table and the sheets of all captures of a batch, including those of other shares, and returns the
     files. Each file is replaced atomically. Raises OSError."""
     folder.forget_failures_but_of({task.capture.name for task in tasks})
     columns = columns_of(expressions_of(task.model for task in tasks))
@@ -41,8 +41,12 @@ def write_summary(folder: BatchFolder, tasks: Sequence[BatchTask]) -> list[Path]
     rows = [table_row(outcome, columns) for outcome in outcomes]
     cards = [sheet_card(outcome, row) for outcome, row in zip(outcomes, rows, strict=True)]
     files = write_table(folder.out, columns, rows)
-    write_atomically(folder.out / SHEET, sheet_html(folder.out.resolve().name, cards).encode("utf-8", "replace"))
-    return [*files, folder.out / SHEET]
+    from server.batch.sheet_pdf import sheet_pdf  # its library takes a while to load; the service's table does without
+
+    title = folder.out.resolve().name
+    write_atomically(folder.out / SHEET, sheet_html(title, cards).encode("utf-8", "replace"))
+    write_atomically(folder.out / SHEET_PDF, sheet_pdf(title, cards))
+    return [*files, folder.out / SHEET, folder.out / SHEET_PDF]
 
 
 def table_row(outcome: Outcome, columns: Sequence[Column]) -> Row:

@@ -257,7 +257,7 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _stores(settings: ServiceSettings) -> tuple[bool, str]:
     """Lists the first object of each place; what may be written there only a delivery shows."""
-    kept = () if settings.results_store is None else (settings.results_store,)
+    kept = [place for place in (settings.captures_store, settings.results_store) if place is not None]
     places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *kept])
     if not places:
         return True, "none; EIGENHEAD_IMPORT_PREFIXES and EIGENHEAD_DELIVER_PREFIXES name places"

@@ -65,18 +65,29 @@ def model_import(
 
 @model_app.command("build", epilog="Example: eigenhead model build scans --out model.npz")
 def model_build(
-    scans: Annotated[Path, typer.Argument(help="A folder of PLY, OBJ or GLB scans and their landmarks.", exists=True)],
+    scans: Annotated[
+        Path, typer.Argument(help="A folder of PLY, OBJ or GLB scans and their landmarks, or of results.", exists=True)
+    ],
     out: Annotated[Path, typer.Option(help="The model file to write.", dir_okay=False)],
     name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
     skip_bad: Annotated[bool, typer.Option(help="Leave out scans that cannot be used, instead of stopping.")] = False,
+    from_results: Annotated[
+        bool, typer.Option("--from-results", help="Update the model that made the heads of these results.")
+    ] = False,
     json_out: Json = False,
 ) -> None:
-    """Build a head model from raw scans (section 3.2)."""
+    """Build a head model from raw scans (section 3.2).
+
+    Or from delivered heads: results of one model, a result a person, whose deviations say how far each counts."""
     prepare_file(out)
     from pipeline.model_building.training.build import build_model
+    from pipeline.verification.delivered_heads import build_from_results
 
     with progress_bar() as report:
-        built = build_model(scans, out, name=name or out.stem, on_bad="skip" if skip_bad else "stop", report=report)
+        if from_results:
+            built = build_from_results(scans, out, name=name or out.stem, report=report)
+        else:
+            built = build_model(scans, out, name=name or out.stem, on_bad="skip" if skip_bad else "stop", report=report)
     document = {
         "file": str(out),
         "used": list(built.used),
@@ -85,7 +96,11 @@ def model_build(
     }
     scan_lines = [f"repaired {scan}: {'; '.join(words)}" for scan, words in built.repaired.items()]
     scan_lines += [f"left out {scan}: {why}" for scan, why in built.skipped.items()]
-    answer(document, json_out, [*scan_lines, f"{out}  from {len(built.used)} scans"])
+    if from_results:
+        before, after = (built.parts.figures[key] for key in ("held_out_before_mm", "held_out_mm"))
+        document["figures"] = dict(built.parts.figures)
+        scan_lines.append(f"a face that it does not know is {after:.2f} mm from its modes, {before:.2f} before (mean)")
+    answer(document, json_out, [*scan_lines, f"{out}  from {len(built.used)} {'results' if from_results else 'scans'}"])
 
 
 @model_app.command("fetch", epilog="Example: eigenhead model fetch ict-facekit")

@@ -49,7 +49,7 @@ def template_add(
     from pipeline.head_model.model import load_model
     from pipeline.model_building.correspondence.scans import landmark_file, read_landmarks
     from pipeline.results.template_picture import template_picture
-    from pipeline.templates.load import make_template
+    from pipeline.templates.make import make_template
     from pipeline.templates.template_file import save_template
     from rig.formats.pictures.images import write_image
 

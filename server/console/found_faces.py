@@ -30,7 +30,7 @@ def found_faces(service: Service, identity: str) -> FacesDocument:
     record = service.store.capture(identity)
     refuse_board(record)
     images = {Path(name).stem: name for name in record.inputs if Path(name).parent.name == "images"}
-    files = service.store.folder("captures", identity) / "files"
+    files = service.store.capture_files(identity)
 
     def find() -> FacesDocument:
         with service.children.one(max(0.0, deadline - time.monotonic())) as child:

@@ -32,7 +32,7 @@ from server.errors import NotFound
 from server.services.keys import Caller
 from server.services.service import Service
 from server.storage.records import CaptureRecord
-from server.wire.batch_files import TableFormat, send_sheet, send_table
+from server.wire.batch_files import SheetFormat, TableFormat, send_sheet, send_table
 from server.wire.multipart import receive_calibration_pictures, receive_capture
 from server.wire.send_file import send_archive, send_file
 
@@ -85,7 +85,7 @@ def thumbnail(who: Reader, capture_id: str, camera: str) -> Response:
     name = _image_name(service.store.capture(capture_id), camera)
     path = service.store.cache_of(capture_id) / "small" / f"{Path(name).stem}.jpg"
     if not path.is_file():
-        make_thumbnail(service.store.folder("captures", capture_id) / "files" / name, path)
+        make_thumbnail(service.store.capture_files(capture_id) / name, path)
     return FileResponse(path, headers=FOREVER)
 
 
@@ -122,7 +122,7 @@ def silhouette(who: Reader, capture_id: str, camera: str) -> Response:
     folder = service.store.cache_of(capture_id) / "outlines"
     with _drawing:
         if not (folder / f"{name}.png").is_file():
-            files = service.store.folder("captures", capture_id) / "files"
+            files = service.store.capture_files(capture_id)
             with service.children.one() as child:
                 child.remote(draw)(capture=str(files), cache=str(folder.parent), target=str(folder))
     return FileResponse(folder / f"{name}.png", headers=FOREVER)
@@ -256,10 +256,10 @@ def batch_table(who: Reader, batch_id: str, form: TableFormat) -> Response:
     return send_table(who[0], batch_id, form)
 
 
-@pages.get("/console/batches/{batch_id}/sheet.html")
-def batch_sheet(who: Reader, batch_id: str) -> Response:
-    """Returns the contact sheet of a batch: an HTML page with views of each head. Raises NotFound."""
-    return send_sheet(who[0], batch_id)
+@pages.get("/console/batches/{batch_id}/sheet.{form}")
+def batch_sheet(who: Reader, batch_id: str, form: SheetFormat) -> Response:
+    """Returns the contact sheet of a batch, as an HTML page or a PDF. Raises NotFound."""
+    return send_sheet(who[0], batch_id, form)
 
 
 @pages.get("/console/calibrations/{calibration_id}/report.html")
@@ -299,7 +299,7 @@ def _image_name(record: CaptureRecord, camera: str) -> str:
 def _capture_files(service: Service, job_id: str) -> tuple[Path, CaptureRecord]:
     """Raises NotFound for a job without a capture that is still there."""
     capture = service.jobs.get(job_id).capture_id or ""
-    return service.store.folder("captures", capture) / "files", service.store.capture(capture)
+    return service.store.capture_files(capture), service.store.capture(capture)
 
 
 def _floats(values: np.ndarray) -> Response:

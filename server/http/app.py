@@ -17,7 +17,7 @@ from server.http.linger import DrainRequestBody
 from server.http.openapi import describe, operation_name
 from server.http.routes import batches, calibrations, captures, jobs, operations, rig, sessions, storage, uploads
 from server.metrics import Metrics
-from server.services.health import check_egl, check_store
+from server.services.health import check_egl, check_store, store_places
 from server.services.retention import sweep
 from server.services.service import Service, open_service
 from server.settings import ServiceSettings
@@ -122,8 +122,8 @@ async def _look_around(service: Service) -> None:
 
 
 async def _watch_store(service: Service) -> None:
-    """Asks the store of results every ``STORE_AGAIN_S`` seconds whether it answers, where there is one."""
-    while service.jobs.results.elsewhere:
+    """Asks the stores every ``STORE_AGAIN_S`` seconds whether they answer, where there are any."""
+    while store_places(service):
         await service.threads.disk(check_store, service)
         await asyncio.sleep(min(STORE_AGAIN_S, service.settings.sweep_s))
 

@@ -13,7 +13,7 @@ from pipeline.head_model.model_names import UnknownModel
 from server.batch.captures import BatchCapture
 from server.batch.digests import files_sha256
 from server.batch.folder import REPORT, FailureRecord, Origin
-from server.batch.sheet import sheet_lines
+from server.batch.sheet import Card, sheet_lines
 from server.batch.summary import Outcome, expressions_of, sheet_card, table_row
 from server.batch.table import Column, Row, columns_of
 from server.problem_types import URN
@@ -41,9 +41,19 @@ def batch_rows(batches: Batches, store: Store, batch: Batch, columns: Sequence[C
 def batch_sheet(batches: Batches, store: Store, batch: Batch) -> Iterator[str]:
     """Yields the lines of a batch's contact sheet, a self-contained HTML page with one card for each capture. A card
     links to the console's page of the result."""
+    return sheet_lines(batch.label or batch.id, _cards(batches, store, batch))
+
+
+def batch_sheet_pdf(batches: Batches, store: Store, batch: Batch) -> bytes:
+    """Returns a batch's contact sheet as PDF."""
+    from server.batch.sheet_pdf import sheet_pdf  # its library takes a while to load
+
+    return sheet_pdf(batch.label or batch.id, _cards(batches, store, batch))
+
+
+def _cards(batches: Batches, store: Store, batch: Batch) -> list[Card]:
     columns = batch_columns(batch)
-    cards = [sheet_card(outcome, table_row(outcome, columns)) for outcome in _outcomes(batches, store, batch)]
-    return sheet_lines(batch.label or batch.id, cards)
+    return [sheet_card(outcome, table_row(outcome, columns)) for outcome in _outcomes(batches, store, batch)]
 
 
 def _outcomes(batches: Batches, store: Store, batch: Batch) -> Iterator[Outcome]:

@@ -27,8 +27,9 @@ from server.services.job_rows import APPLICATION_VERSION, FINISHED, STATES
 from server.services.records import Calibration
 from server.services.texts import check_texts
 from server.storage.events import EventLog
+from server.storage.folders import move_durably
 from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
-from server.storage.store import Store, StoredFile, move_durably, new_id
+from server.storage.store import Store, StoredFile, new_id
 from server.tasks.calibrate import BOARD, check_scale, is_of_board
 from server.tasks.photographs import SCALE
 
@@ -189,7 +190,7 @@ def link_shots(store: Store, folder: Path, captures: list[str]) -> None:
     NotFound for an unknown capture, and InputError if none of them has images."""
     for number, identity in enumerate(captures):
         record = store.capture(identity)
-        files = store.folder("captures", identity) / "files"
+        files = store.capture_files(identity)
         for name in record.inputs:
             if Path(name).parent.name == "images":
                 target = folder / "images" / Path(name).stem / f"shot{number:03}{Path(name).suffix}"

@@ -210,7 +210,7 @@ class Captures:
             path = Path(name)
             single = path.parent.name == kind and path.stem == camera
             if single or (kind == "background" and path.parent.name == camera and path.parent.parent.name == kind):
-                return StoredFile(self._store.folder("captures", identity) / "files" / name, digest)
+                return StoredFile(self._store.capture_files(identity) / name, digest)
         raise NotFound(compose("thing-camera-file"), camera, compose("hint-capture-inputs"))
 
     def features(self, identity: str) -> Points:
@@ -229,7 +229,7 @@ class Captures:
         earlier ones. Raises NotFound, Conflict for a capture of the calibration board, and InputError naming every
         point that does not fit."""
         refuse_board(self._store.capture(identity))
-        folder = self._store.folder("captures", identity) / "files"
+        folder = self._store.capture_files(identity)
         try:
             with self._children.one() as child:
                 data = child.remote(check_features)(folder=str(folder), points=points)
@@ -318,7 +318,7 @@ class Captures:
             if about.session is not None:
                 self._store.session(about.session)
         except NotFound:  # erased while this was taken
-            self._store.remove_capture(record.id)
+            self._store.remove_capture(record.id, later=True)
             raise
         return record
 

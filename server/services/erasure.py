@@ -9,7 +9,8 @@ from rig.messages.message import compose
 from server.errors import Unavailable
 from server.services.job_rows import FINISHED
 from server.services.jobs import Jobs
-from server.storage.store import Store, folder_bytes
+from server.storage.folders import folder_bytes
+from server.storage.store import Store
 
 CANCEL_S = 5.0  # a cancelled job lets go of its files within one second
 
@@ -35,10 +36,11 @@ def holdings(store: Store, jobs: Jobs, capture: str) -> Holdings:
     """Counts what is stored of a capture. Raises NotFound."""
     record = store.capture(capture)
     of_capture = jobs.find(capture=capture, limit=100_000)
+    held = max(record.bytes, folder_bytes(store.folder("captures", capture)))  # some may be in the store alone
     heads = tuple(job.id for job in of_capture if job.state == "succeeded")
     return Holdings(
         pictures=len(record.cameras),
-        bytes=folder_bytes(store.folder("captures", capture)) + folder_bytes(store.cache_of(capture)),
+        bytes=held + folder_bytes(store.cache_of(capture)),
         heads=heads,
         head_bytes=sum(file["bytes"] for job in of_capture for file in job.files.values()),
         jobs=tuple(job.id for job in of_capture if job.state != "succeeded"),

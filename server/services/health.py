@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import version
 
@@ -113,33 +114,47 @@ def _records(service: Service) -> Check:
 
 
 def check_store(service: Service) -> None:
-    """Asks the store of results whether it answers, and keeps the finding for ``readiness``. Blocks while it is
-    silent. Jobs wait for a store that is away, so that this is no reason to send the service none."""
-    place = service.settings.results_store
-    if place is None:
+    """Asks the stores of captures and results whether they answer, and keeps the finding for ``readiness``. Blocks
+    while one is silent. Jobs wait for a store that is away, so that this is no reason to send the service none."""
+    places = store_places(service)
+    if not places:
         return
     try:
         service.jobs.results.probe()
+        if service.store.blobs is not None:
+            service.store.blobs.probe()
     except Refused as error:
         if service.known.get("store", STORE_UNKNOWN).detail.code == "store-answers":
-            log.warning("the store of results is away", reason=error.detail.text)
+            log.warning("the store is away", reason=error.detail.text)
         service.known["store"] = Check(ok=True, detail=error.detail)
     else:
-        service.known["store"] = Check(ok=True, detail=compose("store-answers", place=place))
+        service.known["store"] = Check(ok=True, detail=compose("store-answers", place=", ".join(places)))
+
+
+def store_places(service: Service) -> list[str]:
+    """Returns where captures and results are kept beside the data folder."""
+    places = (service.settings.captures_store, service.settings.results_store)
+    return [place for place in places if place is not None]
 
 
 def _store(service: Service) -> Check:
-    if service.settings.results_store is None:
+    if not store_places(service):
         return Check(ok=True, detail=compose("store-none"))
     return service.known.get("store", STORE_UNKNOWN)
 
 
 def _store_figures(service: Service) -> StoreFigures | None:
-    tally = service.jobs.results.tally
-    if tally is None:
+    blobs = service.store.blobs
+    tallies = [service.jobs.results.tally, None if blobs is None else blobs.objects.tally]
+    found = [tally for tally in tallies if tally is not None]
+    if not found:
         return None
     answers = _store(service).detail.code == "store-answers"
-    return StoreFigures(answers, tally.operations(), tally.seconds())
+    operations, seconds = Counter[tuple[str, str]](), Counter[str]()
+    for tally in found:
+        operations.update(tally.operations())
+        seconds.update(tally.seconds())  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return StoreFigures(answers, operations, seconds)
 
 
 def exposition(service: Service) -> bytes:

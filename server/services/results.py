@@ -18,7 +18,7 @@ import structlog
 from rig.errors import Cancelled, EigenheadError
 from rig.messages.message import compose
 from server.errors import Conflict, Refused
-from server.services.unclaimed_results import DAY_S, collect
+from server.services.unclaimed import COLLECT_S, DAY_S, collect
 from server.settings import ServiceSettings
 from server.storage.object_places import open_objects
 from server.storage.objects import ObjectMissing, StoreDenied, StoreUnavailable
@@ -28,7 +28,6 @@ from server.storage.watched_objects import StoreTally, WatchedObjects
 
 LARGE_BYTES = 1 << 20
 LINK_S = 300
-COLLECT_S = 6 * 3600.0
 UNUSED_S = 900.0  # a file that is being sent is not that old
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 
@@ -152,7 +151,7 @@ class Results:
         return removed
 
     def collect(self, owner: str, known: Callable[[Collection[str]], set[str]], days: float | None) -> int:
-        """Removes results from the store that no job claims, as in ``unclaimed_results``, a few times a day. Returns of
+        """Removes results from the store that no job claims, as in ``unclaimed``, a few times a day. Returns of
         how many jobs."""
         if self._objects is None or days is None:
             return 0

@@ -17,10 +17,11 @@ from server.errors import NotFound
 from server.services.deliveries import UNDER_WAY
 from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
+from server.services.stored_captures import collect_unclaimed, tend_captures
 from server.storage.database import database_identity
+from server.storage.folders import folder_bytes, newest
 from server.storage.job_index import JobQuery
 from server.storage.library import CaptureQuery
-from server.storage.store import folder_bytes, newest
 
 LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
 DAY_S = 86400.0
@@ -47,11 +48,12 @@ def sweep(service: Service) -> dict[str, int]:
     gone["jobs"] = _jobs(service)
     gone["captures"] = _captures(service)
     gone["caches"] = _caches(service)
+    gone["blobs"] = tend_captures(service.store, service.jobs, service.settings.captures_bytes)
     gone["results"] = service.jobs.results.bound(service.settings.results_bytes, service.jobs.files)
     unclaimed = service.settings.keep_unclaimed_days
-    gone["unclaimed"] = service.jobs.results.collect(
-        database_identity(service.engine), service.jobs.index.known, unclaimed
-    )
+    owner = database_identity(service.engine)
+    gone["unclaimed"] = service.jobs.results.collect(owner, service.jobs.index.known, unclaimed)
+    gone["unclaimed"] += collect_unclaimed(service.store, owner, unclaimed)
     gone["orphans"] = _orphans(service)
     gone["deliveries"] = _deliveries(service)
     _find_missing(service)
@@ -144,8 +146,9 @@ def _captures(service: Service) -> int:
         return 0
     for record in list(service.store.captures()):
         if _age_s(record.created) > days * DAY_S and not service.jobs.active(capture=record.id):
-            service.store.remove_capture(record.id)
-            removed += 1
+            with suppress(EigenheadError):  # the store is away
+                service.store.remove_capture(record.id)
+                removed += 1
     return removed
 
 

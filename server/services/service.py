@@ -24,6 +24,7 @@ from server.services.threads import Threads
 from server.services.uploads import ResumableUploads
 from server.services.webhooks import Webhooks
 from server.settings import ServiceSettings
+from server.storage.capture_blobs import open_capture_blobs
 from server.storage.database import open_database
 from server.storage.library import Library
 from server.storage.store import Store
@@ -135,7 +136,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     the parts. Raises InputError for a wrong rig.toml, and DatabaseUnavailable."""
     engine = open_database(settings)
     library = Library(engine)
-    store = Store(settings.data, library)
+    store = Store(settings.data, library, open_capture_blobs(settings, engine), settings.free_bytes)
     library.reconcile(store)
     migrate(settings)
     jobs, rig = Jobs(settings, store, engine, library), open_rig(settings)

@@ -74,6 +74,25 @@ capture_tags = sa.Table(  # of the captures' records, too
     sa.Column("name", sa.Text, nullable=False),
 )
 
+blobs = sa.Table(  # contents in the store of captures
+    "eigenhead_blobs",
+    metadata,
+    sa.Column("id", sa.String(96), primary_key=True),
+    sa.Column("sha256", sa.String(64), nullable=False, index=True),
+    sa.Column("bytes", sa.BigInteger, nullable=False),
+    sa.Column("stored", sa.Boolean, nullable=False),
+    sa.Column("dead", sa.Boolean, nullable=False),  # nothing refers to it, or will
+)
+
+capture_files = sa.Table(
+    "eigenhead_capture_files",
+    metadata,
+    sa.Column("capture_id", sa.String(64), primary_key=True),
+    sa.Column("name", sa.Text, primary_key=True),
+    sa.Column("blob_id", sa.String(96), nullable=False, index=True),
+    sa.Column("arrived", sa.Boolean, nullable=False),  # all files of the capture are in the store
+)
+
 session_index = sa.Table(
     "eigenhead_session_index",
     metadata,

@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -165,10 +165,13 @@ class FolderObjects:
     def erase(self, prefix: str) -> int:
         """Removes all objects below a key and returns how many, as in ``ObjectStore``."""
         with self._asking(prefix) as folder:
-            removed = sum(path.is_file() for path in folder.rglob("*"))
             if folder == self._root:
                 raise StoreDenied(self._place(prefix), compose("store-whole"))
-            shutil.rmtree(folder, ignore_errors=not folder.exists())
+            removed = 0
+            while folder.exists():
+                with suppress(FileNotFoundError):  # somebody else removes it, too
+                    removed = sum(path.is_file() for path in folder.rglob("*"))
+                    shutil.rmtree(folder)
         return removed
 
     def _place(self, key: str) -> str:

@@ -34,6 +34,8 @@ from rig.acquisition.verdict import ViewDocument
 from rig.atomic_write import unfinished, write_atomically
 from rig.messages.message import Message, compose
 from server.errors import DiskFull, NotFound
+from server.storage.capture_blobs import CaptureBlobs
+from server.storage.folders import move_durably, newest, sync_folder
 from server.storage.records import (
     CALIBRATION,
     CAPTURE,
@@ -109,8 +111,11 @@ class Store:
     """Reads and changes the data folder. Methods block. Every id that comes from a request passes ``is_id`` before it
     becomes part of a path."""
 
-    def __init__(self, data: Path, index: RecordIndex | None = None) -> None:
-        self.data, self._index = data, index
+    def __init__(
+        self, data: Path, index: RecordIndex | None = None, blobs: CaptureBlobs | None = None, spare: int = 0
+    ) -> None:
+        """``blobs``: where files of captures are kept, too; ``spare``: bytes that fetching them leaves free."""
+        self.data, self._index, self.blobs, self._spare = data, index, blobs, spare
         self._changing = threading.Lock()  # two changes of one record must not lose one of them
         for name in FOLDERS:
             (data / name).mkdir(parents=True, exist_ok=True)
@@ -152,10 +157,32 @@ class Store:
 
     def add_capture(self, folder: Path, record: CaptureRecord) -> None:
         """Writes a capture's record into ``folder``, which holds ``files/``, and moves the folder to its final place in
-        one rename. After a kill the capture is complete or absent."""
+        one rename. After a kill the capture is complete or absent. Its files go to the store of captures, too."""
         write_atomically(folder / "record.json", _encoded(CAPTURE.document(record)))
         move_durably(folder, self.folder("captures", record.id))
         self._tell(record)
+        self.share(record)
+
+    def share(self, record: CaptureRecord) -> bool:
+        """Stores the files of a capture where a store is configured, as in ``CaptureBlobs.offer``."""
+        if self.blobs is None:
+            return True
+        done = self.blobs.offer(record.id, self.folder("captures", record.id) / "files", record.inputs)
+        if self.found("captures", record.id) is None:  # removed meanwhile
+            self.blobs.release(record.id, later=True)
+        return done
+
+    def capture_files(self, identity: str) -> Path:
+        """Returns the folder of a capture's files, fetched from the store of captures where they lack here. Raises
+        NotFound, Unavailable, DiskFull, and Conflict for files that are nowhere."""
+        folder = self.folder("captures", identity) / "files"
+        if self.blobs is not None:
+            record = self.found("captures", identity)
+            inputs = record.inputs if isinstance(record, CaptureRecord) else None
+            self.blobs.restore(identity, folder, inputs, lambda size: self.reserve(size, self._spare))
+            with suppress(FileNotFoundError):
+                os.utime(folder)  # it is used
+        return folder
 
     def found(self, kind: str, identity: str) -> CaptureRecord | SessionRecord | None:
         """Returns the record of a capture or session (``kind``: "captures", "sessions"). Returns None where it is
@@ -226,10 +253,13 @@ class Store:
         """Replaces the record of a capture by what ``change`` returns for it, and returns the new record. Changes wait
         for each other, and the file is replaced atomically. Raises NotFound."""
         with self._change(compose("thing-capture"), identity):
-            record = change(self.capture(identity))
+            before = self.capture(identity)
+            record = change(before)
             path = self.folder("captures", identity) / "record.json"
             write_atomically(path, _encoded(CAPTURE.document(record)), parents=False)
             self._tell(record)
+        if record.inputs != before.inputs:
+            self.share(record)
         return record
 
     @contextmanager
@@ -242,13 +272,19 @@ class Store:
             except FileNotFoundError as error:
                 raise NotFound(what, identity) from error
 
-    def remove_capture(self, identity: str) -> None:
-        """Removes a capture and everything cached of it, which shows the face as well."""
+    def remove_capture(self, identity: str, *, later: bool = False) -> None:
+        """Removes a capture and everything cached of it, which shows the face as well; first what the store of captures
+        has of it. Raises Unavailable where that does not answer; a second call completes it. ``later``: the next sweep
+        removes that part."""
+        if self.blobs is not None:
+            self.blobs.release(identity, later=later)
         with self._change(compose("thing-capture"), identity):
             self.remove(self.folder("captures", identity))
             self.remove(self.cache_of(identity))
             if self._index is not None:
                 self._index.drop_capture(identity)
+        if self.blobs is not None:  # it may have been stored again since
+            self.blobs.release(identity, later=later)
 
     def cache_of(self, identity: str) -> Path:
         """Returns the folder in which silhouettes, thumbnails and the like of a capture are cached."""
@@ -258,7 +294,7 @@ class Store:
         """Writes the record of a session, replacing an earlier one atomically."""
         path = self.folder("sessions", record.id).with_suffix(".json")
         write_atomically(path, _encoded(SESSION.document(record)))
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
         self._tell(record)
 
     def change_session(self, identity: str, change: Callable[[SessionRecord], SessionRecord]) -> SessionRecord:
@@ -351,37 +387,6 @@ class Store:
         with suppress(OSError):
             whole.rename(self.data / "set-aside" / name)
         return None
-
-
-def move_durably(folder: Path, target: Path) -> None:
-    """Renames a folder whose files have reached the disk, and makes the rename itself durable. Raises OSError if
-    ``target`` is a folder with content."""
-    for path in [folder, *(path for path in folder.rglob("*") if path.is_dir())]:
-        _sync_folder(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    folder.rename(target)
-    _sync_folder(target.parent)
-
-
-def folder_bytes(folder: Path) -> int:
-    """Returns the size in bytes of all files below a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def newest(path: Path) -> float:
-    """Returns when a path, or anything below it, was last modified (s since 1970). Raises FileNotFoundError."""
-    times = [path.stat().st_mtime]
-    if path.is_dir():
-        times += [entry.stat().st_mtime for entry in path.rglob("*")]
-    return max(times)
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _encoded(document: Mapping[str, object]) -> bytes:

@@ -11,6 +11,8 @@ from server.errors import Conflict
 from server.services.service import Service
 
 TableFormat = Literal["csv", "parquet"]
+SheetFormat = Literal["html", "pdf"]
+PDF_TYPE = "application/pdf"
 PARQUET_TYPE = "application/vnd.apache.parquet"
 CLOSED = "sandbox allow-popups; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
@@ -31,13 +33,16 @@ def send_table(service: Service, batch_id: str, form: TableFormat) -> Response:
     return Response(parquet_bytes(columns, list(rows)), media_type=PARQUET_TYPE, headers=_saved_as(PARQUET))
 
 
-def send_sheet(service: Service, batch_id: str) -> Response:
-    """Returns the response that carries the contact sheet of a batch, an HTML page. Its headers forbid scripts, since
+def send_sheet(service: Service, batch_id: str, form: SheetFormat) -> Response:
+    """Returns the response that carries the contact sheet of a batch. The HTML page's headers forbid scripts, since
     people's labels stand on it. Raises NotFound."""
-    from server.services.batch_table import batch_sheet
+    from server.services.batch_table import batch_sheet, batch_sheet_pdf
 
-    lines = batch_sheet(service.batches, service.store, service.batches.get(batch_id))
-    headers = {"Content-Security-Policy": CLOSED, "Content-Disposition": 'inline; filename="sheet.html"'}
+    batch, headers = service.batches.get(batch_id), {"Content-Disposition": f'inline; filename="sheet.{form}"'}
+    if form == "pdf":
+        return Response(batch_sheet_pdf(service.batches, service.store, batch), media_type=PDF_TYPE, headers=headers)
+    lines = batch_sheet(service.batches, service.store, batch)
+    headers["Content-Security-Policy"] = CLOSED
     return StreamingResponse(_encoded(lines), media_type="text/html", headers=headers)
 
 

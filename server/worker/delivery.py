@@ -69,10 +69,14 @@ class Deliverer:
         """Delivers a job's result, and waits for a store that is away. Returns False where the job or its delivery was
         removed meanwhile. Raises JobFailed where it cannot be delivered and once ``until`` is over, and
         WorkerStopped."""
-        pause_s = FIRST_PAUSE_S
+        pause_s, folder = FIRST_PAUSE_S, self._store.folder("jobs", wanted["job_id"])
+        was_there = folder.exists()
         while True:
             try:
-                return self._try(wanted)
+                delivered = self._try(wanted)
+                if not was_there:  # a worker's own data folder: what was fetched for this lies in the store
+                    self._store.remove(folder)
+                return delivered
             except StoreUnavailable as error:
                 if time.time() > wanted["until"]:
                     detail = compose("delivery-given-up", reason=error.detail)

@@ -32,7 +32,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from pipeline.settings import settings_from_document
 from rig.errors import Cancelled, InputError
 from rig.messages.message import compose
-from server.errors import Refused, unusable_input
+from server.errors import unusable_input
 from server.problem_types import type_of_failure
 from server.processes import process_identity
 from server.services import calibrations
@@ -42,9 +42,11 @@ from server.services.job_rows import DELIVERY, WORKFLOW
 from server.services.results import Results
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
+from server.storage.capture_blobs import open_capture_blobs
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
 from server.storage.failure_counts import note_failure
+from server.storage.folders import move_durably
 from server.storage.records import (
     CalibrationOutcome,
     FileEntry,
@@ -52,12 +54,13 @@ from server.storage.records import (
     JobWebhook,
     WebhookMessage,
 )
-from server.storage.store import Store, move_durably
+from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkFailed, function_at
 from server.tasks.progress import EVERY_S, JobProgress, ProgressMeter
 from server.tasks.reconstruct import CaptureWork, reconstruct_capture
 from server.tasks.stage_durations import StageDurations
+from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
 from server.worker.engine import engine_config, take_over
 from server.worker.heartbeat import dead_workers
@@ -75,8 +78,8 @@ class Worker:
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
-        self.store = Store(settings.data)
         self.engine = open_database(settings)
+        self.store = Store(settings.data, blobs=open_capture_blobs(settings, self.engine), spare=settings.free_bytes)
         self.events = EventLog(self.engine)
         self.id = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"[:64]
         self._children = ChildProcessPool(settings.concurrency, niceness=5)  # a busy machine still answers requests
@@ -86,6 +89,7 @@ class Worker:
         self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
         self.results = Results(self.store, settings)
+        self._captures = CaptureSource(self.store, settings, self._states.runs, self._stop)
         self._deliverer = Deliverer(settings, self.store, self._webhooks, self.results, self._stop)
 
     def start(self) -> None:
@@ -107,6 +111,7 @@ class Worker:
         DBOS.register_queue(WEBHOOKS_QUEUE, worker_concurrency=8, on_conflict="always_update")
         DBOS.register_queue(DELIVERIES_QUEUE, worker_concurrency=DELIVERIES_AT_ONCE, on_conflict="always_update")
         threading.Thread(target=self._keep_alive, name="heartbeat", daemon=True).start()
+        threading.Thread(target=self._captures.tidy_forever, name="tidy", daemon=True).start()
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
     def run_until_stopped(self) -> None:
@@ -157,6 +162,7 @@ class Worker:
                     worker.results.discard(job_id)
                     raise
                 worker.publish_outcome(job_id, "succeeded", request.get("webhook"))
+                worker._captures.leave(job_id, request["capture_id"])
                 if "deliver_to" in request:
                     place, hook = request["deliver_to"], request.get("webhook")
                     enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, worker.settings, hook)
@@ -186,11 +192,7 @@ class Worker:
         self.events.append(job_id, {"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None})
         self.store.folder("jobs", job_id).mkdir(parents=True, exist_ok=True)  # where its log goes
         log.info("job started", capture=request["capture_id"])
-        try:
-            record = self.store.capture(request["capture_id"])
-            self.store.reserve(record.bytes, self.settings.free_bytes)
-        except Refused as error:
-            raise JobFailed(error.kind, error.detail) from error
+        self._captures.check(request["capture_id"])
 
     def fit(self, job_id: str, request: JobRequest) -> str:
         """Reconstructs a job's capture in a child process. Returns the name of the folder with the complete result.
@@ -212,9 +214,9 @@ class Worker:
                 return not self._states.runs(job_id)
 
             meter.report("read", 0.0)  # a fresh child loads for seconds before it says so itself
-            with self._children.one() as child:
+            with self._captures.files(job_id, request["capture_id"]) as files, self._children.one() as child:
                 child.remote(self._work, report=meter.report, cancelled=cancelled)(
-                    capture=str(self.store.folder("captures", request["capture_id"]) / "files"),
+                    capture=str(files),
                     result=str(folder),
                     cache=str(self.store.cache_of(request["capture_id"])),
                     model=request.get("model"),

@@ -4,7 +4,7 @@
 
 PostgreSQL and a whole S3 server (SeaweedFS), a service, and WORKERS workers, each with a data folder of its own and in
 a pid namespace of its own (so that each is another machine to the rest; needs root), ``SLOTS`` jobs at once. Captures
-are copied to each beforehand. What a worker asks of database and store goes through two proxies of its own on the
+come from the store. What a worker asks of database and store goes through two proxies of its own on the
 loopback, its links. JOBS pinned jobs sleep SECONDS each. While they run, workers are SIGKILLed and started again KILLS
 times, and CUTS links, of the database and of the store in turn, are cut for ``CUT_S`` seconds: every other one is
 silent (what was connected stays connected, nothing comes through), the others refuse.
@@ -16,7 +16,6 @@ same of a fourth of the jobs before anything is killed.
 import json
 import os
 import random
-import shutil
 import signal
 import socket
 import subprocess
@@ -114,7 +113,6 @@ class FarmWorker:
 
 def farm_worker(number: int, folder: Path, service: RunningService, database: str, store: str) -> FarmWorker:
     data, url = folder / f"worker{number}", sa.make_url(database)
-    shutil.copytree(service.data / "captures", data / "captures")
     links = Link(url.port or 0), Link(int(store.rpartition(":")[2]))
     mine = url.set(port=links[0].port).render_as_string(hide_password=False)
     environment = service.environment | {
@@ -173,6 +171,7 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         settings: dict[str, Any] = {
             "database_url": database_url,
             "results_store": "s3://heads/of/",
+            "captures_store": "s3://heads/captures/",
             "store_endpoint": store,
         }
         settings |= {"store_timeout_s": "3", "silent_s": str(DEAD_S), "heartbeat_s": "1", "poll_s": "0.25"}
@@ -204,6 +203,8 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         keys = {entry["Key"] for page in objects for entry in page.get("Contents", ())} - {"of/owner"}
         everything = client.get("/v1/jobs", params={"limit": 1}).json()["total"]
         said = dict(database.execute(ENDED).fetchall())
+        assert client.delete(f"/v1/captures/{capture}").status_code == 204
+        blobs = bucket.list_objects_v2(Bucket="heads", Prefix="captures/").get("Contents", ())
     return {
         "workers": workers,
         "slots": workers * SLOTS,
@@ -214,6 +215,7 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         "different_results": len(files),
         "ends_said_more_than_once": sum(said.values()) - everything,
         "objects_left_over": len(keys) - 3 * everything,
+        "captures_left_over": len({entry["Key"] for entry in blobs} - {"captures/owner"}),
         "seconds": round(took, 1),
         "efficiency_undisturbed": round(jobs // 4 * seconds / (workers * SLOTS * undisturbed_s), 3),
         "efficiency": round(jobs * seconds / (workers * SLOTS * took), 3),

@@ -22,7 +22,7 @@ from rig.errors import InputError
 from rig.progress import Progress
 
 FEWEST = 3  # heads; they give two modes, and each can be left out to measure generalisation
-_SHARPENINGS = 4  # steps of the iteration in ``corresponded_cages``
+_SHARPENINGS = 4  # steps of the iteration in ``cages_through``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,13 +97,16 @@ def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
 def corresponded_cages(
     scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
 ) -> Float[np.ndarray, "N V0 3"]:
-    """Computes cages (mm) whose subdivided surface passes through the corresponded points.
+    """Computes cages (mm) whose subdivided surface passes through the corresponded points of the scans."""
+    return cages_through(correspond(scans, template, matching, report=report).heads, template)
 
-    Correspondence places cage vertices on the scan, but the subdivided surface lies inside of the cage. So the cage C
-    must solve S C = P, where S are the rows of the subdivision matrix for the cage vertices. S nearly removes detail as
-    fine as the cage itself, so its inverse would amplify noise. A few steps C += P - S C, started with the template's
-    own detail, stop before that."""
-    points = correspond(scans, template, matching, report=report).heads
+
+def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
+    """Computes cages (mm) whose subdivided surface passes through the points at the cage's vertices.
+
+    The subdivided surface lies inside of the cage. So the cage C must solve S C = P, where S are the rows of the
+    subdivision matrix for the cage vertices. S nearly removes detail as fine as the cage itself, so its inverse would
+    amplify noise. A few steps C += P - S C, started with the template's own detail, stop before that."""
     rows = template.levels["full"].operator[: len(template.mean)]
     mean = template.mean.astype(float)
     away = points - rows @ mean

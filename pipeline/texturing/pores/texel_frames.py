@@ -95,7 +95,8 @@ def _steps(layout: Layout, mesh: Mesh) -> tuple[Float[np.ndarray, "n 3"], Float[
     area = np.where(np.abs(area) > 1e-12, area, 1e-12)[:, None]
     along = ((edge * q[:, None] - other * t[:, None]) / area, (other * s[:, None] - edge * p[:, None]) / area)
     count = np.maximum(np.bincount(layout.faces.ravel(), minlength=len(layout.uv)), 1)[:, None]
-    return tuple(_sums(layout.faces, step, len(layout.uv)) / count for step in along)  # type: ignore[return-value]
+    along_u, along_v = (_sums(layout.faces, step, len(layout.uv)) / count for step in along)
+    return along_u, along_v
 
 
 def _sums(faces: Int[np.ndarray, "f 3"], values: Float[np.ndarray, "f 3"], count: int) -> Float[np.ndarray, "n 3"]:

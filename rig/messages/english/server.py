@@ -45,6 +45,8 @@ TEMPLATES = {
     "job-active": "The job is queued or running; cancel it first.",
     "too-many-jobs": "{count} jobs are queued or running for this key, which is the most; wait for one to end.",
     "research-not-carried": "an installed package carries no experiments: clone the project, run deploy/setup.sh in it, and there .venv/bin/eigenhead experiments",
+    "capture-missing": "Its pictures are neither in the data folder nor in the store of captures: restore them from a "
+    "backup, or remove the capture.",
     "result-missing": "Its result is not in the data folder any more: restore it from a backup, or restart the job.",
     "worker-starting": "The worker is being started.",
     "no-worker": "No worker serves the queue {queue}: start one with `eigenhead worker --queue {queue_name}`.",
@@ -72,7 +74,7 @@ TEMPLATES = {
     "records-damaged": "{count} damaged records lie in set-aside: {names}",
     "no-record-damaged": "none damaged",
     "store-answers": "{place} answers",
-    "store-none": "results lie in the data folder",
+    "store-none": "captures and results lie in the data folder",
     "results-missing": "{count} jobs have no result folder any more: {jobs}",
     "results-complete": "all there",
     "capture-in-use": "Jobs that are queued or running need this capture; cancel them first.",

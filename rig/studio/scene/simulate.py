@@ -310,7 +310,8 @@ def _with_chair(view: View, rng: np.random.Generator) -> tuple[View, View]:
     thing = chair(width, height, rng)
     shift = round(0.06 * width)
     moved = np.roll(thing, shift if thing[:, : width // 2, 3].any() else -shift, axis=1)
-    return tuple(replace(view, backdrop=t[:, :, :3] + (1 - t[:, :, 3:]) * view.backdrop) for t in (thing, moved))  # type: ignore[return-value]
+    shot, plate = (replace(view, backdrop=t[:, :, :3] + (1 - t[:, :, 3:]) * view.backdrop) for t in (thing, moved))
+    return shot, plate
 
 
 def _shadowed(view: View, amount: float) -> Float[np.ndarray, "h w 3"]:

@@ -165,12 +165,12 @@ def shoot(page: Page, event: BoardForm) -> Message:
     board_from_document(board)
     shots.check(board)
     identity = service.captures.take(CaptureMetadata(label=LABEL), board=True).id
-    files = service.store.folder("captures", identity) / "files"
+    files = service.store.capture_files(identity)
     with service.children.one() as child:
         found = child.remote(detect_shot)(files=str(files), board=board)
     seen = sum(bool(corners) for corners in found.values())
     if not seen:
-        service.store.remove_capture(identity)
+        service.store.remove_capture(identity, later=True)
         detail = compose("board-not-seen")
         raise InvalidInput("no-board", detail)
     shots.add(board, identity, found)

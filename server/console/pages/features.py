@@ -204,7 +204,7 @@ def choice_of(record: CaptureRecord) -> CaptureChoice:
 def rig_of(service: Service, capture_id: str) -> Rig:
     """Reads the rig from the files of a capture. Raises NotFound for a text that is no id, and InputError for a damaged
     file."""
-    path = find_rig_file(service.store.folder("captures", capture_id) / "files")
+    path = find_rig_file(service.store.capture_files(capture_id))
     assert path is not None  # it was accepted with one
     return read_rig_file(Path(path))
 

@@ -534,6 +534,7 @@ export default {
   "Table, CSV": "Tabelle, CSV",
   "Table, Parquet": "Tabelle, Parquet",
   "Contact sheet": "Bildbogen",
+  "Contact sheet, PDF": "Bildbogen, PDF",
   "What failed": "Was gescheitert ist",
   "All {count} that failed": "Alle {count}, die gescheitert sind",
   "No batches yet": "Noch keine Stapel",

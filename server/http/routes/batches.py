@@ -26,7 +26,7 @@ from server.services.batches import PRIORITY, BatchRequest, Selection
 from server.services.keys import Caller
 from server.services.work import ReconstructionRequest
 from server.storage.batches import BatchState
-from server.wire.batch_files import PARQUET_TYPE, TableFormat, send_sheet, send_table
+from server.wire.batch_files import PARQUET_TYPE, PDF_TYPE, SheetFormat, TableFormat, send_sheet, send_table
 from server.wire.problems import Responses, documented
 
 router = APIRouter(prefix="/v1", tags=["batches"])
@@ -34,7 +34,7 @@ Reader = Annotated[Caller, Depends(require("read"))]
 Submitter = Annotated[Caller, Depends(require("submit"))]
 TEXT = {"schema": {"type": "string"}}
 TABLE: Responses = {200: {"content": {"text/csv": TEXT, PARQUET_TYPE: {}}}, **documented(404, 409)}
-SHEET: Responses = {200: {"content": {"text/html": TEXT}}, **documented(404)}
+SHEET: Responses = {200: {"content": {"text/html": TEXT, PDF_TYPE: {}}}, **documented(404)}
 
 
 class NewBatch(Received):
@@ -183,6 +183,9 @@ def get_batch_table(
 
 
 @router.get("/batches/{batch_id}/sheet", responses=SHEET, response_class=StreamingResponse)
-def get_batch_sheet(service: ServiceOf, caller: Reader, batch_id: str) -> Response:
-    """Returns the contact sheet, one self-contained HTML file: three views of each head, and its warnings in colour."""
-    return send_sheet(service, batch_id)
+def get_batch_sheet(
+    service: ServiceOf, caller: Reader, batch_id: str, form: Annotated[SheetFormat, Query(alias="format")] = "html"
+) -> Response:
+    """Returns the contact sheet: three views of each head, and its warnings in colour. ``html`` is one self-contained
+    file, ``pdf`` has A4 pages."""
+    return send_sheet(service, batch_id, form)

@@ -231,10 +231,10 @@ async def reconstruct_upload(
         submit = partial(service.jobs.submit, record.id, wanted, key=caller.key, idempotency_key=idempotency_key)
         job = await service.threads.disk(submit)
     except BaseException:
-        service.store.remove_capture(record.id)
+        service.store.remove_capture(record.id, later=True)
         raise
     if job.capture_id != record.id:  # an earlier call with this key made the job, so this upload is removed
-        service.store.remove_capture(record.id)
+        service.store.remove_capture(record.id, later=True)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return JobOut.model_validate(job)
 

@@ -4,18 +4,45 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from pipeline.geometry.nearest import nearest
+from pipeline.geometry.nearest import PointTree, nearest
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("count", [1, 4])
 @pytest.mark.parametrize("queries", [0, 1, 1000])
-def test_they_are_those_of_one_query(threads: int, count: int, queries: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("axes", [2, 3])
+def test_they_are_those_of_scipy(
+    threads: int, count: int, queries: int, axes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", str(threads))
     rng = np.random.default_rng(3)
-    tree, points = KDTree(rng.normal(size=(500, 3))), rng.normal(size=(queries, 3))
+    points, places = rng.normal(size=(500, axes)), rng.normal(size=(queries, axes))
     for within in (np.inf, 0.3):
-        distance, row = nearest(tree, points, count=count, within=within)
-        expected_distance, expected_row = tree.query(points, k=count, distance_upper_bound=within)
+        distance, row = nearest(PointTree.of(points), places, count=count, within=within)
+        expected_distance, expected_row = KDTree(points).query(places, k=count, distance_upper_bound=within)
         np.testing.assert_array_equal(distance, expected_distance)
         np.testing.assert_array_equal(row, expected_row)
+
+
+@pytest.mark.parametrize("points", [0, 1, 12, 13, 100])
+def test_few_points_and_more_wanted_than_there_are(points: int) -> None:
+    at = np.random.default_rng(1).normal(size=(points, 3))
+    distance, row = nearest(PointTree.of(at), np.zeros((2, 3)), count=20)
+    expected_distance, expected_row = KDTree(at).query(np.zeros((2, 3)), k=20)
+    np.testing.assert_array_equal(distance, expected_distance)
+    np.testing.assert_array_equal(row, expected_row)
+
+
+def test_of_equally_far_points_the_first_comes_first() -> None:
+    corners = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    many = np.concatenate([corners] * 9)
+    distance, row = nearest(PointTree.of(many), np.zeros((1, 3)), count=8)
+    np.testing.assert_array_equal(distance[0], np.full(8, np.sqrt(3.0)))
+    np.testing.assert_array_equal(row[0], np.arange(8))
+    np.testing.assert_array_equal(nearest(PointTree.of(many), corners)[1], np.arange(8))
+
+
+def test_points_at_one_place_are_sorted_into_leaves() -> None:
+    distance, row = nearest(PointTree.of(np.ones((1000, 3))), np.ones((1, 3)), count=3, within=1.0)
+    np.testing.assert_array_equal(distance, np.zeros((1, 3)))
+    np.testing.assert_array_equal(row, [[0, 1, 2]])

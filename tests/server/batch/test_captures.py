@@ -136,7 +136,7 @@ def test_a_wrong_first_row_is_named(tmp_path: Path, text: str, fault: str) -> No
     assert fault in faults_of(tmp_path / "study.csv")
 
 
-@pytest.mark.parametrize("name", ["heads.csv", "sheet.html", ".batch", "a//b", "a/.b", "a\\b", "/a"])
+@pytest.mark.parametrize("name", ["heads.csv", "sheet.html", "sheet.pdf", ".batch", "a//b", "a/.b", "a\\b", "/a"])
 def test_names_that_would_be_other_files_are_refused(tmp_path: Path, name: str) -> None:
     small_capture(tmp_path / "anna")
     (tmp_path / "study.csv").write_text(f"capture,name\nanna,{name}\n")

@@ -32,7 +32,7 @@ def test_each_capture_becomes_a_folder_and_a_second_run_makes_nothing(tmp_path: 
     shots, out = pinned_captures(tmp_path / "shots", 3), tmp_path / "heads"
     assert states(run_pinned(shots, out)) == {"s0000": "made", "s0001": "made", "s0002": "made"}
     names = {path.relative_to(out).as_posix() for path in out.rglob("*")}
-    assert {"heads.csv", "heads.parquet", "sheet.html", "s0001/head.ply", "s0001/batch.json"} <= names
+    assert {"heads.csv", "heads.parquet", "sheet.html", "sheet.pdf", "s0001/head.ply", "s0001/batch.json"} <= names
     assert not [name for name in names if name.startswith(".")]
     before = {path: path.stat().st_mtime_ns for path in out.glob("*/*")}
     observer = Silent()

@@ -28,11 +28,12 @@ def test_done_failed_and_missing(done: tuple[Path, Path]) -> None:
     shots, out = done
     pinned_capture(shots / "late", 6)
     files = write_summary(BatchFolder(out), plan(shots, out))
-    assert [file.name for file in files] == ["heads.csv", "heads.parquet", "sheet.html"]
+    assert [file.name for file in files] == ["heads.csv", "heads.parquet", "sheet.html", "sheet.pdf"]
     assert {name: row["state"] for name, row in rows(out).items()} == {
         "bad": "failed", "late": "missing", "s0000": "done", "s0001": "done",
     }  # fmt: skip
     assert rows(out)["bad"]["failure"].count("names no capture") == 2
+    assert (out / "sheet.pdf").read_bytes().startswith(b"%PDF-")
     page = (out / "sheet.html").read_text()
     assert page.count("data:image/jpeg") == 2
     assert "4 captures: 2 with warnings, 1 failed, 1 not made yet" in page

@@ -258,6 +258,9 @@ def test_the_table_and_the_sheet_are_those_of_the_command_line(tmp_path: Path) -
         assert "default-src 'none'" in sheet.headers["content-security-policy"]
         assert "<h1>Study &lt;4&gt;</h1>" in sheet.text
         assert sheet.text.count("data:image/jpeg") == 2
+        pdf = http.get(f"/v1/batches/{batch}/sheet", params={"format": "pdf"})
+        assert (pdf.headers["content-type"], pdf.content[:5]) == ("application/pdf", b"%PDF-")
+        assert pdf.content.count(b"/DCTDecode") == 2  # a picture each, as JPEG
 
 
 def test_webhooks_hear_once_of_each_end_of_a_batch(http: httpx.Client, captures: list[str]) -> None:

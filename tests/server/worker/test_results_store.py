@@ -11,9 +11,18 @@ from typing import Any
 import httpx
 import pytest
 
+from server.storage.capture_blobs import SMALL_BYTES
 from server.storage.store import new_id
 from tests.support.object_server import KEYS, Network, client_of, network_before
-from tests.support.services import RunningService, await_state, running_service, uploaded_capture
+from tests.support.services import (
+    RunningService,
+    await_state,
+    packed,
+    running_service,
+    small_capture,
+    upload,
+    uploaded_capture,
+)
 
 NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
 
@@ -42,6 +51,8 @@ def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         tmp_path_factory.mktemp("service") / "data",
         results_store="s3://results/of/",
         results_bytes="0",
+        captures_store="s3://results/captures/",
+        captures_bytes="0",
         sweep_s="0.3",
         keep_unclaimed_days="0.00001",
         store_endpoint=way.url,
@@ -110,6 +121,60 @@ def test_a_result_goes_from_the_data_folder_and_comes_back(
     assert client.get(f"/v1/jobs/{job}/result/all.zip").status_code == 200
 
 
+def test_a_capture_goes_from_the_data_folder_and_comes_back(
+    client: httpx.Client, bucket: Any, service: RunningService, way: Network, tmp_path: Path
+) -> None:
+    data = packed(small_capture(tmp_path / "large", 3, size=200))
+    capture, again = (upload(client, data).json()["id"] for _ in range(2))
+    folder = service.data / "captures" / capture / "files"
+    pictures = {path.name: path.read_bytes() for path in (folder / "images").iterdir()}
+    assert {len(content) > SMALL_BYTES for content in pictures.values()} == {True}
+
+    def versions() -> set[str]:
+        found = bucket.list_object_versions(Bucket="results", Prefix="captures/")
+        parts = {kind: found.get(kind, ()) for kind in ("Versions", "DeleteMarkers")}
+        names = [entry["Key"].split("/")[1].split("-")[0] for entries in parts.values() for entry in entries]
+        return {
+            name for name in names if name in {hashlib.sha256(content).hexdigest() for content in pictures.values()}
+        }
+
+    assert len(versions()) == len(pictures)
+
+    def gone() -> bool:
+        os.utime(folder, (time.time() - 7200, time.time() - 7200))
+        return not [*folder.glob("images/*.png")]
+
+    until(gone)
+    way.fail("torn", 1000, "GET")
+    assert client.get(f"/v1/captures/{capture}/images/cam00").status_code == 503
+    way.heal()
+    assert client.get(f"/v1/captures/{capture}/images/cam00").content == pictures["cam00.png"]
+    until(gone)
+    await_state(client, submitted(client, capture), ("succeeded",))
+    assert {path.name: path.read_bytes() for path in (folder / "images").iterdir()} == pictures
+    assert client.delete(f"/v1/captures/{again}").status_code == 204
+    assert len(versions()) == len(pictures)  # the other has them still
+    way.fail("503", 1000, "DELETE")
+    way.fail("503", 1000, "POST")
+    assert client.delete(f"/v1/captures/{capture}", params={"erase": True}).status_code == 503
+    way.heal()
+    assert client.delete(f"/v1/captures/{capture}", params={"erase": True}).status_code == 204
+    until(lambda: not versions())  # a sweep that was storing the capture again takes that back
+
+
+def test_a_capture_is_taken_while_the_store_is_away(
+    client: httpx.Client, bucket: Any, way: Network, tmp_path: Path
+) -> None:
+    way.fail("503", 10_000, "PUT")
+    answer = upload(client, packed(small_capture(tmp_path / "late", 4)))
+    assert answer.status_code == 201
+    way.heal()
+    record = (tmp_path / "late" / "cameras.json").read_bytes()
+    until(
+        lambda: hashlib.sha256(record).hexdigest() in str(bucket.list_objects_v2(Bucket="results", Prefix="captures/"))
+    )
+
+
 def test_a_job_waits_for_the_store_and_goes_on(client: httpx.Client, capture: str, bucket: Any, way: Network) -> None:
     way.fail("503", 10_000, "PUT")
     job = submitted(client, capture)
@@ -154,7 +219,9 @@ def figures(client: httpx.Client) -> dict[str, float]:
 def test_metrics_and_readiness_say_whether_the_store_answers(client: httpx.Client, way: Network) -> None:
     up, away = 'eigenhead_store_up{store="results"}', 'operation="list",outcome="unavailable"'
     until(lambda: figures(client)[up] == 1.0)
-    assert client.get("/readyz").json()["checks"]["store"]["detail"] == "s3://results/of/ answers"
+    assert (
+        client.get("/readyz").json()["checks"]["store"]["detail"] == "s3://results/captures/, s3://results/of/ answers"
+    )
     way.fail("503", 10_000)
     until(lambda: figures(client)[up] == 0.0)
     answer = client.get("/readyz")

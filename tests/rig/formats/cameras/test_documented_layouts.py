@@ -14,7 +14,7 @@ from rig.formats.cameras.cameras_file import read_rig_file, write_rig_file
 from rig.formats.pictures.images import write_image
 from rig.messages.message import texts_of
 from rig.rig import Rig
-from tests.rig.formats.cameras.test_other_cameras import POINTS, fan
+from tests.support.fan_rig import POINTS, fan
 
 METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
 <document version="1.5.0"><chunk label="Chunk 1" enabled="true">

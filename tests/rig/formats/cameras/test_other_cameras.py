@@ -1,6 +1,5 @@
 """Foreign rig files: what is written is read back the same, by us and by pycolmap; damage always ends in InputError."""
 
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,72 +7,17 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from rig.camera import Camera, Distortion, Intrinsics
+from rig.camera import Distortion, Intrinsics
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import FORMATS, find_rig_file, read_rig_file, rig_file_parts, write_rig_file
-from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.cameras.colmap import write_colmap
-from rig.formats.cameras.opencv_toml import write_aniposelib, write_caliscope
+from rig.formats.cameras.opencv_toml import write_aniposelib
 from rig.formats.pictures.images import write_image
-from rig.geometry import look_at
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
+from tests.support.fan_rig import KINDS, NAMES, POINTS, fan, square, write
 from tests.support.shared_data import shared
-
-POINTS = np.random.default_rng(4).uniform(-80.0, 80.0, (20, 3))
-
-
-def fan(count: int = 5) -> Rig:
-    cameras = []
-    for i, azimuth in enumerate(np.linspace(-1.2, 1.2, count)):
-        centre = np.array([900 * np.sin(azimuth), 90.0 * i - 150, 900 * np.cos(azimuth)])
-        lens = Distortion(-0.11 + 0.02 * i, 0.05, 1e-3 * i, -7e-4, 0.013)
-        intrinsics = Intrinsics(1024 + i, 768, 1500.0 + i, 1510.0, 511.5 + i, 380.25, lens)
-        cameras.append(Camera(f"cam{i:02d}", intrinsics, look_at(centre, np.zeros(3), np.array([0.0, 1.0, 0.0]))))
-    return Rig(tuple(cameras))
-
-
-def write(kind: str, rig: Rig, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    match kind:
-        case "ours":
-            write_rig(rig, folder / "cameras.json")
-        case "colmap text":
-            write_colmap(rig, folder / "sparse" / "0")
-        case "colmap binary":
-            write_colmap(rig, folder, binary=True)
-        case "caliscope":
-            write_caliscope(rig, folder / "camera_array.toml")
-        case "aniposelib":
-            write_aniposelib(rig, folder / "calibration.toml")
-
-
-NAMES = {
-    "eigenhead": "cameras.json",
-    "colmap": "sparse/0",
-    "colmap-text": "sparse/0",
-    "caliscope": "camera_array.toml",
-    "aniposelib": "calibration.toml",
-    "metashape": "cameras.xml",
-    "realitycapture": "images",
-    "realitycapture-csv": "cameras.csv",
-    "nerfstudio": "transforms.json",
-    "opencv-yaml": ".",
-    "blender": "cameras.py",
-}
-
-
-def square(rig: Rig) -> Rig:
-    """The rig with square pixels, which is all that some formats know."""
-    lenses = [replace(camera.intrinsics, fy=camera.intrinsics.fx) for camera in rig]
-    return Rig(tuple(replace(c, intrinsics=lens) for c, lens in zip(rig, lenses, strict=True)))
-
-
-OTHERS = ("metashape", "realitycapture", "realitycapture-csv", "nerfstudio", "opencv-yaml")
-KINDS = ("ours", "colmap text", "colmap binary", "caliscope", "aniposelib")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -249,130 +193,6 @@ def test_the_unit_of_an_aniposelib_file(unit: str, scale: float, tmp_path: Path)
     path.write_text(path.read_text().replace('unit = "mm"', unit))
     back = read_rig_file(path)
     np.testing.assert_allclose(back["cam01"].camera_from_world.translation, rig["cam01"].camera_from_world.translation)
-
-
-def corrupted(kind: str, folder: Path) -> Path:
-    """A rig file with one or more faults, named by the key of the table below."""
-    write("colmap text" if "text" in kind else "colmap binary" if "binary" in kind else "aniposelib", fan(), folder)
-    path = find_rig_file(folder)
-    assert path is not None
-    images = path.with_name(f"images{path.suffix}")
-    match kind:
-        case "binary: truncated cameras":
-            path.write_bytes(path.read_bytes()[:-30])
-        case "binary: truncated images":
-            images.write_bytes(images.read_bytes()[:-3])
-        case "binary: empty":
-            path.write_bytes(b"")
-        case "binary: a huge count":
-            path.write_bytes(struct.pack("<Q", 1 << 60) + path.read_bytes()[8:])
-        case "binary: a huge count of points":
-            images.write_bytes(images.read_bytes()[:-8] + struct.pack("<Q", 1 << 62))
-        case "binary: NaN focal length":
-            data = bytearray(path.read_bytes())
-            data[8 + 24 : 8 + 32] = struct.pack("<d", float("nan"))
-            path.write_bytes(data)
-        case "binary: fisheye":
-            data = bytearray(path.read_bytes())
-            data[12:16] = struct.pack("<i", 7)  # FOV
-            path.write_bytes(data)
-        case "binary: no images file":
-            images.unlink()
-        case "text: NaN translation":
-            images.write_text(
-                images.read_text().replace("1 cam00", "1 cam00").replace(" 1 cam00.png", " 1 cam00.png", 1)
-            )
-            first, *rest = images.read_text().splitlines()[2:]
-            words = first.split()
-            words[5] = "nan"
-            images.write_text("\n".join([" ".join(words), *rest]))
-        case "text: zero quaternion":
-            first, *rest = images.read_text().splitlines()[2:]
-            words = first.split()
-            words[1:5] = ["0"] * 4
-            images.write_text("\n".join([" ".join(words), *rest]))
-        case "text: unknown camera":
-            images.write_text(images.read_text().replace("3 cam02.png", "77 cam02.png"))
-        case "text: a parameter is missing":
-            path.write_text(path.read_text().replace(" 0.0 0.0 0.0\n", " 0.0 0.0\n", 1))
-        case "text: too many images":
-            line = images.read_text().splitlines()[2]
-            images.write_text("\n\n".join([line] * 100))
-        case "toml: broken":
-            path.write_text("[cam_0\n")
-        case "toml: NaN rotation and a missing matrix":
-            text = path.read_text().replace("rotation = [", "rotation = [nan, ", 1)
-            path.write_text(text.replace("matrix", "motrix", 2).replace("motrix", "matrix", 1))
-        case "toml: a fisheye of five coefficients":
-            path.write_text(path.read_text().replace('name = "cam01"', 'name = "cam01"\nfisheye = true'))
-    return path
-
-
-FAULTS = {
-    "binary: truncated cameras": ["promises|truncated"],
-    "binary: truncated images": ["truncated"],
-    "binary: empty": ["truncated"],
-    "binary: a huge count": ["promises 1152921504606846976"],
-    "binary: a huge count of points": ["promises 4611686018427387904"],
-    "binary: NaN focal length": ["cam00.intrinsics.fx"],
-    "binary: fisheye": ["number 7"],
-    "binary: no images file": ["is missing: copy all files of the model"],
-    "text: NaN translation": ["cam00.camera_from_world.translation"],
-    "text: zero quaternion": ["cam00.camera_from_world.rotation"],
-    "text: unknown camera": ["'cam02' names camera 77"],
-    "text: a parameter is missing": ["has 11 parameters"],
-    "text: too many images": ["images; a rig has at most"],
-    "toml: broken": ["cannot be understood"],
-    "toml: NaN rotation and a missing matrix": ["matrix is missing", "rotation"],
-    "toml: a fisheye of five coefficients": [r"cam01.distortions must be at most 4 coefficients \(k1 k2 k3 k4\)"],
-}
-
-
-@pytest.mark.parametrize("kind", FAULTS)
-def test_each_fault_is_named(kind: str, tmp_path: Path) -> None:
-    path = corrupted(kind, tmp_path)
-    for expected in FAULTS[kind]:
-        with pytest.raises(InputError, match=expected):
-            read_rig_file(path)
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    kind=st.sampled_from(KINDS[1:] + OTHERS),
-    which=st.integers(0, 1),
-    cut=st.integers(0, 2000),
-    at=st.integers(0, 2000),
-    patch=st.binary(max_size=12),
-)
-def test_no_damage_escapes_as_another_error(
-    kind: str, which: int, cut: int, at: int, patch: bytes, tmp_path: Path
-) -> None:
-    path = whole_file(kind, tmp_path / kind)
-    damaged = path.with_name(path.name.replace("cameras", "images")) if which and "colmap" in kind else path
-    if which and kind == "opencv-yaml":
-        damaged = path.with_name("extri.yml")
-    data = damaged.read_bytes()
-    data = data[:at] + patch + data[at + len(patch) :]
-    damaged.write_bytes(data[: len(data) - cut] if cut < len(data) // 2 else data)
-    try:
-        rig = read_rig_file(path)
-    except InputError:
-        return
-    assert all(np.isfinite(camera.camera_from_world.rotation).all() for camera in rig)
-
-
-def whole_file(kind: str, folder: Path) -> Path:
-    """A rig's file of that kind, not damaged yet."""
-    if kind in OTHERS:
-        write_rig_file(square(fan(3)), folder / NAMES[kind], kind)
-        for camera in fan(3):
-            write_image(folder / "images" / f"{camera.name}.jpg", np.zeros((768, 1024), np.uint8))
-        found = find_rig_file(folder)
-        assert found is not None
-        return found
-    write(kind, fan(3), folder)
-    path = {"colmap text": folder / "sparse/0/cameras.txt", "colmap binary": folder / "cameras.bin"}.get(kind)
-    return path or folder / ("camera_array.toml" if kind == "caliscope" else "calibration.toml")
 
 
 def test_opencv_yaml_of_plain_lists_is_read_and_words_in_place_of_numbers_are_named(tmp_path: Path) -> None:

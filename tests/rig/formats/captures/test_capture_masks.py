@@ -10,7 +10,7 @@ from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.captures.capture_folder import read_capture, write_capture
 from rig.formats.captures.capture_masks import _without_specks
-from tests.rig.formats.captures.test_capture_folder import HEIGHT, WIDTH, picture, small_rig
+from tests.support.small_captures import HEIGHT, WIDTH, picture, small_rig
 
 ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
 BUST = (np.hypot(COLUMNS - 32, ROWS - 22) < 10) | ((ROWS > 32) & (np.abs(COLUMNS - 32) < 22))

@@ -9,7 +9,7 @@ import pytest
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture, write_capture
 from rig.formats.pictures.picture_samples import is_mosaic, measure_samples, used_bits
-from tests.rig.formats.captures.test_capture_folder import small_rig
+from tests.support.small_captures import small_rig
 
 PICTURE = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8), (0, 0), 2)
 

@@ -1,5 +1,5 @@
-"""Removes results from the object store that no job claims: of jobs that were removed while a worker still wrote, or
-that a restored database lacks.
+"""Removes what nothing claims from an object store: results of jobs that were removed while a worker still wrote, and
+results and captures' files that a restored database lacks.
 
 Several services may do this at once. The row of a job is written before its result, and the store is listed before the
 rows are read, so that a result is never taken for one without a job. A database collects only where its own results
@@ -19,22 +19,28 @@ from server.storage.store import is_id
 
 OWNER = "owner"
 DAY_S = 86400.0
+COLLECT_S = 6 * 3600.0  # between two looks at a whole store
 AT_ONCE = 500
 
 log = structlog.get_logger()
 
 
 def collect(
-    objects: ObjectStore, owner: str, known: Callable[[Collection[str]], set[str]], days: float, scratch: Path
+    objects: ObjectStore,
+    owner: str,
+    known: Callable[[Collection[str]], set[str]],
+    days: float,
+    scratch: Path,
+    is_name: Callable[[str], object] = is_id,
 ) -> int:
     """Removes the results of jobs that are not known and were written more than ``days`` ago. ``owner`` names the
-    database, ``known`` returns those of the ids that are jobs of it. Returns of how many jobs. A store that is away
-    ends it; the next call goes on."""
+    database, ``known`` returns those of the ids that are jobs of it, ``is_name`` tells what may be an id. Returns of
+    how many jobs. A store that is away ends it; the next call goes on."""
     removed = 0
     try:
         if not _owns(objects, owner, scratch):
             return 0
-        listed = [name for name in objects.folders() if is_id(name)]
+        listed = [name for name in objects.folders() if is_name(name)]
         for start in range(0, len(listed), AT_ONCE):
             some = listed[start : start + AT_ONCE]
             for job_id in sorted({*some} - known(some)):
@@ -42,7 +48,7 @@ def collect(
                 if time.time() - written > days * DAY_S and not known([job_id]):  # submitted again under its id
                     removed += objects.erase(f"{job_id}/") > 0  # some stores go on listing empty folders
     except Refused as error:
-        log.info("results without a job stay", reason=error.detail.text)
+        log.info("objects that nothing claims stay", reason=error.detail.text)
     return removed
 
 
@@ -56,5 +62,5 @@ def _owns(objects: ObjectStore, owner: str, scratch: Path) -> bool:
             path.write_text(owner, encoding="utf-8")
             objects.put(OWNER, path, sha256_of(path))
         if (found := path.read_text(encoding="utf-8")) != owner:
-            log.warning("another database keeps its results in this store; none is collected", owner=found[:64])
+            log.warning("this store is another database's; nothing is collected in it", owner=found[:64])
         return found == owner

@@ -1,0 +1,96 @@
+"""Looks after the store of captures: what waits for it goes there, what is dead or unclaimed is removed, and what it
+has goes from the data folder where that holds too much.
+
+A data folder whose captures have no records is a worker's own. It is a cache as a whole: what was erased goes from it,
+too.
+"""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+import structlog
+
+from rig.errors import EigenheadError
+from server.errors import Refused
+from server.services.jobs import Jobs
+from server.services.unclaimed import COLLECT_S, DAY_S, collect
+from server.storage.capture_blobs import NAME
+from server.storage.records import CaptureRecord
+from server.storage.store import Store
+
+UNUSED_S = 3600.0  # the files of a job that runs were used since
+SHARED_AT_ONCE = 50
+
+log = structlog.get_logger()
+
+
+def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
+    """Stores captures that wait for the store, removes what nothing refers to any more, and bounds the data folder. A
+    store that is away ends it; the next call goes on. Returns how many blobs were removed."""
+    blobs, removed = store.blobs, 0
+    if blobs is None:
+        return 0
+    try:
+        for identity in blobs.waiting(SHARED_AT_ONCE):
+            record = store.found("captures", identity)
+            if isinstance(record, CaptureRecord) and not store.share(record):
+                break
+        blobs.release_abandoned()
+        removed = blobs.bury()
+        bound_captures(store, most, lambda identity: bool(jobs.active(capture=identity)))
+    except Refused as error:
+        log.info("captures wait for the store", reason=error.detail.text)
+    return removed
+
+
+def collect_unclaimed(store: Store, owner: str, days: float | None) -> int:
+    """Removes blobs from the store that this database, ``owner``, does not have, as in ``collect``, a few times a day.
+    Returns how many."""
+    if store.blobs is None or days is None:
+        return 0
+    if time.monotonic() - store.blobs.collected < min(COLLECT_S, days * DAY_S):
+        return 0
+    store.blobs.collected = time.monotonic()
+    with store.incoming() as scratch:
+        return collect(store.blobs.objects, owner, store.blobs.known, days, scratch, NAME.fullmatch)
+
+
+def bound_captures(store: Store, most: int, is_used: Callable[[str], bool]) -> int:
+    """Removes large files of captures that were not used for long from the data folder, until all of them take
+    ``most`` bytes. Each is compared with its object before. Returns of how many captures."""
+    assert store.blobs is not None
+    found, total, removed = [], 0, 0
+    for identity in store.ids("captures"):
+        folder = store.folder("captures", identity) / "files"
+        with suppress(FileNotFoundError):
+            size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+            found.append((folder.stat().st_mtime, size, identity))
+            total += size
+    for used, size, identity in sorted(found):
+        if total <= most or time.time() - used < UNUSED_S:
+            break
+        if is_used(identity):
+            continue
+        try:
+            there = store.blobs.compare(identity, store.folder("captures", identity) / "files")
+        except (EigenheadError, OSError) as error:
+            log.info("a capture stays in the data folder", capture=identity, reason=str(error)[:200])
+            continue
+        for path in there.values():
+            path.unlink(missing_ok=True)
+        total, removed = total - size, removed + 1
+    return removed
+
+
+def forget_erased(store: Store) -> int:
+    """Removes from a worker's own data folder what it has of captures that the service has no more. Returns of how
+    many."""
+    assert store.blobs is not None
+    mine = {*store.ids("captures"), *store.ids("cache/captures")}
+    mine = {identity for identity in mine if not (store.folder("captures", identity) / "record.json").exists()}
+    gone = mine - store.blobs.holders(mine)
+    for identity in gone:
+        store.remove(store.folder("captures", identity))
+        store.remove(store.cache_of(identity))
+    return len(gone)

@@ -1,0 +1,255 @@
+"""Files of captures in an object store: each content once, under ``<its SHA-256>-<16 hex digits>/content``.
+
+The database says which capture has which blob, and workers without the service's data folder read both. A blob that
+nothing refers to is marked dead in the same transaction, and nothing refers to it again: the same content that comes
+later gets a new name. So whoever removes dead blobs, at any time and any number of them, never meets one in use.
+"""
+
+import os
+import re
+import secrets
+import tempfile
+import time
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import sqlalchemy as sa
+import structlog
+
+from rig.messages.message import compose
+from server.errors import Conflict
+from server.settings import ServiceSettings
+from server.storage.database import blobs, capture_files, capture_index
+from server.storage.object_places import open_objects
+from server.storage.objects import Admission, ObjectMissing, StoreDenied, StoreUnavailable, sha256_of
+from server.storage.watched_objects import WatchedObjects
+
+NAME = re.compile(r"[0-9a-f]{64}-[0-9a-f]{16}")
+SMALL_BYTES = 1 << 16  # files up to this size stay in the data folder, and are compared before they are used
+ARRIVING_S = 3600.0  # a capture whose files are older than that and that is not there was given up
+AT_ONCE = 500
+
+log = structlog.get_logger()
+
+log = structlog.get_logger()
+
+
+@dataclass(frozen=True, slots=True)
+class Blob:
+    """Holds the name of a blob, and SHA-256 and size of its content. ``stored``: it is in the store."""
+
+    id: str
+    sha256: str
+    bytes: int
+    stored: bool = False
+
+    @property
+    def key(self) -> str:
+        """Returns the key of its object."""
+        return f"{self.id}/content"
+
+
+class CaptureBlobs:
+    """Stores and fetches the files of captures. Methods block, and may be called by several processes at once. Each
+    raises StoreUnavailable where the store does not do its part, and StoreDenied where it will not."""
+
+    def __init__(self, objects: WatchedObjects, engine: sa.Engine) -> None:
+        self._objects, self._engine = objects, engine
+        self.collected = float("-inf")  # when this process last looked for unclaimed blobs (s, monotonic)
+
+    @property
+    def objects(self) -> WatchedObjects:
+        """Returns the store, with what was asked of it."""
+        return self._objects
+
+    def probe(self) -> None:
+        """Asks the store for a list of nothing."""
+        next(self._objects.entries("none/"), None)
+
+    def keep(self, capture: str, folder: Path, inputs: Mapping[str, str]) -> None:
+        """Stores the files of a capture that lie in ``folder``; ``inputs`` is their SHA-256 by name. Once all are
+        there, others may fetch them. Contents that are in the store are not sent again."""
+        claimed = self._claim(capture, inputs, lambda name: (folder / name).stat().st_size)
+        used = {blob.id: (name, blob) for name, blob in claimed.items()}
+        sent = list[str]()
+        try:
+            for name, blob in used.values():
+                if not blob.stored:
+                    sent.append(blob.id)
+                    self._objects.put(blob.key, folder / name, blob.sha256)
+        finally:
+            self._take_back(sent)
+        mine = sa.and_(capture_files.c.capture_id == capture, capture_files.c.blob_id.in_(used))
+        with self._engine.begin() as connection:
+            connection.execute(sa.update(blobs).where(blobs.c.id.in_(used), ~blobs.c.dead).values(stored=True))
+            connection.execute(sa.update(capture_files).where(mine).values(arrived=True))
+
+    def offer(self, capture: str, folder: Path, inputs: Mapping[str, str]) -> bool:
+        """Stores the files of a capture, as ``keep`` does. Returns False where the store does not take them, or the
+        capture is gone; what is there waits for the next sweep."""
+        try:
+            self.keep(capture, folder, inputs)
+        except (StoreUnavailable, StoreDenied) as error:
+            log.warning("a capture waits for the store", capture=capture, reason=error.detail.text)
+            return False
+        except FileNotFoundError:
+            return False
+        return True
+
+    def files(self, capture: str) -> dict[str, Blob]:
+        """Returns the blobs of a capture by the names of its files; none before all of them are in the store."""
+        query = sa.select(capture_files.c.name, capture_files.c.arrived, blobs).join(
+            blobs, blobs.c.id == capture_files.c.blob_id
+        )
+        with self._engine.connect() as connection:
+            rows = connection.execute(query.where(capture_files.c.capture_id == capture)).all()
+        if not all(row.arrived for row in rows):
+            return {}
+        return {row.name: Blob(row.id, row.sha256, row.bytes, row.stored) for row in rows}
+
+    def is_known(self, capture: str) -> bool:
+        """Tells whether the service has a capture, though its files may not be in the store yet."""
+        with self._engine.connect() as connection:
+            return connection.scalar(sa.select(sa.literal(1)).where(capture_index.c.id == capture)) is not None
+
+    def restore(self, capture: str, folder: Path, inputs: Mapping[str, str] | None, admit: Admission) -> None:
+        """Fetches the files of a capture that ``folder`` lacks. ``inputs``: SHA-256 by name, None: as the database
+        says. Raises Conflict ("capture-missing") for files that are nowhere, and what ``admit`` raises."""
+        known = {} if inputs is not None and _all_there(folder, inputs) else self.files(capture)
+        wanted = {name: blob.sha256 for name, blob in known.items()} if inputs is None else inputs
+        if inputs is None and not known:
+            raise Conflict("capture-missing", compose("capture-missing"))
+        for name, sha256 in wanted.items():
+            if not _is_there(folder / name, sha256):
+                blob = known.get(name)
+                if blob is None or blob.sha256 != sha256:
+                    raise Conflict("capture-missing", compose("capture-missing"))
+                self._fetch(blob, folder / name, admit)
+
+    def compare(self, capture: str, folder: Path) -> dict[str, Path]:
+        """Returns the large files of a capture in ``folder`` that are in the store, each compared with its object."""
+        same = {}
+        for name, blob in self.files(capture).items():
+            path = folder / name
+            if blob.bytes > SMALL_BYTES and path.is_file():
+                self._objects.put(blob.key, path, blob.sha256)
+                same[name] = path
+        return same
+
+    def release(self, capture: str, *, later: bool = False) -> None:
+        """Removes what only this capture has from the store, with every version; ``later``: with the next sweep. A call
+        that fails is completed by a second one."""
+        self._claim(capture, {}, lambda _: 0)
+        if not later:
+            self.bury()
+
+    def bury(self) -> int:
+        """Removes all dead blobs. Returns how many."""
+        with self._engine.connect() as connection:
+            dead = connection.scalars(sa.select(blobs.c.id).where(blobs.c.dead)).all()
+        for blob in dead:
+            self._objects.erase(f"{blob}/")
+            with self._engine.begin() as connection:
+                connection.execute(sa.delete(blobs).where(blobs.c.id == blob))
+        return len(dead)
+
+    def waiting(self, limit: int) -> list[str]:
+        """Returns captures of the service whose files are not all in the store, the oldest first."""
+        arrived = sa.select(capture_files.c.capture_id).where(capture_files.c.arrived)
+        query = sa.select(capture_index.c.id).where(capture_index.c.id.not_in(arrived)).order_by(capture_index.c.id)
+        with self._engine.connect() as connection:
+            return [*connection.scalars(query.limit(limit))]
+
+    def release_abandoned(self) -> int:
+        """Releases the files of captures that were being received when their service was killed. Returns how many."""
+        known = sa.select(capture_index.c.id)
+        query = sa.select(capture_files.c.capture_id).distinct()
+        query = query.where(~capture_files.c.arrived, capture_files.c.capture_id.not_in(known))
+        with self._engine.connect() as connection:
+            found = [c for c in connection.scalars(query) if time.time() - int(c[:12], 16) / 1e3 > ARRIVING_S]
+        for capture in found:
+            self.release(capture)
+        return len(found)
+
+    def known(self, ids: Collection[str]) -> set[str]:
+        """Returns those of the ids that are blobs of this database."""
+        with self._engine.connect() as connection:
+            return {*connection.scalars(sa.select(blobs.c.id).where(blobs.c.id.in_(ids)))}
+
+    def holders(self, captures: Collection[str]) -> set[str]:
+        """Returns those of the captures that have files in the store, or are about to."""
+        query, found = sa.select(capture_files.c.capture_id).distinct(), set[str]()
+        ids = sorted(captures)
+        with self._engine.connect() as connection:
+            for start in range(0, len(ids), AT_ONCE):
+                some = ids[start : start + AT_ONCE]
+                found |= {*connection.scalars(query.where(capture_files.c.capture_id.in_(some)))}
+        return found
+
+    def _claim(self, capture: str, inputs: Mapping[str, str], size: Callable[[str], int]) -> dict[str, Blob]:
+        """Makes these the files of a capture, and dead what only it had. Locks rows in the order of their names, so
+        that two services wait for each other."""
+        mine = sa.select(capture_files.c.blob_id).where(capture_files.c.capture_id == capture)
+        alike = sa.and_(blobs.c.sha256.in_(set(inputs.values())), ~blobs.c.dead)
+        query = sa.select(blobs).where(sa.or_(blobs.c.id.in_(mine), alike)).order_by(blobs.c.id).with_for_update()
+        with self._engine.begin() as connection:
+            if connection.dialect.name == "sqlite":  # where a transaction begins, and locks, with the first change
+                connection.execute(sa.update(blobs).where(sa.false()).values(dead=True))
+            rows = connection.execute(query).all()
+            usable = {row.sha256: Blob(row.id, row.sha256, row.bytes, row.stored) for row in rows if not row.dead}
+            for name, sha256 in inputs.items():
+                if sha256 not in usable:
+                    usable[sha256] = Blob(f"{sha256}-{secrets.token_hex(8)}", sha256, size(name))
+                    blob = usable[sha256]
+                    connection.execute(
+                        sa.insert(blobs).values(id=blob.id, sha256=sha256, bytes=blob.bytes, stored=False, dead=False)
+                    )
+            connection.execute(sa.delete(capture_files).where(capture_files.c.capture_id == capture))
+            for name, sha256 in inputs.items():
+                row = {"capture_id": capture, "name": name, "blob_id": usable[sha256].id, "arrived": False}
+                connection.execute(sa.insert(capture_files).values(row))
+            used = sa.exists().where(capture_files.c.blob_id == blobs.c.id)
+            ids = [row.id for row in rows]
+            connection.execute(sa.update(blobs).where(blobs.c.id.in_(ids), ~used).values(dead=True))
+        return {name: usable[sha256] for name, sha256 in inputs.items()}
+
+    def _take_back(self, sent: Collection[str]) -> None:
+        """Removes what was sent of a capture that was removed meanwhile: its blobs may have been buried before."""
+        with self._engine.connect() as connection:
+            alive = {*connection.scalars(sa.select(blobs.c.id).where(blobs.c.id.in_(sent), ~blobs.c.dead))}
+        for blob in sent:
+            if blob not in alive:
+                self._objects.erase(f"{blob}/")
+
+    def _fetch(self, blob: Blob, path: Path, admit: Admission) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        part = Path(name)
+        try:
+            os.close(handle)
+            self._objects.fetch(blob.key, part, blob.sha256, admit)
+            part.chmod(0o644)
+            part.replace(path)
+        except ObjectMissing as error:
+            raise Conflict("capture-missing", compose("capture-missing")) from error
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def open_capture_blobs(settings: ServiceSettings, engine: sa.Engine) -> CaptureBlobs | None:
+    """Opens the store of captures that the settings name; None without one."""
+    place = settings.captures_store
+    return None if place is None else CaptureBlobs(WatchedObjects(open_objects(place, settings)), engine)
+
+
+def _all_there(folder: Path, inputs: Mapping[str, str]) -> bool:
+    return all(_is_there(folder / name, sha256) for name, sha256 in inputs.items())
+
+
+def _is_there(path: Path, sha256: str) -> bool:
+    """Whether a file is there. Small ones may be replaced while their capture stays: they are compared."""
+    with suppress(FileNotFoundError, NotADirectoryError):
+        return path.stat().st_size > SMALL_BYTES or sha256_of(path) == sha256
+    return False
