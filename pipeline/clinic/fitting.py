@@ -40,6 +40,8 @@ FLANK_HEIGHTS_MM = (5.0, 11.0)  # below nasion
 EYE_HALF_WIDTH_MM = 4.0  # of the band before an eye that a frame's rim spans
 ABOVE_EYE_MM, BELOW_EYE_MM = 35.0, 40.0
 CRANIUM_BEHIND_MM = 40.0  # the ears' line; less is a face without a cranium
+SPARE_MM = 15.0  # longer than any edge of a head
+LOWEST_MM = 60.0  # below nasion nothing is measured
 DRAWS, WAVES = 48, 32
 
 Points = Float[np.ndarray, "_ 3"]
@@ -69,13 +71,17 @@ def fitting_measures(visit: Visit) -> dict[str, Fitted]:
     measured = visit.measured
     frame = frankfurt_axes(measured, "RAS")
     motion = frame.patient_from_world
-    vertices, normals = motion.apply(measured.mesh_world.vertices), measured.mesh_world.normals() @ motion.rotation.T
     marks = {name: motion.apply(point) for name, point in measured.landmarks.items()}
-    head = UprightHead(vertices, measured.mesh_world.faces, marks, measured.regions["ears"])
+    whole = motion.apply(measured.mesh_world.vertices)
+    kept = whole[:, 2] > marks["nasion"][2] - LOWEST_MM
+    faces = (np.cumsum(kept) - 1)[measured.mesh_world.faces[kept[measured.mesh_world.faces].all(axis=1)]]
+    vertices, stated = whole[kept], measured.stated_mm[kept]
+    normals = measured.mesh_world.normals()[kept] @ motion.rotation.T
+    head = UprightHead(vertices, faces, marks, measured.regions["ears"][kept])
     units = {name: value for name, value in _all(head).items() if value is not None}
     drawn: dict[str, list[float]] = {name: [] for name in units}
     for field in _fields(vertices):
-        moved = UprightHead(vertices + (measured.stated_mm * field)[:, None] * normals, head.faces, marks, head.ears)
+        moved = UprightHead(vertices + (stated * field)[:, None] * normals, head.faces, marks, head.ears)
         for name, value in _all(moved).items():
             if name in drawn and value is not None:
                 drawn[name].append(value)
@@ -173,7 +179,11 @@ def _nose_section(head: UprightHead, below_mm: float) -> Points:
     """Returns the level section of the nose at a height below nasion, from right to left (mm)."""
     nasion = head.marks["nasion"]
     reach = np.abs(head.marks["endocanthion_right"][0] - head.marks["endocanthion_left"][0]) / 2.0
-    points = section(head.vertices, head.faces, nasion - (0.0, 0.0, below_mm), np.array([0.0, 0.0, 1.0]))
+    off = head.vertices - nasion
+    nose = (np.abs(off[:, 0]) < reach + SPARE_MM) & (off[:, 1] > -30.0 - SPARE_MM)
+    nose &= np.abs(off[:, 2] + below_mm) < SPARE_MM
+    faces = head.faces[nose[head.faces[:, 0]]]  # all of them would be a hundred times as many
+    points = section(head.vertices, faces, nasion - (0.0, 0.0, below_mm), np.array([0.0, 0.0, 1.0]))
     near = (np.abs(points[:, 0] - nasion[0]) < reach) & (points[:, 1] > nasion[1] - 30.0)
     return points[near][np.argsort(points[near, 0])]
 

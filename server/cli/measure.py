@@ -1,12 +1,15 @@
 """Implements ``eigenhead measure``: what helmets, masks and spectacles are fitted by, and the sizes that fit."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from server.cli.answers import Data, Json, answer
+
+if TYPE_CHECKING:
+    from pipeline.clinic.sizes import SizeTable
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -28,23 +31,18 @@ def measure(
 
     Prints each measure with its standard deviation and ISO name, and of every table of sizes how likely each size
     fits."""
-    from pipeline.clinic.fitting import ISO_NAMES, Fitted, fitting_measures
+    from pipeline.clinic.fitting import ISO_NAMES, MEASURES, Fitted, fitting_measures
     from pipeline.clinic.sizes import choose_size, read_size_tables
     from pipeline.clinic.visit import read_visit
-    from rig.errors import InputError
-    from rig.messages.message import compose
 
     tables = [] if sizes is None else read_size_tables(sizes)
     visit = read_visit(result, model)
+    _check_measures(sizes, tables, {*visit.measurements, *MEASURES})
     found = {
         name: Fitted(of.value_mm, of.std_mm, "mm") for name, of in visit.measurements.items() if of.std_mm is not None
     }
     found |= fitting_measures(visit)
-    unknown = [table for table in tables if table.measure not in found]
-    if unknown and sizes is not None:
-        known = ", ".join(sorted(found))
-        faults = [compose("size-measure-unknown", table=of.name, measure=of.measure, known=known) for of in unknown]
-        raise InputError(sizes.name, faults)
+    _check_measures(sizes, tables, found.keys())
     chosen = [choose_size(table, found[table.measure].value, found[table.measure].std) for table in tables]
     document = {
         "measures": {
@@ -57,6 +55,21 @@ def measure(
         },
     }
     answer(document, json_out, _lines(document))
+
+
+def _check_measures(path: Path | None, tables: "Sequence[SizeTable]", known: Collection[str]) -> None:
+    """Raises InputError if a table is by a measure that this head does not have."""
+    from rig.errors import InputError
+    from rig.messages.message import compose
+
+    listed = ", ".join(sorted(known))
+    faults = [
+        compose("size-measure-unknown", table=of.name, measure=of.measure, known=listed)
+        for of in tables
+        if of.measure not in known
+    ]
+    if faults and path is not None:
+        raise InputError(path.name, faults)
 
 
 def _lines(document: Mapping[str, Any]) -> list[str]:

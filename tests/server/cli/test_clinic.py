@@ -33,6 +33,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
             name: {"position": vertices[row].tolist(), "std": [1.0, 2.0, 2.0]} for name, row in model.landmarks.items()
         },
         "measurements": {"nose_breadth": {"value": 34.0, "std": 1.0}},
+        "expression": [],
         "warnings": [],
     }
     (folder / "report.json").write_text(json.dumps(report))
