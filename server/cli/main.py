@@ -8,7 +8,20 @@ from typing import Annotated
 import typer
 
 from rig.errors import EigenheadError
-from server.cli import batch, cameras, clinic, experiments, export, heads, models, rig, service, templates, wrap
+from server.cli import (
+    batch,
+    cameras,
+    clinic,
+    experiments,
+    export,
+    heads,
+    measure,
+    models,
+    rig,
+    service,
+    templates,
+    wrap,
+)
 from server.cli.answers import fail
 
 app = typer.Typer(
@@ -18,7 +31,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # importing rich's markdown alone takes half a second
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for room in (service, heads, batch, export, clinic, wrap, experiments, cameras):
+for room in (service, heads, batch, export, clinic, measure, wrap, experiments, cameras):
     app.add_typer(room.app)
 groups = {"keys": service.keys_app, "rig": rig.rig_app, "model": models.model_app, "template": templates.template_app}
 for name, group in groups.items():

@@ -32,7 +32,7 @@ MADE = "<!-- Made of the program by `make reference`; changes belong there. -->\
 WIDTH = 100
 ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
     "heads": ("Heads", ("reconstruct", "batch", "check", "export")),
-    "clinic": ("Clinic", ("compare", "register")),
+    "clinic": ("Clinic", ("compare", "register", "measure")),
     "trials": ("Trials", ("simulate", "demo", "verify", "experiments")),
     "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
     "rig": ("The rig", ("rig",)),

@@ -33,6 +33,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
             name: {"position": vertices[row].tolist(), "std": [1.0, 2.0, 2.0]} for name, row in model.landmarks.items()
         },
         "measurements": {"nose_breadth": {"value": 34.0, "std": 1.0}},
+        "expression": [],
         "warnings": [],
     }
     (folder / "report.json").write_text(json.dumps(report))
@@ -73,3 +74,23 @@ def test_a_comparison_that_is_there_is_not_written_over(result: Path, tmp_path: 
     (tmp_path / "compare.json").write_text("{}")
     done = CliRunner().invoke(app, ["compare", str(result), str(result), "--out", str(tmp_path)])
     assert "compare.json is there already" in str(done.exception)
+
+
+def test_a_measure_comes_with_its_deviation_and_size(result: Path, tmp_path: Path) -> None:
+    table = tmp_path / "sizes.toml"
+    table.write_text(
+        'format = "eigenhead-sizes/1"\n[[table]]\nname = "helmet"\nmeasure = "head_circumference"\n'
+        "sizes = { S = [480, 540], M = [540, 600], L = [600, 660] }\n"
+    )
+    done = CliRunner().invoke(app, ["measure", str(result), "--sizes", str(table), "--json"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.output)
+    girth, bridge = (document["measures"][name] for name in ("head_circumference", "nose_bridge_width"))
+    assert 0.0 < girth["std"] < 2.0 * np.pi * 0.2  # the head states 0.2 mm
+    assert 8.0 < bridge["value"] < 25.0
+    helmet = document["sizes"]["helmet"]
+    limits = {"S": (480, 540), "M": (540, 600), "L": (600, 660)}[helmet["best"]]
+    assert limits[0] <= girth["value"] < limits[1]
+    table.write_text(table.read_text().replace("head_circumference", "hat"))
+    refused = CliRunner().invoke(app, ["measure", str(result), "--sizes", str(table)])
+    assert "helmet: hat is no measure of this head" in str(refused.exception)
