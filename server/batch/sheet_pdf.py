@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
+from typing import cast
 
 import cv2
 import numpy as np
@@ -92,7 +93,8 @@ class _Page(FPDF):
     def wrapped(self, text: str, size_pt: float, width_mm: float) -> list[str]:
         """Returns the text's lines, of ``width_mm`` at most, in Latin-1."""
         self.set_font("Helvetica", style="B", size=size_pt)  # the wider one
-        return self.multi_cell(width_mm, text=_latin(text), align="L", dry_run=True, output="LINES")
+        lines = self.multi_cell(width_mm, text=_latin(text), align="L", dry_run=True, output="LINES")
+        return cast(list[str], lines)
 
     def write_line(self, line: _Line, x: float, width_mm: float) -> None:
         """Writes one line at the height of the cursor, and moves that below it."""

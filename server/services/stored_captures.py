@@ -38,7 +38,8 @@ def tend_captures(store: Store, jobs: Jobs, most: int) -> int:
                 break
         blobs.release_abandoned()
         removed = blobs.bury()
-        bound_captures(store, most, lambda identity: bool(jobs.active(capture=identity)))
+        if blobs.bytes_of_all() > most:  # or nobody need look at each file
+            bound_captures(store, most, lambda identity: bool(jobs.active(capture=identity)))
     except Refused as error:
         log.info("captures wait for the store", reason=error.detail.text)
     return removed

@@ -162,6 +162,11 @@ class CaptureBlobs:
         with self._engine.connect() as connection:
             return [*connection.scalars(query.limit(limit))]
 
+    def bytes_of_all(self) -> int:
+        """Returns the size of the files of all captures of the service, wherever they lie."""
+        with self._engine.connect() as connection:
+            return int(connection.scalar(sa.select(sa.func.sum(capture_index.c.bytes))) or 0)
+
     def release_abandoned(self) -> int:
         """Releases the files of captures that were being received when their service was killed. Returns how many."""
         known = sa.select(capture_index.c.id)

@@ -10,7 +10,10 @@ times, and CUTS links, of the database and of the store in turn, are cut for ``C
 silent (what was connected stays connected, nothing comes through), the others refuse.
 
 ``efficiency``: seconds slept for results, by the seconds of all slots until the last job ended. ``undisturbed``: the
-same of a fourth of the jobs before anything is killed.
+same of a fourth of the jobs before anything is killed. ``lost_to``: seconds of slots that were not slept for results in
+the disturbed part, by cause: ``starting``, from a kill to the heartbeat of the next process; ``begun_again``, what was
+slept for jobs whose worker was killed then; the rest are cuts, children that start, steps around a job and the last
+jobs. ``taken_over_s``: from a kill until another worker goes on with a job, the median.
 """
 
 import json
@@ -18,6 +21,7 @@ import os
 import random
 import signal
 import socket
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -26,6 +30,7 @@ import time
 from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +47,9 @@ CUT_S = (5.0, 20.0)
 DEAD_S = 6.0
 SEED = 37
 BLOCK = 1 << 16
+STARTED = "SELECT started FROM eigenhead_workers ORDER BY started"
+BEGUN = """SELECT job_id, at FROM eigenhead_events WHERE document::json ->> 'stage' = 'read' ORDER BY job_id, at"""
+NOW = "SELECT extract(epoch FROM clock_timestamp())"
 ENDED = """SELECT document::json ->> 'state', count(*) FROM eigenhead_events
            WHERE document::json ->> 'state' IN ('succeeded', 'failed', 'cancelled') GROUP BY 1"""
 
@@ -130,6 +138,7 @@ class Farm:
 
     def __init__(self, client: httpx.Client, database: "psycopg.Connection[Any]", workers: list[FarmWorker]) -> None:
         self.client, self.database, self.workers = client, database, workers
+        self.killed = list[float]()
 
     def submit(self, capture: str, jobs: int, seconds: float) -> list[str]:
         wanted = {"capture_id": capture, "settings": {"front": f"{seconds:g}"}}
@@ -145,6 +154,23 @@ class Farm:
             assert time.monotonic() < deadline, self.under_way()
             time.sleep(0.2)
 
+    def losses(self) -> dict[str, float]:
+        """Seconds of slots that kills took, and of taking over, from what the database has of workers and jobs."""
+        started = [row[0] for row in self.database.execute(STARTED).fetchall()]
+        starting = [min((at - kill for at in started if at > kill), default=0.0) for kill in self.killed]
+        again, taken_over = 0.0, list[float]()
+        begun = self.database.execute(BEGUN).fetchall()
+        for (job, first), (same, second) in pairwise(begun):
+            kills = [kill for kill in self.killed if first < kill < second]
+            if job == same and kills:
+                again += kills[0] - first
+                taken_over.append(second - kills[0])
+        return {
+            "starting": SLOTS * sum(starting),
+            "begun_again": again,
+            "taken_over_s": statistics.median(taken_over) if taken_over else 0.0,
+        }
+
     def harm(self, kills: int, cuts: int, seconds: float) -> None:
         """Kills and cuts at random moments of about so many seconds."""
         rng = random.Random(SEED)
@@ -156,6 +182,7 @@ class Farm:
             worker = self.workers[number % len(self.workers)]
             if act == "kill":
                 worker.kill()
+                self.killed.append(float(self.database.execute(NOW).fetchall()[0][0]))
                 worker.start()
             else:
                 worker.links[cut % 2].cut(rng.uniform(*CUT_S), refuse=cut // 2 % 2 == 1)
@@ -197,6 +224,7 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         farm.harm(kills, cuts, 0.9 * jobs * seconds / (workers * SLOTS))
         farm.finish()
         took = time.monotonic() - began
+        lost = farm.losses()
         ended = [client.get(f"/v1/jobs/{job}").json() for job in ids]
         files = Counter(json.dumps(job["files"], sort_keys=True) for job in ended)
         objects = bucket.get_paginator("list_objects_v2").paginate(Bucket="heads", Prefix="of/")
@@ -217,6 +245,9 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         "objects_left_over": len(keys) - 3 * everything,
         "captures_left_over": len({entry["Key"] for entry in blobs} - {"captures/owner"}),
         "seconds": round(took, 1),
+        "slot_seconds_lost": round(workers * SLOTS * took - jobs * seconds, 1),
+        "lost_to": {name: round(lost[name], 1) for name in ("starting", "begun_again")},
+        "taken_over_s": round(lost["taken_over_s"], 1),
         "efficiency_undisturbed": round(jobs // 4 * seconds / (workers * SLOTS * undisturbed_s), 3),
         "efficiency": round(jobs * seconds / (workers * SLOTS * took), 3),
     }
