@@ -123,8 +123,9 @@ def length_changes(earlier: Visit, later: Visit) -> dict[str, LengthChange]:
         after = later.measurements.get(name)
         if after is None:
             continue
-        known = before.std_mm is not None and after.std_mm is not None
-        std = float(np.hypot(before.std_mm, after.std_mm)) if known else None
+        std = None
+        if before.std_mm is not None and after.std_mm is not None:
+            std = float(np.hypot(before.std_mm, after.std_mm))
         found[name] = LengthChange(before, after, after.value_mm - before.value_mm, std)
     return found
 

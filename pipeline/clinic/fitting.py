@@ -126,7 +126,9 @@ def bridge_width(head: UprightHead) -> float | None:
 def splay_angle(head: UprightHead) -> float | None:
     """Returns the mean angle of the bridge's flanks to straight ahead, degrees."""
     narrow, wide = (_width(head, BRIDGE_BELOW_NASION_MM, depth) for depth in FLANK_DEPTHS_MM)
-    return None if narrow is None or wide is None else _half_angle(wide - narrow, np.subtract(*FLANK_DEPTHS_MM[::-1]))
+    return (
+        None if narrow is None or wide is None else _half_angle(wide - narrow, FLANK_DEPTHS_MM[1] - FLANK_DEPTHS_MM[0])
+    )
 
 
 def frontal_angle(head: UprightHead) -> float | None:
@@ -136,7 +138,7 @@ def frontal_angle(head: UprightHead) -> float | None:
         return None
     plane = crest - PAD_DEPTH_MM  # a front of spectacles is upright
     high, low = (_width(head, below, None, plane) for below in FLANK_HEIGHTS_MM)
-    return None if high is None or low is None else _half_angle(low - high, np.subtract(*FLANK_HEIGHTS_MM[::-1]))
+    return None if high is None or low is None else _half_angle(low - high, FLANK_HEIGHTS_MM[1] - FLANK_HEIGHTS_MM[0])
 
 
 def frame_angle(head: UprightHead) -> float | None:

@@ -118,7 +118,8 @@ def test_the_files_hold_what_was_found(tmp_path: Path) -> None:
     assert (rows["nose_breadth"]["sure"], rows["face_height"]["std_mm"]) == ("false", "")
     mesh = trimesh.load(tmp_path / "difference.ply", process=False)
     assert isinstance(mesh, trimesh.Trimesh)
-    colours = np.asarray(mesh.visual.vertex_colors)[:, :3]  # pyright: ignore[reportAttributeAccessIssue]
+    assert isinstance(mesh.visual, trimesh.visual.ColorVisuals)
+    colours = np.asarray(mesh.visual.vertex_colors)[:, :3]
     grey = (colours == UNTOLD).all(axis=1)
     np.testing.assert_array_equal(~grey, found.changed)
     top = colours[row_of("zygion_left")].astype(int)

@@ -22,6 +22,12 @@ def frame_of(plane: str, axes: Axes) -> AnatomicalFrame:
     return frankfurt_axes(HERE.measured, axes) if plane == "frankfurt" else head_axes(HERE.measured, axes)
 
 
+def vertices_of(path: Path) -> np.ndarray:
+    mesh = trimesh.load(path, process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    return np.asarray(mesh.vertices)
+
+
 def slicer_ras(folder: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Mesh and points in Slicer's scene, which is RAS: of a mesh the comment SPACE decides, of a list its own field
     (vtkMRMLModelStorageNode, vtkMRMLMarkupsJsonStorageNode); LPS differs by the signs of x and y."""
@@ -29,7 +35,7 @@ def slicer_ras(folder: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     space = re.search(rb"comment .*SPACE=(\w+)", head.read_bytes()[:500])
     assert space is not None
     signs = {"RAS": (1.0, 1.0, 1.0), "LPS": (-1.0, -1.0, 1.0)}
-    vertices = trimesh.load(head, process=False).vertices * signs[space[1].decode()]
+    vertices = vertices_of(head) * signs[space[1].decode()]
     [markup] = json.loads((folder / "landmarks.mrk.json").read_text())["markups"]
     sign = np.array(signs[markup["coordinateSystem"]])
     return vertices, {point["label"]: sign * point["position"] for point in markup["controlPoints"]}
@@ -93,7 +99,7 @@ def test_a_moved_rig_gives_the_same_patient(tmp_path: Path) -> None:
     write_patient_files(tmp_path / "a", HERE, frame_of("frankfurt", "LPS"))
     there = moved(HERE, MOVED)
     write_patient_files(tmp_path / "b", there, frankfurt_axes(there.measured, "LPS"))
-    first, second = (trimesh.load(tmp_path / name / "head.ply", process=False).vertices for name in "ab")
+    first, second = (vertices_of(tmp_path / name / "head.ply") for name in "ab")
     np.testing.assert_allclose(first, second, atol=2e-4)
     frame = json.loads((tmp_path / "b" / "frame.json").read_text())
     matrix = np.array(frame["patient_from_world"])

@@ -90,6 +90,7 @@ def test_files_of_slicer_lead_there_and_back(tmp_path: Path) -> None:
     matrix = np.array(document["patient_from_world"])
     moved = HEAD.measured.mesh_world.vertices @ matrix[:3, :3].T + matrix[:3, 3]
     written = trimesh.load(tmp_path / "out" / "head.ply", process=False)
+    assert isinstance(written, trimesh.Trimesh)
     np.testing.assert_allclose(written.vertices, moved, atol=1e-4)
     assert b"comment SPACE=RAS" in (tmp_path / "out" / "residual.ply").read_bytes()[:200]
     assert json.loads((tmp_path / "out" / "registration.json").read_text())["surface"]["axes"] == "RAS"
