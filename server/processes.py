@@ -13,6 +13,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from rig.progress import Progress
+
 M_ARENA_MAX = -8  # of malloc.h
 PR_SET_PDEATHSIG = 1  # of sys/prctl.h
 SERVER = __package__ or "server"  # "eigenhead.server" in the wheel
@@ -47,6 +49,29 @@ def share_one_heap() -> None:
 
     with suppress(AttributeError):
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)
+
+
+def give_freed_memory_back() -> None:
+    """Gives the system the pages of this process's heap that nothing uses any more, if the C library is glibc, in
+    milliseconds.
+
+    By itself glibc keeps what arrays have freed below others that still live: 270 MB after a job's depth maps.
+    """
+    import ctypes
+
+    with suppress(AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def tidied(report: Progress) -> Progress:
+    """Returns ``report`` as a job takes it that gives freed memory back whenever a stage begins."""
+
+    def tell(stage: str, fraction: float) -> None:
+        if not fraction:
+            give_freed_memory_back()
+        report(stage, fraction)
+
+    return tell
 
 
 def process_identity() -> tuple[str, str, int, int]:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from server.processes import share_one_heap
+from server.processes import share_one_heap, tidied
 from server.tasks.child import Report, WorkerContext
 
 DONE = "done"  # the pipeline's last word, when nothing is written yet
@@ -84,7 +84,7 @@ def reconstruct_capture(
             head_model,
             chosen,
             renderer,
-            tell,
+            tidied(tell),
             once,
             device=matching_device(context, chosen, renderer),
             read_original=full_size_pictures(Path(capture), Path(capture)) if chosen.detail == "pores" else None,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from rig.formats.captures.archive import extract_archive
 from rig.progress import Progress
-from server.processes import end_with_parent, share_one_heap
+from server.processes import end_with_parent, share_one_heap, tidied
 from server.tasks.child import WorkerContext
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def reconstruct_folder(
         head_model,
         chosen,
         renderer,
-        report,
+        tidied(report),
         segment,
         device=device,
         read_original=full_size_pictures(folder, kept) if chosen.detail == "pores" else None,

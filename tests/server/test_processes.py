@@ -96,3 +96,30 @@ def test_a_child_has_the_variables_that_it_was_given() -> None:
 
 def thread_variable(context: WorkerContext, report: Progress) -> str:
     return os.environ["EIGENHEAD_THREADS"]
+
+
+def test_freed_memory_is_given_back_when_a_stage_begins() -> None:
+    """Below arrays that still live, where glibc keeps it."""
+    done = subprocess.run(
+        [sys.executable, "-c", FREEING], cwd=ROOT, capture_output=True, text=True, timeout=20, check=True
+    )
+    before, within, after = map(int, done.stdout.split())
+    assert within == pytest.approx(before, abs=1.0)
+    assert after < before - 20.0
+
+
+FREEING = """
+from pathlib import Path
+from server.processes import share_one_heap, tidied
+
+def held_mb():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4 // 1024
+
+share_one_heap()
+arrays = [bytearray(100_000) for _ in range(400)]
+arrays = arrays[::40]
+report = tidied(lambda stage, share: print(held_mb()))
+print(held_mb())
+report("depth", 0.5)
+report("fine", 0.0)
+"""
