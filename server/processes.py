@@ -55,7 +55,7 @@ def give_freed_memory_back() -> None:
     """Gives the system the pages of this process's heap that nothing uses any more, if the C library is glibc, in
     milliseconds.
 
-    By itself glibc keeps what arrays have freed below others that still live: 270 MB after a job's depth maps.
+    By itself glibc keeps what arrays have freed below others that still live: 110 MB after a default job's depth maps.
     """
     import ctypes
 
