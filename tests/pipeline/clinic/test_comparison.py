@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from pipeline.clinic.comparison import compare
 from pipeline.clinic.comparison_files import FILES, write_comparison
 from pipeline.evidence.measurements import Measurement
 from pipeline.verification.pictures import UNTOLD
 from rig.errors import InputError
+from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.pictures.images import read_image
 from rig.mesh import Mesh
 from tests.support.measured_heads import LEVEL, mannequin, model
@@ -116,10 +116,9 @@ def test_the_files_hold_what_was_found(tmp_path: Path) -> None:
     assert float(rows["face"]["volume_ml"]) == pytest.approx(found.regions["face"].volume_ml, abs=1e-4)
     rows = {row["measurement"]: row for row in csv.DictReader((tmp_path / "measurements.csv").open())}
     assert (rows["nose_breadth"]["sure"], rows["face_height"]["std_mm"]) == ("false", "")
-    mesh = trimesh.load(tmp_path / "difference.ply", process=False)
-    assert isinstance(mesh, trimesh.Trimesh)
-    assert isinstance(mesh.visual, trimesh.visual.ColorVisuals)
-    colours = np.asarray(mesh.visual.vertex_colors)[:, :3]
+    coloured = read_mesh(tmp_path / "difference.ply").colours
+    assert coloured is not None
+    colours = np.asarray(coloured)
     grey = (colours == UNTOLD).all(axis=1)
     np.testing.assert_array_equal(~grey, found.changed)
     top = colours[row_of("zygion_left")].astype(int)
