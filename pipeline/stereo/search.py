@@ -24,11 +24,11 @@ from rig.camera import Camera
 # 4.2 mm a pixel, left 21 % of the face 2 mm off, half of it leaves 14 % (an oily head, noise of 6 levels).
 SEARCH_PIXEL_MM = 2.1
 FIRST_LEVELS = (1, 2)  # half and quarter of the photographs' size
-# Costs are 1 minus a correlation. A step of one label is a slope that the room's bounds do not have; a wider step is an
-# edge, which three or four pixels of clear texture pay for.
 WIDE_MM = 60.0  # of a range: nothing but the hull bounds it. The fitted head's slopes are better than found ones
 AROUND_PX = 3.0  # sigma of the window over which slopes are found: 6 mm. With 4 and 6 less of all is right
 EVEN_PX2 = 0.5  # variance of places that is added: a single line of pixels has no slope across
+# Costs are 1 minus a correlation. A step of one label is a slope that the room's bounds do not have; a wider step is an
+# edge, which three or four pixels of clear texture pay for.
 STEP_COST, EDGE_COST = np.float32(0.1), np.float32(0.8)
 
 
@@ -53,10 +53,9 @@ def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange], setting
     def work(view: int) -> Field:
         room, matcher = depth_ranges[view], matching.matcher(view)
         strides = label_strides(room, settings)
-        for _ in range(2):
-            field = _cheapest(matcher.sweep(room, strides, settings.labels), room, strides)
-            room = slanted(room, field, float(matching.stack.lens[view, 0]))
-        return field
+        field = _cheapest(matcher.sweep(room, strides, settings.labels), room, strides)
+        room = slanted(room, field, float(matching.stack.lens[view, 0]))
+        return _cheapest(matcher.sweep(room, strides, settings.labels), room, strides)
 
     return map_in_threads(work, len(matching.stack))
 
@@ -77,7 +76,7 @@ def slopes_around(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w
     """Returns the slopes (mm a pixel, by x and y) of the plane that fits the depths around each pixel best. Depths of 0
     are unknown; one at least is known."""
     live = depth > 0.0
-    row, column = np.indices(depth.shape, dtype=np.float64)
+    row, column = np.mgrid[: depth.shape[0], : depth.shape[1]].astype(np.float64)
     known, height = live.astype(np.float64), np.where(live, depth - depth[live].mean(), 0.0)
     total = np.maximum(cv2.GaussianBlur(known, (0, 0), AROUND_PX), 1e-12)
 
