@@ -38,10 +38,12 @@ def test_depth_of_a_scan_is_precise_and_states_its_deviation() -> None:
 def test_smooth_skin_leaves_no_chance_matches() -> None:
     """An oily, path-traced head as it was photographed, highlights and all: what is told of it lies on the surface, and
     much is told. With chance matches left in, 93.5 % and 72.3 %; without those that the surface encloses 94.1 % and
-    75.0 %. (Without those at outlines and beside each other 94.8 % and 75.4 %, and 6 % of draw-b's clothes go.)"""
+    75.0 %, and searched twice 93.8 % and 75.5 %: of 1,000 pixels 708 are told and true for 706. (Without those at
+    outlines and beside each other 94.8 % and 75.4 %, and 6 % of draw-b's clothes went.)"""
     precise, known_share = smooth_skin(1.0, 0.0)
-    assert precise > 0.938
-    assert known_share > 0.745
+    assert precise > 0.937
+    assert known_share > 0.75
+    assert precise * known_share > 0.706
 
 
 @pytest.mark.slow
