@@ -70,7 +70,7 @@ def read_measured(folder: Path, model: HeadModel, name: str) -> Measured:
         rotation = np.array(place["rotation"], float)
         translation = place["scale"] * np.array(place["translation"], float)
         codes = tuple(str(warning["code"]) for warning in report["warnings"])
-        expression = {str(each["name"]): float(each["weight"]) for each in report["expression"]}
+        expression = {str(each["name"]): float(each["weight"]) for each in report.get("expression", ())}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{name}/report.json", [f"is no report that can be read ({error!r})"]) from error
     return Measured(
