@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from pipeline.results.overlays import Resized
-from pipeline.results.pdf_page import BAD, FAINT, LINE_MM, MARGIN_MM, PdfPage, jpeg_of
+from pipeline.results.pdf_page import BAD, FAINT, LINE_MM, MARGIN_MM, PdfPage
 from pipeline.verification.pictures import legend
 
 PANEL_MM = 50.0  # width of a picture: three rows leave room for the notes
@@ -75,18 +75,9 @@ def _pictures_page(pdf: PdfPage, document: Mapping[str, Any], rows: Sequence[tup
     pdf.line_of("Both visits, and what changed", size=14, bold=True)
     for title, row in rows:
         pdf.line_of(title, bold=True)
-        width = PANEL_MM
-        top, height = pdf.get_y(), width * row[0].shape[0] / row[0].shape[1]
-        for column, image in enumerate(row):
-            pdf.image(jpeg_of(image), x=MARGIN_MM + column * width, y=top, w=width)
-        pdf.set_y(top + height)
-    top, end = pdf.get_y() + 1, document["scale_end_mm"]
-    pdf.image(jpeg_of(legend()), x=MARGIN_MM + 39, y=top, w=100, h=4)
-    pdf.set_y(top + 4)
-    pdf.set_font("Helvetica", size=8)
-    for share, text in ((0.0, f"-{end:g} mm inside"), (0.5, "0"), (1.0, f"+{end:g} mm outside")):
-        pdf.set_x(MARGIN_MM + 39 + 100 * share - 20)
-        pdf.cell(40, LINE_MM, text, align="C")
-    pdf.ln(LINE_MM + 1)
+        pdf.pictures_of(row, PANEL_MM)
+    pdf.ln(1)
+    end = document["scale_end_mm"]
+    pdf.scale_of(legend(), (f"-{end:g} mm inside", f"+{end:g} mm outside"))
     for note in NOTES:
         pdf.line_of(note.format(sure=document["sure"]), size=7.5, ink=FAINT)

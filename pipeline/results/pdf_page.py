@@ -27,6 +27,24 @@ class PdfPage(FPDF):
         self.set_text_color(*ink)
         self.multi_cell(WIDTH_MM, LINE_MM * size / 9, latin(text), align="L", new_x="LMARGIN", new_y="NEXT")
 
+    def pictures_of(self, row: Sequence[Resized], width_mm: float) -> None:
+        """Draws pictures side by side, each ``width_mm`` wide, and goes below them."""
+        top, height = self.get_y(), width_mm * row[0].shape[0] / row[0].shape[1]
+        for column, image in enumerate(row):
+            self.image(jpeg_of(image), x=MARGIN_MM + column * width_mm, y=top, w=width_mm)
+        self.set_y(top + height)
+
+    def scale_of(self, legend: Resized, ends: tuple[str, str]) -> None:
+        """Draws a scale of colours with words at both of its ends and 0 in its middle, and goes below it."""
+        left, top, width = MARGIN_MM + 39, self.get_y(), 100
+        self.image(jpeg_of(legend), x=left, y=top, w=width, h=4)
+        self.set_y(top + 4)
+        self.set_font("Helvetica", size=8)
+        for share, text in ((0.0, ends[0]), (0.5, "0"), (1.0, ends[1])):
+            self.set_x(left + width * share - 20)
+            self.cell(40, LINE_MM, text, align="C")
+        self.ln(LINE_MM + 1)
+
     def table_of(
         self, header: Sequence[str], rows: Sequence[Sequence[str]], widths_mm: Sequence[float], inks: dict[int, tuple]
     ) -> None:

@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from pipeline.results.pdf_page import BAD, FAINT, GOOD, LINE_MM, MARGIN_MM, WIDTH_MM, PdfPage, jpeg_of
+from pipeline.results.pdf_page import BAD, FAINT, GOOD, LINE_MM, MARGIN_MM, WIDTH_MM, PdfPage
 from pipeline.verification.judgement import FORM_SHARE, Judgement
 from pipeline.verification.limits import Check
 from pipeline.verification.pictures import AZIMUTHS_DEG, Pictures, legend
@@ -130,17 +130,7 @@ def _pictures_page(pdf: PdfPage, pictures: Pictures) -> None:
         ("Error that all captures have in common, mm (grey: not judged)", pictures.error),
     ):
         pdf.line_of(title, bold=True)
-        top, height = pdf.get_y(), width * row[0].shape[0] / row[0].shape[1]
-        for column, image in enumerate(row):
-            pdf.image(jpeg_of(image), x=MARGIN_MM + column * width, y=top, w=width)
-        pdf.set_y(top + height)
-    top = pdf.get_y()
-    pdf.image(jpeg_of(legend()), x=MARGIN_MM + 39, y=top, w=100, h=4)
-    pdf.set_y(top + 4)
-    pdf.set_font("Helvetica", size=8)
-    for share, text in ((0.0, f"-{pictures.end_mm:g} inside"), (0.5, "0"), (1.0, f"+{pictures.end_mm:g} outside")):
-        pdf.set_x(MARGIN_MM + 39 + 100 * share - 20)
-        pdf.cell(40, LINE_MM, text, align="C")
-    pdf.ln(LINE_MM + 1)
+        pdf.pictures_of(row, width)
+    pdf.scale_of(legend(), (f"-{pictures.end_mm:g} inside", f"+{pictures.end_mm:g} outside"))
     for note in NOTES:
         pdf.line_of(note, size=7.5, ink=FAINT)
