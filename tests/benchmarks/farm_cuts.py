@@ -150,7 +150,7 @@ class Farm:
         query = "SELECT count(*) FROM dbos.workflow_status WHERE status IN ('PENDING', 'ENQUEUED')"
         return self.database.execute(query).fetchall()[0][0]
 
-    def finish(self, timeout_s: float = 400.0) -> None:
+    def finish(self, timeout_s: float = 1200.0) -> None:
         deadline = time.monotonic() + timeout_s
         while self.under_way():
             assert time.monotonic() < deadline, self.under_way()
