@@ -13,7 +13,8 @@ silent (what was connected stays connected, nothing comes through), the others r
 same of a fourth of the jobs before anything is killed. ``lost_to``: seconds of slots that were not slept for results in
 the disturbed part, by cause: ``starting``, from a kill to the heartbeat of the next process; ``begun_again``, what was
 slept for jobs whose worker was killed then; the rest are cuts, children that start, steps around a job and the last
-jobs. ``taken_over_s``: from a kill until another worker goes on with a job, the median.
+jobs. ``taken_over_s``: from a kill until another worker goes on with a job, the median. ``connections``: of all to the
+database, before anything is killed.
 """
 
 import json
@@ -33,6 +34,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import httpx
 import psycopg
@@ -49,6 +51,8 @@ SEED = 37
 BLOCK = 1 << 16
 STARTED = "SELECT started FROM eigenhead_workers ORDER BY started"
 BEGUN = """SELECT job_id, at FROM eigenhead_events WHERE document::json ->> 'stage' = 'read' ORDER BY job_id, at"""
+CONNECTIONS = "SELECT count(*) FROM pg_stat_activity WHERE backend_type = 'client backend'"
+MORE_CONNECTIONS = "-c max_connections=400"
 NOW = "SELECT extract(epoch FROM clock_timestamp())"
 ENDED = """SELECT count(*) FILTER (WHERE ends = 0), count(*) FILTER (WHERE ends > 1) FROM
            (SELECT job.job_id, count(event.seq) AS ends FROM eigenhead_job_index job LEFT JOIN eigenhead_events event
@@ -144,7 +148,13 @@ class Farm:
 
     def submit(self, capture: str, jobs: int, seconds: float) -> list[str]:
         wanted = {"capture_id": capture, "settings": {"front": f"{seconds:g}"}}
-        return [self.client.post("/v1/jobs", json=wanted).raise_for_status().json()["id"] for _ in range(jobs)]
+        return [self._submit(wanted, str(uuid4())) for _ in range(jobs)]
+
+    def _submit(self, wanted: dict[str, Any], key: str) -> str:
+        """Until it is accepted, as a client does; the key makes it one job."""
+        while (said := self.client.post("/v1/jobs", json=wanted, headers={"Idempotency-Key": key})).status_code == 503:
+            time.sleep(float(said.headers["Retry-After"]))
+        return said.raise_for_status().json()["id"]
 
     def under_way(self) -> int:
         query = "SELECT count(*) FROM dbos.workflow_status WHERE status IN ('PENDING', 'ENQUEUED')"
@@ -194,7 +204,10 @@ class Farm:
 def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, folder: Path) -> dict[str, Any]:
     with ExitStack() as stack:
         os.environ.update(KEYS)
-        database_url, store = stack.enter_context(running_postgres()), stack.enter_context(running_object_server())
+        database_url, store = (
+            stack.enter_context(running_postgres(MORE_CONNECTIONS)),
+            stack.enter_context(running_object_server()),
+        )
         bucket = client_of(store)
         bucket.create_bucket(Bucket="heads")
         settings: dict[str, Any] = {
@@ -221,6 +234,7 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         farm.submit(capture, jobs // 4, seconds)
         farm.finish()
         undisturbed_s = time.monotonic() - began
+        ((connections,),) = database.execute(CONNECTIONS).fetchall()
         began = time.monotonic()
         ids = farm.submit(capture, jobs, seconds)
         farm.harm(kills, cuts, 0.9 * jobs * seconds / (workers * SLOTS))
@@ -242,6 +256,7 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         "kills": kills,
         "cuts": cuts,
         "states": dict(Counter(job["state"] for job in ended)),
+        "connections": connections,
         "different_results": len(files),
         "ends_never_said": unsaid,
         "ends_said_more_than_once": said_twice,
