@@ -231,8 +231,9 @@ class Jobs:
         before = self.state(job_id)
         if before not in FINISHED:
             self.client.cancel_workflow(job_id)
-            self.events.append(job_id, {"state": self.state(job_id)})
         job = self.get(job_id)
+        if job.state == "cancelled":
+            self.events.replace_end(job_id, {"state": "cancelled"})
         return job, before not in FINISHED and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
