@@ -254,6 +254,7 @@ def simulate(
         typer.Option(help="NAME[,NAME] of what real photographs have: smooth, oily, scattering, mosaic, jpeg; or all."),
     ] = None,
     no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
+    polarised: Annotated[bool, typer.Option("--polarised", help="Also the texture sets cross and parallel.")] = False,
     expression: Annotated[
         list[str] | None,
         typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
@@ -276,7 +277,8 @@ def simulate(
     --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
     given) with which the rig commands and the service work as with a real rig."""
     chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
-    preset = _studio_preset(realism, hair=not no_hair, hairstyle=tuple(hair.split(",")) if hair else (), **chosen)
+    hairstyle = tuple(hair.split(",")) if hair else ()
+    preset = _studio_preset(realism, hair=not no_hair, hairstyle=hairstyle, polarised=polarised, **chosen)
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
                       faults=fault or [], expression=expression or [])  # fmt: skip

@@ -415,6 +415,8 @@ export default {
   "no-chart": "kein Leerbild zeigt einen lesbaren ColorChecker Classic; die Farben sind deshalb die der Kameras: ein Bild mit der Tafel, näher, schärfer oder aus der Spiegelung einer Lampe gedreht, nach background/<Kamera>/ legen",
   "no-albedo": "{reason}",
   "picture-gone": "{camera}: Es gibt kein Bild mehr",
+  "texture-sets-exchanged": "texture_sets/cross zeigt die Glanzlichter, texture_sets/parallel nicht: die Namen der Ordner vertauschen",
+  "texture-sets-unused": "die Textursätze {sets} färben nichts: der Kopf hat keine Textur",
   "no-pores": "es gibt keine Karten der Poren: Sie brauchen eine Textur und die Dateien der Fotos",
   "pieces-apart": "Stücke von {share:.1%} der Fläche der Person stehen abseits und werden weggelassen: Hat sich seit dem Leerbild etwas bewegt, oder passt die Kleidung zum Hintergrund?",
   "outline-weak": "{share:.0%} der Kontur heben sich kaum vom Hintergrund ab: Hintergrund oder Kleidung wechseln",
