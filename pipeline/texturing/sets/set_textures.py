@@ -30,7 +30,7 @@ from rig.colour_space import srgb_from_linear
 from rig.image import ImageRgb
 from rig.mesh import Mesh
 
-SIZE_MOST = 4096  # sets are read at work size, whose pixels no finer texels are worth
+MAX_SIZE = 4096  # sets are read at work size, whose pixels no finer texels are worth
 
 
 @traced

@@ -33,7 +33,7 @@ NORMAL_SHARE = 0.04  # of light at right angles that glTF's material mirrors (in
 REDUCED = 4  # pixels that become one, to calm the noise before colours are compared
 CLIPPED = 0.95  # linear: brighter pixels do not tell how bright
 MIN_COLOUR = 0.01  # linear, mean difference between channels, below which a picture tells no exposure
-EXCHANGED, EXCHANGED_LEAST = (
+EXCHANGED, MIN_EXCHANGED = (
     2.0,
     0.002,
 )  # negative by positive light, and the former's mean (linear): noise has 1 and less
@@ -154,6 +154,6 @@ def specular_light(
     in_threads(-(-size // STRIP_ROWS), work)
     above, below = (float(np.maximum(sign * light, 0.0).mean()) for sign in (1.0, -1.0))
     covered = max(float((shown >= 0).mean()), 1e-9)
-    exchanged = below > EXCHANGED * above and below / covered > EXCHANGED_LEAST
+    exchanged = below > EXCHANGED * above and below / covered > MIN_EXCHANGED
     spread = spread_texels(np.maximum(light, 0.0), shown >= 0)
     return Specular(spread.astype(np.float16), exposure, below / max(above, 1e-12), exchanged)

@@ -8,7 +8,7 @@ from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision
 from pipeline.texturing.layout.model_layout import ModelLayout
 from pipeline.texturing.layout.uv_unwrap import Atlas
-from pipeline.texturing.sets.set_textures import SIZE_MOST, set_texture
+from pipeline.texturing.sets.set_textures import MAX_SIZE, set_texture
 from pipeline.texturing.sets.specular import Specular, specular_light
 from pipeline.warnings import ReportWarning
 from rig.image import ImageRgb
@@ -50,7 +50,7 @@ def colour_by_sets(
         mesh_world: the head, mm.
         silhouettes: by camera.
         layout: of the head.
-        atlas: the head's texture, whose size these get, up to ``SIZE_MOST``.
+        atlas: the head's texture, whose size these get, up to ``MAX_SIZE``.
         settings: of the texture.
 
     Returns:
@@ -60,7 +60,7 @@ def colour_by_sets(
         return None, []
     if decision is None or layout is None or atlas is None:
         return None, [compose("texture-sets-unused", sets=[*sets])]
-    size = min(len(atlas.image), SIZE_MOST)
+    size = min(len(atlas.image), MAX_SIZE)
     painted = {
         name: set_texture(images, decision, mesh_world, silhouettes, layout, size=size, settings=settings)
         for name, images in sets.items()
