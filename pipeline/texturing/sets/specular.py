@@ -37,6 +37,9 @@ EXCHANGED, MIN_EXCHANGED = (
     2.0,
     0.002,
 )  # negative by positive light, and the former's mean (linear): noise has 1 and less
+COLOUR_SIDE = 128  # texels of the image of the lamps' colours: 4 mm on a head
+MIN_MIRRORED = 0.004  # linear; less light is taken for grey
+MAX_TINT = 2.0  # of a channel by the mean
 STRIP_ROWS = 256
 
 
@@ -152,8 +155,23 @@ def specular_light(
             light[row : row + STRIP_ROWS] /= total[:, :, None]
 
     in_threads(-(-size // STRIP_ROWS), work)
-    above, below = (float(np.maximum(sign * light, 0.0).mean()) for sign in (1.0, -1.0))
+    strength = light.mean(axis=2)
+    above, below = (float(np.maximum(sign * strength, 0.0).mean()) for sign in (1.0, -1.0))
     covered = max(float((shown >= 0).mean()), 1e-9)
     exchanged = below > EXCHANGED * above and below / covered > MIN_EXCHANGED
-    spread = spread_texels(np.maximum(light, 0.0), shown >= 0)
+    coloured = np.maximum(strength, 0.0)[:, :, None] * _lamp_colour(light)
+    spread = spread_texels(coloured, shown >= 0)
     return Specular(spread.astype(np.float16), exposure, below / max(above, 1e-12), exchanged)
+
+
+def _lamp_colour(light: Float32[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "s s 3"]:
+    """The colour of mirrored light around each texel, of mean 1: it is the lamps', so that what differs from texel to
+    texel is noise."""
+    size = len(light)
+    coarse = cv2.resize(light, (COLOUR_SIDE, COLOUR_SIDE), interpolation=cv2.INTER_AREA)
+    coarse = cv2.GaussianBlur(coarse, (0, 0), 1.0)
+    mean = coarse.mean(axis=2, keepdims=True)
+    colour = np.where(mean > MIN_MIRRORED, coarse / np.maximum(mean, MIN_MIRRORED), np.float32(1.0))
+    colour = np.clip(colour, 1 / MAX_TINT, MAX_TINT)
+    colour /= colour.mean(axis=2, keepdims=True)
+    return cv2.resize(colour, (size, size), interpolation=cv2.INTER_LINEAR)
