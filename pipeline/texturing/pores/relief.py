@@ -125,8 +125,8 @@ def log_light(codes: np.ndarray) -> Float32[np.ndarray, "r s"]:
 def without_slow(light: Float32[np.ndarray, "r s"], side: int) -> Float32[np.ndarray, "r s"]:
     """Returns a strip without what is wider than a third of a patch, whose edges would leak into all waves.
 
-    So wide a Gaussian is computed on fewer texels: in a texture of 8192 that takes a fiftieth of the time, and strips of
-    noise differ by 0.3 % of their spread at most."""
+    So wide a Gaussian is computed on fewer texels: in a texture of 8192 that takes a fiftieth of the time, and strips
+    of noise differ by 0.3 % of their spread at most."""
     height, width = light.shape
     step = max(side // BLURRED_SIDE, 1)
     coarse = cv2.resize(light, (width // step, height // step), interpolation=cv2.INTER_AREA)
