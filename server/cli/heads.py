@@ -270,15 +270,12 @@ def simulate(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Take a capture with the simulated studio.
-
-    The truth is written beside it.
+    """Take a capture with the simulated studio; the truth is written beside it.
 
     --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
     given) with which the rig commands and the service work as with a real rig."""
     chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
-    hairstyle = tuple(hair.split(",")) if hair else ()
-    preset = _studio_preset(realism, hair=not no_hair, hairstyle=hairstyle, polarised=polarised, **chosen)
+    preset = _studio_preset(realism, hair, has_hair=not no_hair, polarised=polarised, **chosen)
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
                       faults=fault or [], expression=expression or [])  # fmt: skip
@@ -297,7 +294,7 @@ def simulate(
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
 
 
-def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
+def _studio_preset(realism: str | None, hairstyles: str | None, *, has_hair: bool, **chosen: Any) -> "Preset":
     """Returns the studio's preset with the chosen values. Raises typer.BadParameter for an unknown name in
     ``realism``."""
     from dataclasses import replace
@@ -305,9 +302,15 @@ def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
     from rig.studio.sensor.preset import PRESET
     from rig.studio.sensor.realism import made_real, realism_names
 
+    styles = tuple(hairstyles.split(",")) if hairstyles else ()
     with wrong_usage("--realism"):
         return made_real(
-            replace(PRESET, **{key: value for key, value in chosen.items() if value is not None}),
+            replace(
+                PRESET,
+                hair=has_hair,
+                hairstyle=styles,
+                **{key: value for key, value in chosen.items() if value is not None},
+            ),
             realism_names(realism),
         )
 

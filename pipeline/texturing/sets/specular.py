@@ -157,11 +157,10 @@ def specular_light(
     in_threads(-(-size // STRIP_ROWS), work)
     strength = light.mean(axis=2)
     above, below = (float(np.maximum(sign * strength, 0.0).mean()) for sign in (1.0, -1.0))
-    covered = max(float((shown >= 0).mean()), 1e-9)
-    exchanged = below > EXCHANGED * above and below / covered > MIN_EXCHANGED
+    exchanged = below > EXCHANGED * above and below > MIN_EXCHANGED * float((shown >= 0).mean())
     coloured = np.maximum(strength, 0.0)[:, :, None] * _lamp_colour(light)
-    spread = spread_texels(coloured, shown >= 0)
-    return Specular(spread.astype(np.float16), exposure, below / max(above, 1e-12), exchanged)
+    stored = spread_texels(coloured, shown >= 0).astype(np.float16)
+    return Specular(stored, exposure, below / max(above, 1e-12), exchanged)
 
 
 def _lamp_colour(light: Float32[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "s s 3"]:

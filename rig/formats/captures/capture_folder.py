@@ -190,31 +190,17 @@ def read_shot(
         faults += files.faults
     jobs = [(kind, camera.name, path) for camera in rig for kind, path in files.of_camera(camera.name)]
     bits, levels = _sample_bits(jobs, faults)
-    with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
-        decoded = list(
-            pool.map(
-                lambda job: decode_picture(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]]), jobs
-            )
-        )
-    images: dict[str, np.ndarray] = {}
-    masks: dict[str, tuple[str, np.ndarray]] = {}
+    pictures, digests = _decoded(folder, jobs, rig, faults, pixels_most=pixels_most, bits=bits)
+    images = {name: pixels for name, _, pixels in pictures.get("images", ())}
+    masks = {name: (where, pixels) for name, where, pixels in pictures.get("masks", ())}
     backgrounds: dict[str, list[np.ndarray]] = {}
-    sets: dict[str, dict[str, np.ndarray]] = {}
-    digests: dict[str, str] = {}
-    for (kind, name, path), (pixels, digest, fault) in zip(jobs, decoded, strict=True):
-        if pixels is None:
-            assert fault is not None
-            faults.append(fault)
-            continue
-        digests[path.relative_to(folder).as_posix()] = digest
-        if kind == "images":
-            images[name] = pixels
-        elif kind == "masks":
-            masks[name] = path.relative_to(folder).as_posix(), pixels
-        elif kind == "background":
-            backgrounds.setdefault(name, []).append(pixels)
-        else:
-            sets.setdefault(kind.removeprefix(f"{TEXTURE_SETS}/"), {})[name] = pixels
+    for name, _, pixels in pictures.get("background", ()):
+        backgrounds.setdefault(name, []).append(pixels)
+    sets = {
+        kind.removeprefix(f"{TEXTURE_SETS}/"): {name: pixels for name, _, pixels in of_set}
+        for kind, of_set in pictures.items()
+        if kind.startswith(TEXTURE_SETS)
+    }
     features: Features = {}
     if with_features and (folder / "features.json").is_file():
         data = (folder / "features.json").read_bytes()
@@ -235,6 +221,35 @@ def read_shot(
         subjects.soft,
         sets,
     )
+
+
+def _decoded(
+    folder: Path,
+    jobs: Sequence[tuple[str, str, Path]],
+    rig: Rig,
+    faults: list[Message],
+    *,
+    pixels_most: int | None,
+    bits: Mapping[str, int],
+) -> tuple[dict[str, list[tuple[str, str, np.ndarray]]], dict[str, str]]:
+    """Returns camera, file and pixels of every picture that can be read, by kind, and the SHA-256 of the files."""
+
+    def decode(job: tuple[str, str, Path]) -> tuple[np.ndarray | None, str, Message | None]:
+        return decode_picture(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]])
+
+    with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
+        decoded = list(pool.map(decode, jobs))
+    pictures: dict[str, list[tuple[str, str, np.ndarray]]] = {}
+    digests: dict[str, str] = {}
+    for (kind, name, path), (pixels, digest, fault) in zip(jobs, decoded, strict=True):
+        where = path.relative_to(folder).as_posix()
+        if pixels is None:
+            assert fault is not None
+            faults.append(fault)
+            continue
+        digests[where] = digest
+        pictures.setdefault(kind, []).append((name, where, pixels))
+    return pictures, digests
 
 
 def _cut_outs(
