@@ -8,6 +8,8 @@ TEMPLATES = {
     "view-left-out": "{remark}",
     "mask-doubtful": "{camera}: {remark}",
     "no-texture-layout": "{reason}",
+    "texture-sets-exchanged": "texture_sets/cross shows the highlights and texture_sets/parallel does not: exchange the folders' names",
+    "texture-sets-unused": "the texture sets {sets} colour nothing: the head has no texture",
     "no-pores": "there are no maps of the pores: they need a texture, and the pictures' files",
     "view-unused": "{remark}; the view is left out",
     "eyes-closed": "{eyes} closed: no white and no iris in the photographs, or lids that meet",
