@@ -89,14 +89,16 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
     blend = np.where(votes.weight < 0, UNDECIDED_BLEND_MM, BLEND_MM)
     pull = np.where(unseen, (grid.step_mm / blend) ** 2, DATA_WEIGHT * votes.weight).astype(np.float32)
     field = np.where(grid.outer, start, np.maximum(target, votes.bound)).astype(np.float32)
-    fixed = grid.outer | (votes.bound >= reach)
-    membrane = Membrane(target, pull, votes.bound, fixed)
+    free, odd = ~grid.outer & (votes.bound < reach), (np.bitwise_xor.reduce(grid.index, axis=1) & 1) == 1
+    colours = [np.flatnonzero(free & ~odd).astype(np.int32), np.flatnonzero(free & odd).astype(np.int32)]
+    membrane = Membrane(target, pull, votes.bound)
     for sweep in range(2 * sweeps):
+        rows = colours[sweep % 2]
 
-        def sweep_nodes(first: int, last: int, parity: int = sweep % 2) -> None:
-            relax(field, membrane, grid.index, grid.neighbours, parity, factor, first, last)
+        def sweep_nodes(first: int, last: int, rows: np.ndarray = rows) -> None:
+            relax(field, membrane, rows, grid.neighbours, factor, first, last)
 
-        in_threads(len(grid), sweep_nodes)
+        in_threads(len(rows), sweep_nodes)
     return Level(grid, field, votes.weight)
 
 
