@@ -20,6 +20,19 @@ def _detail_levels() -> tuple[str, ...]:
     return "span", "kernel", "photo", "fine"
 
 
+Only = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="people: rows of this rig (front-3, circle-24), evidence (plates, masks, neither) or subject alone; "
+        "or eyes. growth: views or pixels alone. wrap, hair-shell: this capture alone. May be repeated."
+    ),
+]
+Realism = Annotated[
+    str | None,
+    typer.Option(help="hidden, visible: the studio's heads once more with these names of simulate --realism."),
+]
+
+
 @app.command(epilog="Example: eigenhead experiments limit --subjects 3 --json")
 def experiments(
     name: Annotated[
@@ -47,18 +60,9 @@ def experiments(
     ] = None,
     captures: Annotated[bool, typer.Option(help="hidden, visible, texture: the captures of --shared, too.")] = False,
     openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="people: rows of this rig (front-3, circle-24), evidence (plates, masks, neither) or subject alone; "
-            "or eyes. growth: views or pixels alone. wrap, hair-shell: this capture alone. May be repeated."
-        ),
-    ] = None,
+    only: Only = None,
     detail: Annotated[str | None, chosen("people: span, kernel, photo or fine (the default).", _detail_levels)] = None,
-    realism: Annotated[
-        str | None,
-        typer.Option(help="hidden, visible: the studio's heads once more with these names of simulate --realism."),
-    ] = None,
+    realism: Realism = None,
     front: Annotated[str | None, typer.Option(help="real: the view that the subject faces.")] = None,
     outlines: Annotated[
         Path | None, typer.Option(help="real: outlines drawn by hand, outlines.json.", exists=True, dir_okay=False)
