@@ -49,6 +49,8 @@ WARNING_CODES = (
     "scale-implausible",
     "shape-implausible",
     "size-unusual",
+    "texture-sets-exchanged",
+    "texture-sets-unused",
     "unknown-key",
     "view",
     "view-left-out",

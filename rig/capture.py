@@ -14,6 +14,8 @@ from rig.messages.message import Message
 
 Content = TypeVar("Content")
 
+TEXTURE_SETS = "texture_sets"  # a capture's folder of them
+
 
 ReadImage = Callable[[str], ImageRgb]
 """Reads once more, at the size of its file, the picture that is filed under a camera's name. Raises InputError."""
@@ -28,7 +30,7 @@ class Capture:
     ``images`` are the photographs by camera (RGB), ``backgrounds`` the clean plates, ``masks`` ready-made masks (True =
     subject); ``soft_masks`` give the subject's share of each pixel, 0 to 255, for masks with soft edges. ``features``
     are feature points (px) by landmark and camera. ``digests`` are the sha256 of all files read, ``remarks`` the
-    warnings of the reader."""
+    warnings of the reader. ``texture_sets`` are further photographs by the same cameras, by set and camera."""
 
     images: Mapping[str, ImageRgb]
     backgrounds: Mapping[str, tuple[ImageRgb, ...]] = field(default_factory=dict)
@@ -37,6 +39,7 @@ class Capture:
     digests: Mapping[str, str] = field(default_factory=dict)
     remarks: tuple[Message, ...] = ()
     soft_masks: Mapping[str, UInt8[np.ndarray, "h w"]] = field(default_factory=dict)
+    texture_sets: Mapping[str, Mapping[str, ImageRgb]] = field(default_factory=dict)
 
 
 def reassign_images(
@@ -50,8 +53,8 @@ def reassign_images(
     """Returns the capture with some of its images, masks, clean plates and points assigned to other cameras.
 
     Args:
-        pictures: for a camera, the name under which its image is stored now; its mask follows, unless ``masks`` is
-            given.
+        pictures: for a camera, the name under which its image is stored now; its pictures in texture sets follow, and
+            its mask, unless ``masks`` is given.
         plates: the same for its clean plates.
         points: the same for the feature points that were picked in its image.
         masks: the same for its mask.
@@ -67,9 +70,10 @@ def reassign_images(
         reassign(capture.backgrounds, plates),
         reassign(capture.masks, masks),
         {landmark: reassign(views, points) for landmark, views in capture.features.items()},
-        _renamed(capture.digests, {"images": pictures, "masks": masks, "background": plates}),
+        _renamed(capture.digests, {"images": pictures, "masks": masks, "background": plates, TEXTURE_SETS: pictures}),
         capture.remarks,
         reassign(capture.soft_masks, masks),
+        {name: reassign(images, pictures) for name, images in capture.texture_sets.items()},
     )
 
 
@@ -79,7 +83,7 @@ def _renamed(digests: Mapping[str, str], sources: Mapping[str, Mapping[str, str]
     for file, digest in digests.items():
         path = PurePosixPath(file)
         owner = {filed: camera for camera, filed in sources.get(path.parts[0], {}).items()}
-        if len(path.parts) > 2:
+        if len(path.parts) > 2 and path.parts[0] != TEXTURE_SETS:
             path = PurePosixPath(path.parts[0], owner.get(path.parts[1], path.parts[1]), *path.parts[2:])
         elif path.stem in owner:
             path = path.with_name(owner[path.stem] + path.suffix)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
+from rig.capture import TEXTURE_SETS
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, name_fault
 from rig.formats.captures.capture_folder import capture_root, size_fault
@@ -48,7 +49,9 @@ def find_photographs(folder: Path) -> Photographs:
     root = capture_root(folder)
     root = root / "images" if (root / "images").is_dir() else root
     flat = _pictures(root)
-    beside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name not in BESIDE_PICTURES]
+    beside = [
+        path for path in sorted(root.iterdir()) if path.is_dir() and path.name not in (*BESIDE_PICTURES, TEXTURE_SETS)
+    ]
     folders = {path.name: _pictures(path) for path in beside}
     folders = {name: files for name, files in folders.items() if files}
     if flat and folders:

@@ -1,7 +1,8 @@
 """Writes the fitted head in every format that the settings ask for.
 
 head.ply, head.obj: world frame, mm. head.glb, head.usdz: head frame, metres, y up. head.stl, head.3mf: closed, mm, z
-up. texture/albedo.png: in the layout of head.glb and head.obj, if the settings ask for it. With a texture, the first
+up. texture/albedo.png: in the layout of head.glb and head.obj, if the settings ask for it; so are the textures of
+texture sets. With a texture, the first
 vertices of head.glb are those of head.ply in the same order; the vertices on the texture's seam follow once more. With
 a normal map it has only some of them (``rows_of_ply``).
 """
@@ -16,6 +17,7 @@ from jaxtyping import UInt8
 from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.set_files import strength_png, write_set_textures
 from pipeline.results.skin_files import write_skin_maps
 from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Atlas
@@ -65,6 +67,8 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         write_atomically(folder / "texture" / "albedo.png", encoded(result.texturing.albedo.atlas, "png"))
     if atlas is not None and result.texturing.skin is not None:
         write_skin_maps(folder / "texture", atlas, result.texturing.skin)
+    if result.texturing.sets is not None:
+        write_set_textures(folder / "texture", result.texturing.sets)
     normals = result.texturing.normals @ result.head.fit.world_from_head.rotation
     if "glb" in formats:
         write_atomically(folder / "head.glb", _glb(result, head, normals))
@@ -88,17 +92,20 @@ def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
     if atlas is None:
         return glb_bytes(head, normals=normals, colours=result.texturing.vertices.colours, extras=extras)
     kind = outputs.image
-    source = atlas.layout.source
+    source, sets = atlas.layout.source, result.texturing.sets
+    strength = None if sets is None or sets.specular is None else strength_png(sets.specular)
     if outputs.skin == "albedo" and result.texturing.albedo is not None:
         atlas = result.texturing.albedo.atlas
+    elif sets is not None and sets.diffuse is not None and strength is not None:
+        atlas = sets.diffuse  # highlights come from the strength
     if result.texturing.reduced is not None:
         mapped = normal_mapped(head.vertices, normals, atlas.layout, result.texturing.reduced)
         extras["rows_of_ply"] = mapped.rows.tolist()
-        skin = Skin(mapped.uv, encoded(atlas, kind), ENCODINGS[kind][1], png(mapped.image), mapped.tangents)
+        skin = Skin(mapped.uv, encoded(atlas, kind), ENCODINGS[kind][1], png(mapped.image), mapped.tangents, strength)
         return glb_bytes(mapped.mesh, normals=mapped.normals, skin=skin, extras=extras)
     extras["repeated_vertices"] = source[len(head.vertices) :].tolist()
     opened = Mesh(head.vertices[source], atlas.layout.faces)
-    skin = Skin(atlas.layout.uv, encoded(atlas, kind), ENCODINGS[kind][1])
+    skin = Skin(atlas.layout.uv, encoded(atlas, kind), ENCODINGS[kind][1], specular=strength)
     if result.texturing.skin is not None:
         tangents = vertex_tangents(opened.vertices, normals[source], atlas.layout.uv, atlas.layout.faces)
         skin = replace(skin, normal_map=png(result.texturing.skin.normals), tangents=tangents)

@@ -26,8 +26,10 @@ from pipeline.results.report_types import (
     MorphsReport,
     PoseReport,
     Report,
+    SetsReport,
     SimilarityReport,
     SkinReport,
+    SpecularReport,
     TemplateReport,
     TextureReport,
     ViewReport,
@@ -41,6 +43,9 @@ from pipeline.texturing.chart_colours import ChartColours
 from pipeline.texturing.light import HARMONICS, Light
 from pipeline.texturing.pores.relief import LONGEST_MM, SHORTEST_MM
 from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, SkinMaps
+from pipeline.texturing.sets.specular import NORMAL_SHARE, Specular
+from pipeline.texturing.sets.texture_sets import SetTextures
+from rig.formats.meshes.glb import ROUGHNESS
 from rig.geometry import Similarity
 from rig.mesh import boundary_edges
 from rig.messages.message import documents_of, texts_of
@@ -202,6 +207,22 @@ def _texture(texturing: Texturing) -> TextureReport:
         "chart": None if texturing.chart is None else _chart(texturing.chart),
         "light": None if texturing.albedo is None else _light(texturing.albedo.light),
         "skin": None if texturing.skin is None else skin_document(texturing.skin),
+        "sets": None if texturing.sets is None else _sets(texturing.sets),
+    }
+
+
+def _sets(sets: SetTextures) -> SetsReport:
+    size = max(len(atlas.image) for atlas in sets.atlases.values())
+    specular = None if sets.specular is None else _specular(sets.specular)
+    return {"names": [*sets.atlases], "size": size, "specular": specular}
+
+
+def _specular(specular: Specular) -> SpecularReport:
+    return {
+        "exposure": dict(specular.exposure),
+        "negative": specular.negative,
+        "strength_one": NORMAL_SHARE,
+        "roughness": ROUGHNESS,
     }
 
 

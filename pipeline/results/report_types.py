@@ -154,6 +154,26 @@ class SkinReport(TypedDict):
     views: list[str]
 
 
+class SpecularReport(TypedDict):
+    """Describes texture/specular: the exposure of each camera's parallel picture by that of its crossed one, the light
+    below zero by that above before it was cut off, the share of mirrored light that is a strength of 1 in head.glb, and
+    the material's roughness, which is assumed."""
+
+    exposure: dict[str, float]
+    negative: float
+    strength_one: float
+    roughness: float
+
+
+class SetsReport(TypedDict):
+    """Describes the textures of texture sets: their names and size (texels); ``specular`` is null without both sets
+    of polarised light."""
+
+    names: list[str]
+    size: int
+    specular: SpecularReport | None
+
+
 class TextureReport(TypedDict):
     """Describes the head's colours. ``filled`` counts the vertices that no photograph coloured; ``gains`` are factors
     of linear RGB, by camera."""
@@ -164,6 +184,7 @@ class TextureReport(TypedDict):
     chart: dict[str, object] | None
     light: dict[str, object] | None
     skin: NotRequired[SkinReport | None]  # not in files of earlier versions
+    sets: NotRequired[SetsReport | None]  # not in files of earlier versions
 
 
 class DetailReport(TypedDict):

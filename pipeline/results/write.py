@@ -8,6 +8,7 @@
     head.obj head.mtl head.png, head.usdz, head.stl, head.3mf     on request (settings.outputs.formats)
     neutral.glb         on request: the head without its expression; posed.glb, with morphs to make others
     texture/            on request: albedo.png; with pores colour.png, normals.png and displacement.png
+    texture/sets/       a texture of each texture set; of polarised light texture/diffuse and texture/specular
     landmarks.mrk.json  on request: the landmarks as a point list of 3D Slicer
     head-NAME.obj       on request: the head in the vertex order of the template NAME, with its texture
     head-NAME.glb, head-NAME-shapes.npz     with morphs: that mesh without expression, with shapes and pivots

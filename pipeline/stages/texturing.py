@@ -21,6 +21,7 @@ from pipeline.texturing.layout.reduced_layout import ReducedLayout, reduced_layo
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.pores.close_views import CloseViews, read_close_views
 from pipeline.texturing.pores.skin_maps import SkinMaps, skin_maps, skin_share
+from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
 from pipeline.texturing.vertex_colours import Texture, texture
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
@@ -41,6 +42,7 @@ class Texturing:
     chart: ChartColours | None = None  # where the settings ask for it and a plate shows one
     albedo: Albedo | None = None  # where the settings ask for it and the light can be estimated
     skin: SkinMaps | None = None  # where the settings ask for pores and the pictures' files are at hand
+    sets: SetTextures | None = None  # where the capture has texture sets
 
 
 @stage("texture")
@@ -84,8 +86,17 @@ def texture_head(
     albedo, albedo_warnings = None, []
     if settings.outputs.delit:
         albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)
-    warnings = (*chart_warnings, *vertices.warnings, *layout_warnings, *albedo_warnings, *pores_warnings)
-    return Staged(Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo, skin), warnings)
+    sets, set_warnings = colour_by_sets(
+        capture.texture_sets,
+        vertices.decision,
+        mesh,
+        views.silhouettes,
+        layout,
+        atlas=atlas,
+        settings=settings.texture,
+    )
+    warnings = (*chart_warnings, *vertices.warnings, *layout_warnings, *albedo_warnings, *pores_warnings, *set_warnings)
+    return Staged(Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo, skin, sets), warnings)
 
 
 def _read_pores(

@@ -20,6 +20,7 @@ from pipeline.texturing.light import BAND_FACTORS, Light, harmonics
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
+from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig
 
@@ -64,15 +65,16 @@ def colours_of_charts(charts: Mapping[str, list[Chart]], rig: Rig) -> tuple[Char
 
 
 def with_true_colours(capture: Capture, colours: ChartColours) -> Capture:
-    """Returns the capture with the colours of its photographs corrected; its clean plates are unchanged. A camera that
-    saw no chart gets the mean correction."""
+    """Returns the capture with the colours of its photographs and texture sets corrected; its clean plates are
+    unchanged. A camera that saw no chart gets the mean correction."""
 
-    def corrected(name: str) -> UInt8[np.ndarray, "h w 3"]:
-        return in_true_colours(capture.images[name], colours.matrix_of(name))
+    def corrected(images: Mapping[str, ImageRgb]) -> dict[str, ImageRgb]:
+        names = list(images)
+        pictures = map_in_threads(lambda k: in_true_colours(images[names[k]], colours.matrix_of(names[k])), len(names))
+        return dict(zip(names, pictures, strict=True))
 
-    names = list(capture.images)
-    images = map_in_threads(lambda k: corrected(names[k]), len(names))
-    return replace(capture, images=dict(zip(names, images, strict=True)))
+    sets = {name: corrected(images) for name, images in capture.texture_sets.items()}
+    return replace(capture, images=corrected(capture.images), texture_sets=sets)
 
 
 def in_true_colours(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
+from rig.capture import TEXTURE_SETS
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file
 from rig.formats.captures.shot_files import BESIDE_PICTURES, listed_pictures
@@ -23,6 +24,7 @@ ARCHIVES = (".tar.gz", ".tgz", ".tar", ".zip")
 COLUMNS = ("capture", "name", "subject", "session", "settings")
 MIN_PICTURES = 3  # in a folder of photographs without cameras: fewer are no capture
 TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html", "sheet.pdf")  # files of OUT, which no capture may be called
+ASIDE = (*BESIDE_PICTURES, TEXTURE_SETS)  # folders of a capture that are none themselves
 MORE = "more"  # key of a row: how many cells it has beyond the columns
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 
@@ -100,7 +102,7 @@ def read_list(path: Path) -> tuple[BatchCapture, ...]:
 
 def _walk(folder: Path, out: Path) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
-        if is_junk(path.name) or path.resolve() == out or path.name.endswith(".truth") or path.name in BESIDE_PICTURES:
+        if is_junk(path.name) or path.resolve() == out or path.name.endswith(".truth") or path.name in ASIDE:
             continue
         if is_capture(path):
             yield path

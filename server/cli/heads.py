@@ -254,6 +254,7 @@ def simulate(
         typer.Option(help="NAME[,NAME] of what real photographs have: smooth, oily, scattering, mosaic, jpeg; or all."),
     ] = None,
     no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
+    polarised: Annotated[bool, typer.Option("--polarised", help="Also the texture sets cross and parallel.")] = False,
     expression: Annotated[
         list[str] | None,
         typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
@@ -269,14 +270,12 @@ def simulate(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Take a capture with the simulated studio.
-
-    The truth is written beside it.
+    """Take a capture with the simulated studio; the truth is written beside it.
 
     --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
     given) with which the rig commands and the service work as with a real rig."""
     chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
-    preset = _studio_preset(realism, hair=not no_hair, hairstyle=tuple(hair.split(",")) if hair else (), **chosen)
+    preset = _studio_preset(realism, hair, has_hair=not no_hair, polarised=polarised, **chosen)
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
                       faults=fault or [], expression=expression or [])  # fmt: skip
@@ -295,7 +294,7 @@ def simulate(
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
 
 
-def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
+def _studio_preset(realism: str | None, hairstyles: str | None, *, has_hair: bool, **chosen: Any) -> "Preset":
     """Returns the studio's preset with the chosen values. Raises typer.BadParameter for an unknown name in
     ``realism``."""
     from dataclasses import replace
@@ -303,9 +302,15 @@ def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
     from rig.studio.sensor.preset import PRESET
     from rig.studio.sensor.realism import made_real, realism_names
 
+    styles = tuple(hairstyles.split(",")) if hairstyles else ()
     with wrong_usage("--realism"):
         return made_real(
-            replace(PRESET, **{key: value for key, value in chosen.items() if value is not None}),
+            replace(
+                PRESET,
+                hair=has_hair,
+                hairstyle=styles,
+                **{key: value for key, value in chosen.items() if value is not None},
+            ),
             realism_names(realism),
         )
 

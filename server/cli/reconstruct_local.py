@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.atomic_write import write_atomically
+from rig.capture import TEXTURE_SETS
 from rig.formats.captures.capture_folder import capture_root
 from rig.formats.captures.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
@@ -90,7 +91,7 @@ def check_apart(out: Path, capture: Path, option: str = "--out") -> None:
     if not capture.is_dir():
         return
     place, whole, root = out.resolve(), capture.resolve(), capture_root(capture).resolve()
-    pictures = [root / kind for kind in ("images", *BESIDE_PICTURES)]
+    pictures = [root / kind for kind in ("images", *BESIDE_PICTURES, TEXTURE_SETS)]
     pictures += [picture_folder(root)] if photographs_alone(root) else []  # there every folder counts as a camera's
     # The root is recognised as the only folder within ``whole``: a result beside it would hide it.
     beside_root = place.is_relative_to(whole) and not place.is_relative_to(root)

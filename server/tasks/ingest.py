@@ -20,7 +20,7 @@ from pipeline.warnings import ReportWarning
 from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera
-from rig.capture import Capture
+from rig.capture import TEXTURE_SETS, Capture
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, no_rig_fault, read_cameras, rig_file_parts
 from rig.formats.cameras.cameras_json import read_rig
@@ -96,8 +96,8 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
 
 def _name_by_camera(root: Path) -> None:
     """Gives files the names by which the service asks for them, images/<camera>.<ext>, masks/<camera>.<ext>,
-    background/<camera>.<ext> or background/<camera>/<anything>, wherever the archive has them and those that are called
-    otherwise and can be told. What cannot be told is left to ``check_capture``."""
+    texture_sets/<set>/<camera>.<ext>, background/<camera>.<ext> or background/<camera>/<anything>, wherever the archive
+    has them and those that are called otherwise and can be told. What cannot be told is left to ``check_capture``."""
     rig_file = find_rig_file(root)
     try:
         read = None if rig_file is None else read_cameras(rig_file)
@@ -133,13 +133,14 @@ def _move(path: Path, target: Path) -> None:
 
 def _leave_out(root: Path, rig: Rig) -> None:
     """Removes what belongs to views that did not join, which the warnings name."""
-    for folder in (picture_folder(root), *(root / kind for kind in BESIDE_PICTURES)):
+    sets = [path for path in (root / TEXTURE_SETS).glob("*") if path.is_dir()]
+    for folder in (picture_folder(root), *(root / kind for kind in BESIDE_PICTURES), *sets):
         for path in [*folder.iterdir()] if folder.is_dir() else ():
             is_candidate = path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES
             if (
                 is_candidate
                 and (path.name if path.is_dir() else path.stem) not in rig
-                and path.name not in BESIDE_PICTURES
+                and path.name not in (*BESIDE_PICTURES, TEXTURE_SETS)
             ):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 

@@ -115,10 +115,8 @@ class Worker:
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
     def run_until_stopped(self) -> None:
-        """Runs jobs until ``stop`` is called or SIGTERM or SIGINT arrives, then ends the process. A job that is running
-        then is taken over by another worker."""
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self._stop.set())
+        """Runs jobs until ``stop`` is called, then ends the process. A job that is running then is taken over by
+        another worker."""
         while not self._stop.wait(0.5):
             pass
         with suppress(SQLAlchemyError), self.engine.begin() as connection:
@@ -366,9 +364,11 @@ class _StateWatch:
 
 
 def run_worker(settings: ServiceSettings, *, until_eof: bool = False) -> None:
-    """Runs a worker until it is stopped; does not return. With ``until_eof`` it also stops at the end of its standard
-    input, that is when its parent ends."""
+    """Runs a worker until SIGTERM or SIGINT stops it; does not return. With ``until_eof`` it also stops at the end of
+    its standard input, that is when its parent ends."""
     worker = Worker(settings)
+    for number in (signal.SIGTERM, signal.SIGINT):  # before its row says that it lives: one that is ended says so there
+        signal.signal(number, lambda *_: worker.stop())
     worker.start()
     if until_eof:
         threading.Thread(target=_stop_at_eof, args=(worker.stop,), daemon=True).start()

@@ -5,6 +5,7 @@ images/<camera>.png|jpg|jpeg|tif|webp|bmp|ppm|pgm, RAW, DNG or HEIC
 background/<camera>.<ext>  or  background/<camera>/<anything>.<ext>
 features.json                      optional
 masks/<camera>.png                 optional; then background/ may be absent
+texture_sets/<set>/<camera>.<ext>  optional: further photographs by the same cameras, for the texture
 
 Without background/ and masks/ the subject is the opaque part if every picture was cut out; otherwise it is segmented
 from the photographs. Without images/ the pictures lie beside cameras.json. ``shot_files`` decides which file
@@ -22,7 +23,7 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
-from rig.capture import Capture, Features
+from rig.capture import TEXTURE_SETS, Capture, Features
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import write_rig
@@ -51,6 +52,7 @@ from rig.text import suggest
 SCALE = "scale.json"
 ENCLOSING_MOST = 8  # levels of single folders around a capture, as nested packing leaves them
 ALIKE_LEAST = 0.75  # likeness of two folders' names: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
+SETS_ALIKE = 0.9  # to texture_sets: "texture_set" 0.96, "texture-sets" 0.92; "textures", other programs' folder, 0.8
 
 
 def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
@@ -99,7 +101,7 @@ def read_rig_of(rig_file: Path) -> CamerasRead:
 def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
     """Returns remarks on pictures that belong to no camera, and on folders of pictures that are not read."""
     remarks = [stray_sentence(files.strays, rig)] if files.strays else []
-    known = ("images", *BESIDE_PICTURES, *rig.names)
+    known = ("images", *BESIDE_PICTURES, TEXTURE_SETS, *rig.names)
     for path in sorted(folder.iterdir()):
         is_other = path.is_dir() and path.name not in known and not is_junk(path.name)
         used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
@@ -163,6 +165,9 @@ def check_folders(folder: Path, rig: Rig) -> None:
         alike = suggest(kind, others, min_likeness=ALIKE_LEAST)
         if alike and not (folder / kind).is_dir():
             faults.append(compose("folder-misnamed", folder=others[alike[0]], name=kind))
+    alike = suggest(TEXTURE_SETS, others, min_likeness=SETS_ALIKE)
+    if alike and not (folder / TEXTURE_SETS).is_dir():
+        faults.append(compose("folder-misnamed", folder=others[alike[0]], name=TEXTURE_SETS))
     if faults:
         raise InputError("capture", faults)
 
@@ -185,28 +190,17 @@ def read_shot(
         faults += files.faults
     jobs = [(kind, camera.name, path) for camera in rig for kind, path in files.of_camera(camera.name)]
     bits, levels = _sample_bits(jobs, faults)
-    with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
-        decoded = list(
-            pool.map(
-                lambda job: decode_picture(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]]), jobs
-            )
-        )
-    images: dict[str, np.ndarray] = {}
-    masks: dict[str, tuple[str, np.ndarray]] = {}
+    pictures, digests = _decoded(folder, jobs, rig, faults, pixels_most=pixels_most, bits=bits)
+    images = {name: pixels for name, _, pixels in pictures.get("images", ())}
+    masks = {name: (where, pixels) for name, where, pixels in pictures.get("masks", ())}
     backgrounds: dict[str, list[np.ndarray]] = {}
-    digests: dict[str, str] = {}
-    for (kind, name, path), (pixels, digest, fault) in zip(jobs, decoded, strict=True):
-        if pixels is None:
-            assert fault is not None
-            faults.append(fault)
-            continue
-        digests[path.relative_to(folder).as_posix()] = digest
-        if kind == "images":
-            images[name] = pixels
-        elif kind == "masks":
-            masks[name] = path.relative_to(folder).as_posix(), pixels
-        else:
-            backgrounds.setdefault(name, []).append(pixels)
+    for name, _, pixels in pictures.get("background", ()):
+        backgrounds.setdefault(name, []).append(pixels)
+    sets = {
+        kind.removeprefix(f"{TEXTURE_SETS}/"): {name: pixels for name, _, pixels in of_set}
+        for kind, of_set in pictures.items()
+        if kind.startswith(TEXTURE_SETS)
+    }
     features: Features = {}
     if with_features and (folder / "features.json").is_file():
         data = (folder / "features.json").read_bytes()
@@ -225,7 +219,37 @@ def read_shot(
         digests,
         (*levels, *_page_remarks(folder, jobs), *_grey_remarks(images), *rims, *subjects.remarks),
         subjects.soft,
+        sets,
     )
+
+
+def _decoded(
+    folder: Path,
+    jobs: Sequence[tuple[str, str, Path]],
+    rig: Rig,
+    faults: list[Message],
+    *,
+    pixels_most: int | None,
+    bits: Mapping[str, int],
+) -> tuple[dict[str, list[tuple[str, str, np.ndarray]]], dict[str, str]]:
+    """Returns camera, file and pixels of every picture that can be read, by kind, and the SHA-256 of the files."""
+
+    def decode(job: tuple[str, str, Path]) -> tuple[np.ndarray | None, str, Message | None]:
+        return decode_picture(folder, *job, rig=rig, pixels_most=pixels_most, bits=bits[job[0]])
+
+    with ThreadPoolExecutor(max_workers=4) as pool:  # cv2 decodes outside the interpreter lock
+        decoded = list(pool.map(decode, jobs))
+    pictures: dict[str, list[tuple[str, str, np.ndarray]]] = {}
+    digests: dict[str, str] = {}
+    for (kind, name, path), (pixels, digest, fault) in zip(jobs, decoded, strict=True):
+        where = path.relative_to(folder).as_posix()
+        if pixels is None:
+            assert fault is not None
+            faults.append(fault)
+            continue
+        digests[where] = digest
+        pictures.setdefault(kind, []).append((name, where, pixels))
+    return pictures, digests
 
 
 def _cut_outs(
@@ -236,7 +260,7 @@ def _cut_outs(
     Returns None if one picture is not cut out, or its alpha is no valid mask. That is no fault, since nobody declared
     the alpha to be a mask."""
     found = {}
-    for _, name, path in jobs:
+    for _, name, path in (job for job in jobs if job[0] == "images"):
         alpha, k = cut_out_alpha(path), rig[name].intrinsics
         if alpha is None or alpha.shape != (k.height, k.width):
             return None
@@ -251,7 +275,7 @@ def _sample_bits(
 ) -> tuple[Mapping[str, int], list[Message]]:
     """Returns, for each kind of files, how many of 16 bits are used, and a remark where they are fewer. Sensor mosaics
     that were not developed are appended to ``faults``."""
-    kinds = ("images", "background")
+    kinds = [*dict.fromkeys(("images", "background", *(kind for kind, _, _ in jobs if kind != "masks")))]
     samples = {kind: measure_samples([path for of, _, path in jobs if of == kind]) for kind in kinds}
     mosaics = [f"{kind}/" for kind in kinds if samples[kind].mosaic]
     if mosaics:
@@ -292,6 +316,8 @@ def write_capture(folder: Path, capture: Capture, rig: Rig) -> None:
     for name, mask in capture.masks.items():
         share = capture.soft_masks.get(name, mask.astype(np.uint8) * np.uint8(255))
         files.append((folder / "masks" / f"{name}.png", share))
+    for kind, images in capture.texture_sets.items():
+        files += [(folder / TEXTURE_SETS / kind / f"{name}.png", image) for name, image in images.items()]
     with ThreadPoolExecutor(max_workers=4) as pool:
         list(pool.map(lambda file: write_image(*file), files))
     if capture.features:
@@ -314,7 +340,7 @@ def decode_picture(
     folder: Path, kind: str, name: str, path: Path, *, rig: Rig, pixels_most: int | None, bits: int
 ) -> tuple[np.ndarray | None, str, Message | None]:
     """Decodes a file of a camera, reduced and undistorted. Returns its pixels, the sha256 of the file, and a fault
-    (then there are no pixels). ``kind`` is images, background or masks."""
+    (then there are no pixels). ``kind`` is images, background, masks or a texture set's folder."""
     camera = rig[name]
     wanted, share = (camera.intrinsics.width, camera.intrinsics.height), work_share(camera.intrinsics, pixels_most)
     where, whole = path.relative_to(folder).as_posix(), kind == "masks"

@@ -5,10 +5,12 @@ where only one camera can be meant (``rig.formats.pictures.picture_names``), the
 (``serials``). A camera's file may also lie in a folder of the camera's name, and all files together in one more
 folder."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from rig.capture import TEXTURE_SETS
 from rig.formats.captures.serials import pictures_by_serial
 from rig.formats.pictures.images import is_picture
 from rig.formats.pictures.picture_names import UNREAD_PICTURES, is_junk, match_names, picture_stem
@@ -18,23 +20,28 @@ from rig.rig import Rig
 
 PLATES_MOST = 32  # clean plates read per camera
 BESIDE_PICTURES = ("masks", "background")  # folders of a capture that belong to no single camera
+SETS_MOST = 8  # texture sets of a capture: every one is as large as its photographs
+SET_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+NAME_SHOWN = 60  # characters of a name that is too long
 
 
 @dataclass(frozen=True, slots=True)
 class ShotFiles:
     """Holds the files of a shot by camera. ``strays`` are pictures of no camera, relative to the capture's folder;
-    ``faults`` are messages on files that are missing or ambiguous."""
+    ``faults`` are messages on files that are missing or ambiguous; ``texture_sets`` are files by set and camera."""
 
     images: Mapping[str, Path]
     masks: Mapping[str, Path]
     plates: Mapping[str, tuple[Path, ...]]
     strays: tuple[str, ...]
     faults: tuple[Message, ...]
+    texture_sets: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
 
     def of_camera(self, name: str) -> list[tuple[str, Path]]:
-        """Returns the kind (the folder's name) and path of each file of a camera."""
+        """Returns the kind (the folder, relative to the capture's) and path of each file of a camera."""
         found = [("images", self.images.get(name)), ("masks", self.masks.get(name))]
         found += [("background", plate) for plate in self.plates.get(name, ())]
+        found += [(f"{TEXTURE_SETS}/{kind}", files.get(name)) for kind, files in self.texture_sets.items()]
         return [(kind, path) for kind, path in found if path is not None]
 
 
@@ -58,7 +65,45 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
         strays["beside"] = [path for path in listed_pictures(folder) if path not in used]
     stray_names = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
     faults += missing + ([stray_sentence(stray_names, rig)] if missing and stray_names and not cause else [])
-    return ShotFiles(images, masks, plates, tuple(stray_names), tuple(faults))
+    sets = _texture_sets(folder, rig, names, faults)
+    return ShotFiles(images, masks, plates, tuple(stray_names), tuple(faults), sets)
+
+
+def _texture_sets(folder: Path, rig: Rig, names: Sequence[str], faults: list[Message]) -> dict[str, dict[str, Path]]:
+    """Returns the pictures of each texture set by camera. Its name becomes that of a file, so it has small letters."""
+    place = folder / TEXTURE_SETS
+    if not place.is_dir():
+        return {}
+    if alone := [path.relative_to(folder).as_posix() for path in sorted(place.iterdir()) if _shows_something(path)]:
+        faults.append(compose("texture-set-unnamed", pictures=some_of(alone), count=len(alone)))
+    folders = _folders(place)
+    if len(folders) > SETS_MOST:
+        faults.append(compose("texture-sets-many", count=len(folders), most=SETS_MOST))
+        return {}
+    found = {}
+    for path in folders:
+        if SET_NAME.fullmatch(path.name):
+            found[path.name] = _texture_set(folder, path, rig, names, faults)
+        else:
+            faults.append(compose("texture-set-misnamed", folder=f"{TEXTURE_SETS}/{path.name[:NAME_SHOWN]}"))
+    return found
+
+
+def _texture_set(folder: Path, place: Path, rig: Rig, names: Sequence[str], faults: list[Message]) -> dict[str, Path]:
+    """Returns the pictures of one texture set by camera. Every camera must have one, and no picture may be left."""
+    where = place.relative_to(folder).as_posix()
+    owned = _owned(place, names, TEXTURE_SETS, rig, faults)
+    pictures = {name: path for name in rig.names if (path := _one(owned.get(name, []), folder, faults))}
+    strays = _strays(place, {path for paths in owned.values() for path in _flat(paths)}, names, TEXTURE_SETS)
+    lacking = [name for name in rig.names if name not in pictures and name not in owned]
+    unread = {name: fault for name in lacking if (fault := _of_other_kind(name, folder, strays))}
+    faults += unread.values()
+    if absent := [name for name in lacking if name not in unread]:
+        faults.append(compose("texture-set-incomplete", folder=where, cameras=some_of(absent), count=len(absent)))
+    strange = [path.relative_to(folder).as_posix() for path in strays if picture_stem(path.name) not in unread]
+    if strange:
+        faults.append(stray_sentence(strange, rig))
+    return pictures
 
 
 def picture_folder(folder: Path) -> Path:
@@ -84,7 +129,7 @@ def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[
         return {}
     inner = _unwrapped(place, names)
     pictures = listed_pictures(inner)
-    beside = () if kind != "images" or inner != place or place.name == "images" else BESIDE_PICTURES
+    beside = () if kind != "images" or inner != place or place.name == "images" else (*BESIDE_PICTURES, TEXTURE_SETS)
     folders = [path for path in _folders(inner) if path.name not in beside and listed_pictures(path)]
     found: dict[str, list[Path]] = {}
     for path in [*pictures, *folders]:

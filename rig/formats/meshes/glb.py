@@ -15,7 +15,8 @@ from rig.colour_space import linear_from_srgb
 from rig.mesh import Mesh
 
 ROUGHNESS = 0.55  # glTF's roughness of skin: 0.4 on an oily nose, 0.7 on a cheek
-WEBP = "image/webp"  # glTF 2.0 itself knows JPEG and PNG alone: EXT_texture_webp
+WEBP, TEXTURE_WEBP = "image/webp", "EXT_texture_webp"  # glTF 2.0 itself knows JPEG and PNG alone
+SPECULAR = "KHR_materials_specular"  # viewers that do not know it mirror evenly
 FLOAT, UINT, USHORT = 5126, 5125, 5123
 VERTICES, INDICES = 34962, 34963
 
@@ -26,7 +27,7 @@ class Skin:
     image.
 
     With a normal map (PNG, linear, +Y up), ``tangents`` are the tangents to which it refers, with the signs of the
-    bitangents.
+    bitangents. ``specular`` is the strength of mirrored light, the alpha of a PNG (KHR_materials_specular).
     """
 
     uv: Float[np.ndarray, "v 2"]
@@ -34,6 +35,12 @@ class Skin:
     mime: str = "image/jpeg"
     normal_map: bytes | None = None
     tangents: Float[np.ndarray, "v 4"] | None = None
+    specular: bytes | None = None
+
+    @property
+    def maps(self) -> tuple[bytes, ...]:
+        """Returns the encoded images after the texture, all PNG: normal map, specular strength."""
+        return tuple(image for image in (self.normal_map, self.specular) if image is not None)
 
 
 def glb_bytes(
@@ -68,14 +75,14 @@ def glb_bytes(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "head"}],
         "meshes": [{"name": "head", "primitives": [{"attributes": attributes, "indices": 2, "material": 0}]}],
-        "materials": [{"name": "skin", "pbrMetallicRoughness": surface, "doubleSided": True} | _bumps(skin)],
+        "materials": [{"name": "skin", "pbrMetallicRoughness": surface, "doubleSided": True} | _maps(skin)],
         "accessors": [{"bufferView": k} | shape for k, (_, _, shape) in enumerate(parts)],
         "bufferViews": views,
     }
     if skin is not None:
         surface["baseColorTexture"] = {"index": 0}
         document |= _texture(skin, len(views))
-        for image in (skin.image, *([] if skin.normal_map is None else [skin.normal_map])):
+        for image in (skin.image, *skin.maps):
             views.append({"buffer": 0, "byteOffset": len(payload), "byteLength": len(image)})
             payload += image
     return _container(document | {"buffers": [{"byteLength": len(payload)}]}, bytes(payload))
@@ -116,24 +123,33 @@ def _parts(
     return parts, attributes
 
 
-def _bumps(skin: Skin | None) -> dict[str, Any]:
-    return {} if skin is None or skin.normal_map is None else {"normalTexture": {"index": 1}}
+def _maps(skin: Skin | None) -> dict[str, Any]:
+    """Returns what a material says of the images after its texture."""
+    found: dict[str, Any] = {}
+    if skin is not None and skin.normal_map is not None:
+        found["normalTexture"] = {"index": 1}
+    if skin is not None and skin.specular is not None:
+        found["extensions"] = {SPECULAR: {"specularTexture": {"index": len(skin.maps)}}}
+    return found
 
 
 def _texture(skin: Skin, view: int) -> dict[str, Any]:
     """Returns glTF's images, textures and samplers, with images from buffer view ``view`` on: the texture, then its
-    normal map."""
-    webp, bumps = skin.mime == WEBP, skin.normal_map is not None
-    source = {"extensions": {"EXT_texture_webp": {"source": 0}}} if webp else {"source": 0}
-    used = ["EXT_texture_webp"]
+    maps."""
+    webp, maps = skin.mime == WEBP, range(1, 1 + len(skin.maps))
+    source = {"extensions": {TEXTURE_WEBP: {"source": 0}}} if webp else {"source": 0}
+    required = [TEXTURE_WEBP] if webp else []
+    used = required + ([SPECULAR] if skin.specular is not None else [])
     return {
         "images": [
             {"bufferView": view, "mimeType": skin.mime},
-            *([{"bufferView": view + 1, "mimeType": "image/png"}] if bumps else []),
+            *({"bufferView": view + k, "mimeType": "image/png"} for k in maps),
         ],
         "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],  # clamped to the edge
-        "textures": [{"sampler": 0} | source, *([{"sampler": 0, "source": 1}] if bumps else [])],
-    } | ({"extensionsUsed": used, "extensionsRequired": used} if webp else {})
+        "textures": [{"sampler": 0} | source, *({"sampler": 0, "source": k} for k in maps)],
+        **({"extensionsUsed": used} if used else {}),
+        **({"extensionsRequired": required} if required else {}),
+    }
 
 
 def write_glb(path: Path, mesh: Mesh, **properties: Any) -> None:

@@ -24,6 +24,7 @@ from rig.rig import Rig
 from rig.studio.scene.backdrop import backdrop, chair
 from rig.studio.scene.hairstyles import restyled
 from rig.studio.scene.lights import LAMPS, Lamp
+from rig.studio.scene.polarised import matt_light
 from rig.studio.scene.subject import Look, Subject, dress, random_look, random_pose
 from rig.studio.scene.visible import VisiblePoints, part_masks, visible_points
 from rig.studio.sensor.faults import Fault
@@ -39,11 +40,12 @@ THREADS = 2
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
     """Holds what one camera sees. ``subject`` is linear light times coverage, and coverage; ``backdrop`` the light
-    behind the subject."""
+    behind the subject; ``matt`` is the subject without what its surface mirrors, where the preset asks for it."""
 
     subject: Float[np.ndarray, "h w 4"]
     backdrop: Float[np.ndarray, "h w 3"]
     sensor: Sensor
+    matt: Float[np.ndarray, "h w 4"] | None = None
 
     @property
     def mask(self) -> Bool[np.ndarray, "h w"]:
@@ -126,9 +128,12 @@ def build_scene(
     pose = world_from_head or random_pose(rig.centre_world(), preset.pose_spread_deg, preset.pose_spread_mm, pose_rng)
     dressed = dress(renderer, subject, look, pose, clothes=preset.clothes, rng=dress_rng, lamps=lamps)
     true_rig = Rig(tuple(_knocked(camera, faults, set_rng) for camera in rig))
-    light = renderer.photograph(true_rig, (*dressed.worn, dressed.skin), dressed.gallery, samples=preset.samples)
+    shown = (*dressed.worn, dressed.skin)
+    light = renderer.photograph(true_rig, shown, dressed.gallery, samples=preset.samples)
+    matt = matt_light(renderer, true_rig, shown, dressed.gallery, preset)
     if preset.rolling_ms > 0:
-        light = _rolling(true_rig, light, pose.translation, preset, rng.spawn(1)[0])
+        sway_mm = _sway(preset, rng.spawn(1)[0])
+        light, matt = (_rolling(true_rig, of, pose.translation, sway_mm) for of in (light, matt))
     head = dressed.head
     colours = np.rint(255 * srgb_from_linear(renderer.vertex_radiance(head, dressed.gallery))).astype(np.uint8)
     with renderer.silhouette_set(true_rig, head.faces) as silhouettes:
@@ -137,6 +142,7 @@ def build_scene(
     depth = renderer.depth(coarse, *dressed.solid)
     marks = {name: pose.apply(point[None])[0] for name, point in subject.landmarks.items()}
     views = _views(true_rig, light, preset, faults, set_rng)
+    views = {name: replace(view, matt=matt.get(name)) for name, view in views.items()}
     masks = {name: view.mask for name, view in views.items()}
     return Scene(
         rig=rig,
@@ -187,7 +193,22 @@ def shoot(scene: Scene, rng: np.random.Generator, faults: Sequence[Fault] = ()) 
         backgrounds={name: taken[source[name]][1] for name in names},
         masks=_wrong_masks(scene, faults),
         features=click(scene, click_rng),
+        texture_sets=_polarised(scene, source, rng) if scene.preset.polarised else {},
     )
+
+
+def _polarised(
+    scene: Scene, source: Mapping[str, str], rng: np.random.Generator
+) -> dict[str, dict[str, UInt8[np.ndarray, "_ _ 3"]]]:
+    """The texture sets of polarised light, of the same moment and exposed alike: a filter that is crossed with those
+    of the lamps takes away what the surface mirrors."""
+    sets: dict[str, dict[str, np.ndarray]] = {"cross": {}, "parallel": {}}
+    for name, camera_rng in zip(scene.rig.names, rng.spawn(len(scene.rig)), strict=True):
+        view = scene.views[source[name]]
+        assert view.matt is not None, "the preset asks for it"
+        sets["cross"][name] = expose(view_light(replace(view, subject=view.matt)), view.sensor, camera_rng)
+        sets["parallel"][name] = expose(view_light(view), view.sensor, camera_rng)
+    return sets
 
 
 def click(scene: Scene, rng: np.random.Generator) -> dict[str, dict[str, Float[np.ndarray, " 2"]]]:
@@ -232,19 +253,22 @@ def _knocked(camera: Camera, faults: Sequence[Fault], rng: np.random.Generator) 
     return camera
 
 
+def _sway(preset: Preset, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
+    """How far the subject moves (mm) while a rolling shutter reads all rows."""
+    direction = rng.standard_normal(3)
+    return direction / np.linalg.norm(direction) * preset.sway_mm_s * preset.rolling_ms / 1000
+
+
 def _rolling(
     rig: Rig,
-    light: Mapping[str, Float[np.ndarray, "h w 4"]],
+    light: Mapping[str, Float[np.ndarray, "_ _ 4"]],
     at_world: Float[np.ndarray, " 3"],
-    preset: Preset,
-    rng: np.random.Generator,
-) -> dict[str, Float[np.ndarray, "h w 4"]]:
+    sway_mm: Float[np.ndarray, " 3"],
+) -> dict[str, Float[np.ndarray, "_ _ 4"]]:
     """The subject sways while the rows are read, and each camera sees that from its own side. The truth is its place
     at the middle row. Motion across the image is that of the head's origin; nearer parts move by a tenth more."""
-    direction = rng.standard_normal(3)
-    sway_mm = direction / np.linalg.norm(direction) * preset.sway_mm_s * preset.rolling_ms / 1000
     shifts = {camera.name: camera.project_with_jacobian(at_world[None])[1][0] @ sway_mm for camera in rig}
-    return {name: rolled(light[name], shift_px) for name, shift_px in shifts.items()}
+    return {name: rolled(light[name], shifts[name]) for name in light}
 
 
 def _views(

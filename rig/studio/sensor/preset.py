@@ -37,6 +37,7 @@ class Preset:
     read_noise: float = 0.0  # of the sensor without light, share of full scale in linear light
     mosaic: bool = False  # a Bayer filter before the sensor, its gaps filled as cameras do
     jpeg_quality: int | None = None  # of the pictures that a camera hands out; None: not compressed
+    polarised: bool = False  # the texture sets cross (without reflections of the skin) and parallel (with them)
 
 
 PRESET = Preset()

@@ -26,9 +26,12 @@ from pipeline.texturing.layout.model_layout import model_layout
 from pipeline.texturing.layout.reduced_layout import reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.light import Light
+from pipeline.texturing.sets.specular import Specular
+from pipeline.texturing.sets.texture_sets import SetTextures
 from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
+from tests.rig.formats.pictures.test_exr import read_exr
 from tests.support.made_up_results import textured_result
 
 ALL = ("glb", "ply", "obj", "usdz", "stl", "3mf")
@@ -141,6 +144,52 @@ def test_the_albedo_is_written_and_the_glb_shows_it_where_that_is_asked_for(
     assert report_document(result)["texture"]["light"] is None
 
 
+def with_sets(result: Reconstruction) -> Reconstruction:
+    """Green scattered light, and a surface that mirrors 0.02 of it on the left and 0.3 on the right."""
+    assert result.texturing.atlas is not None
+    layout = result.texturing.atlas.layout
+    green, dark = (np.full((1024, 1024, 3), colour, np.uint8) for colour in ((40, 180, 90), (60, 20, 10)))
+    light = np.full((1024, 1024, 3), 0.02, np.float16)
+    light[:, 512:] = 0.3
+    sets = {"cross": Atlas(layout, green), "parallel": Atlas(layout, dark), "uv": Atlas(layout, dark)}
+    specular = Specular(light, {"a": 0.5, "b": 1.0}, 0.1, False)
+    return replace(result, texturing=replace(result.texturing, sets=SetTextures(sets, specular)))
+
+
+def test_texture_sets_are_written_and_the_glb_mirrors_what_polarised_light_shows(
+    result: Reconstruction, tmp_path: Path
+) -> None:
+    polarised = with_sets(result)
+    written(polarised, tmp_path)
+    maps = {path.relative_to(tmp_path).as_posix() for path in (tmp_path / "texture").rglob("*") if path.is_file()}
+    assert maps == {f"texture/{name}" for name in ("diffuse.png", "diffuse.exr", "specular.png", "specular.exr")} | {
+        f"texture/sets/{name}.png" for name in ("cross", "parallel", "uv")
+    }
+    mirrored = read_exr((tmp_path / "texture" / "specular.exr").read_bytes())
+    assert float(mirrored[5, 900, 1]) == pytest.approx(0.3, rel=1e-3)
+    scattered = read_exr((tmp_path / "texture" / "diffuse.exr").read_bytes())
+    assert float(scattered[5, 5, 1]) == pytest.approx(0.4564, rel=1e-3)  # linear light of code 180
+    coded = cv2.imread(str(tmp_path / "texture" / "specular.png"))
+    assert np.asarray(coded)[5, 900].tolist() == [149] * 3  # sRGB's code of 0.3
+    document, payload = opened_glb(tmp_path / "head.glb")
+    assert document["extensionsUsed"] == ["KHR_materials_specular"]
+    assert "extensionsRequired" not in document
+    material = document["materials"][0]
+    index = material["extensions"]["KHR_materials_specular"]["specularTexture"]["index"]
+    view = document["bufferViews"][document["images"][document["textures"][index]["source"]]["bufferView"]]
+    data = np.frombuffer(payload, np.uint8)[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    strength = np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED))[:, :, 3]
+    assert strength[5, 5] == pytest.approx(128, abs=1)  # half of what glTF's skin mirrors
+    assert strength[5, 900] == 255
+    loaded: Any = trimesh.load(tmp_path / "head.glb", force="mesh", process=False)
+    shown = np.asarray(loaded.visual.material.baseColorTexture.convert("RGB")).astype(int)
+    assert np.abs(shown - (40, 180, 90)).max() <= 3  # JPEG
+    report: Any = report_document(polarised)["texture"]["sets"]
+    assert report["names"] == ["cross", "parallel", "uv"]
+    assert report["specular"]["exposure"] == {"a": 0.5, "b": 1.0}
+    assert report["specular"]["roughness"] == material["pbrMetallicRoughness"]["roughnessFactor"]
+
+
 def test_the_albedo_alone_asks_for_a_layout() -> None:
     assert OutputSettings(formats=("ply",), delight=True).textured
     assert OutputSettings(formats=("ply",), skin="albedo").delit
@@ -180,7 +229,7 @@ def test_the_khronos_validator_has_nothing_to_say(
     assert result.texturing.atlas is not None
     name = "head.glb"
     if kind == "normal map":
-        written(with_reduced_layout(result), tmp_path, image="webp")
+        written(with_sets(with_reduced_layout(result)), tmp_path, image="webp")
     elif kind == "morphs":
         model, name = load_model(), "posed.glb"
         blendshape_rig = build_blendshape_rig(model, result.head.fit.world_from_head, result.mesh_world, ())

@@ -91,9 +91,10 @@ def test_light_is_levelled_to_what_falls_on_the_chart() -> None:
 
 def test_a_correction_is_what_it_says() -> None:
     colours = ChartColours({"a": ChartCorrection(MATRIX, 0.01)}, np.array([0.0, 0.0, 1.0]))
-    shown = with_true_colours(Capture(images={"a": grey(90)}), colours)
+    shown = with_true_colours(Capture(images={"a": grey(90)}, texture_sets={"cross": {"a": grey(90)}}), colours)
     assert shown.images["a"].dtype == np.uint8
     assert shown.images["a"][0, 0].tolist() == in_true_colours(grey(90), MATRIX)[0, 0].tolist()
+    np.testing.assert_array_equal(shown.texture_sets["cross"]["a"], shown.images["a"])
 
 
 @pytest.mark.parametrize("channel", [0, 1, 2])

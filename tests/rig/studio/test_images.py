@@ -16,7 +16,7 @@ from rig.rig import Rig
 from rig.studio.devices.folder import simulate_to_folder
 from rig.studio.scene.layout import ARRANGEMENTS_DEG, arrangement, default_layout
 from rig.studio.scene.lights import dome
-from rig.studio.scene.simulate import Scene, SimulatedCapture, _rolling, shoot, simulate
+from rig.studio.scene.simulate import Scene, SimulatedCapture, _rolling, _sway, shoot, simulate
 from rig.studio.scene.subject import Look, Subject, random_look
 from rig.studio.sensor import sensor as sensors
 from rig.studio.sensor.faults import KINDS, Fault, fault_from_text
@@ -192,6 +192,22 @@ def test_plates_differ_by_noise_and_shots_by_drift(renderer, rig):
     assert 0.002 < np.std(ratios) < 0.03  # 2 % of the light is about 1 % of what is written of it
 
 
+def test_crossed_filters_take_the_highlights_away_and_nothing_else(renderer, rig):
+    """Without noise the two sets differ where the skin shines alone, and by no more than highlights do."""
+    rig = rig.subset(("cam00", "cam04"))
+    oily = replace(CLEAN, oil=1.0, polarised=True)
+    taken = shot(renderer, rig, oily)
+    cross, parallel = taken.capture.texture_sets["cross"], taken.capture.texture_sets["parallel"]
+    dull = shot(renderer, rig, replace(oily, oil=0.0)).capture.texture_sets["cross"]
+    for name in rig.names:
+        assert np.array_equal(taken.capture.images[name], parallel[name])
+        assert np.array_equal(cross[name], dull[name])
+        assert (parallel[name] >= cross[name]).all()
+        beside = taken.scene.views[name].subject[:, :, 3] == 0
+        assert np.array_equal(parallel[name][beside], cross[name][beside])
+    assert (parallel["cam00"].astype(int) - cross["cam00"]).max() > 60
+
+
 def test_lens_and_gains():
     sensor = Sensor((1.2, 1.0, 0.8), 0.2, 1.5, 0.0)
     light = focus(np.full((90, 120, 3), 0.2, np.float32), sensor)
@@ -221,7 +237,7 @@ def test_a_rolling_row_shows_the_subject_where_it_was_then(renderer, rig):
     before = Similarity(1.0, np.eye(3), at.translation - sway_mm / 6)
     still, then = (shot(renderer, rig, CLEAN, world_from_head=pose).scene for pose in (at, before))
     light = {name: view.subject for name, view in still.views.items()}
-    seen = _rolling(rig, light, at.translation, preset, np.random.default_rng(5))
+    seen = _rolling(rig, light, at.translation, _sway(preset, np.random.default_rng(5)))
     for name in rig.names:
         row = round((len(light[name]) - 1) / 3)
         off = np.abs(seen[name][row, :, 3] - then.views[name].subject[row, :, 3]).sum()

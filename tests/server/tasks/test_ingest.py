@@ -164,6 +164,31 @@ def test_an_upload_is_kept_under_its_cameras_names(tmp_path: Path) -> None:
     assert {len(plates) for plates in read_capture(kept)[0].backgrounds.values()} == {2}
 
 
+def test_an_upload_keeps_its_texture_sets_under_the_cameras_names(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "capture")
+    for path in sorted((folder / "images").iterdir()):
+        write_image(folder / "texture_sets" / "cross" / f"shot_{path.stem}.png", read_image(path))
+    content, kept = kept_of(folder, tmp_path)
+    assert {f"texture_sets/cross/cam0{number}.png" for number in range(3)} <= {*content.inputs}
+    assert set(read_capture(kept)[0].texture_sets["cross"]) == {"cam00", "cam01", "cam02"}
+
+
+def test_texture_sets_of_an_upload_are_checked_before_they_are_decoded(tmp_path: Path) -> None:
+    """A small file may claim any size, and a set with a fault is no reason to pass over the others."""
+    folder = small_capture(tmp_path / "capture")
+    for path in sorted((folder / "images").iterdir()):
+        write_image(folder / "texture_sets" / "cross" / path.name, read_image(path))
+    write_image(folder / "texture_sets" / "cross" / "cam01.png", np.zeros((400, 400, 3), np.uint8))
+    write_image(folder / "texture_sets" / "cross" / "cam77.png", np.zeros((24, 24, 3), np.uint8))
+    (folder / "texture_sets" / "cross" / "cam02.png").unlink()
+    with pytest.raises(InputError) as refusal:
+        check_capture(folder, 100_000, lambda stage, share: None)
+    said = texts_of(refusal.value.faults)
+    assert len(said) == 3
+    for word in ("cross/cam01.png is 400 x 400", "cam77.png has no camera", "cross/ lacks the picture of cam02"):
+        assert any(word in sentence for sentence in said)
+
+
 def test_an_upload_with_cameras_switched_off_is_taken_without_their_files(tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "capture", cameras=5)
     write_rig_file(read_rig(folder / "cameras.json"), folder / "cameras.xml", "metashape")

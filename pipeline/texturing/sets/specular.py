@@ -1,0 +1,176 @@
+"""Separates what skin mirrors from what it scatters, by two sets in polarised light.
+
+Lamps behind a filter send polarised light. What the surface mirrors stays polarised; what comes out of the skin does
+not. A filter before the lens that is crossed with the lamps' passes scattered light alone, a parallel one both in equal
+exposure (Ma et al., *Rapid Acquisition of Specular and Diffuse Normal Maps*, EGSR 2007). So, in linear light, ``cross``
+is the diffuse part and ``parallel / exposure - cross`` the specular one.
+
+The exposure of the parallel picture by that of the crossed one is measured for each camera from colour alone: mirrored
+light has the lamps' colour, near grey in a balanced picture, so that differences between channels come from scattered
+light, and their ratio is the exposure's. The median over the head leaves out where that does not hold.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float16, Float32, UInt8
+
+from pipeline.compute.threads import in_threads, map_in_threads
+from pipeline.compute.trace import traced
+from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.imaging.masks import box_around
+from pipeline.imaging.silhouette import Silhouette
+from pipeline.texturing.decision import Decision
+from pipeline.texturing.layout.layout_image import spread_texels
+from pipeline.texturing.layout.uv_unwrap import Layout
+from pipeline.texturing.paint_kernels import TAPS
+from pipeline.texturing.visibility import LINEAR
+from rig.image import ImageRgb
+
+NORMAL_SHARE = 0.04  # of light at right angles that glTF's material mirrors (index of refraction 1.5)
+REDUCED = 4  # pixels that become one, to calm the noise before colours are compared
+CLIPPED = 0.95  # linear: brighter pixels do not tell how bright
+MIN_COLOUR = 0.01  # linear, mean difference between channels, below which a picture tells no exposure
+EXCHANGED, MIN_EXCHANGED = (
+    2.0,
+    0.002,
+)  # negative by positive light, and the former's mean (linear): noise has 1 and less
+COLOUR_SIDE = 128  # texels of the image of the lamps' colours: 4 mm on a head
+MIN_MIRRORED = 0.004  # linear; less light is taken for grey
+MAX_TINT = 2.0  # of a channel by the mean
+STRIP_ROWS = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Specular:
+    """Holds the light that a head's surface mirrors.
+
+    Attributes:
+        light: linear, in the textures' units: the mean over the views that see a texel, 0 where none does.
+        exposure: of the parallel picture by that of the crossed one, by camera.
+        negative: light below zero by that above, before it is cut off: what noise and motion leave.
+        exchanged: whether the crossed pictures show the mirrored light.
+    """
+
+    light: Float16[np.ndarray, "s s 3"]
+    exposure: Mapping[str, float]
+    negative: float
+    exchanged: bool
+
+    def strength(self) -> UInt8[np.ndarray, "s s"]:
+        """Returns the codes of glTF's specular strength: 255 mirrors ``NORMAL_SHARE`` of white light."""
+        share = self.light.astype(np.float32).mean(axis=2) / NORMAL_SHARE
+        return np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+
+
+def exposure_ratios(
+    cross: Mapping[str, ImageRgb],
+    parallel: Mapping[str, ImageRgb],
+    silhouettes: Mapping[str, Silhouette],
+    names: Sequence[str],
+) -> dict[str, float]:
+    """Measures how much longer each camera exposed its parallel picture than its crossed one. A camera that sees no
+    colour gets the median of the others; 1 if none sees any."""
+    found = map_in_threads(
+        lambda k: _exposure(cross[names[k]], parallel[names[k]], silhouettes[names[k]].mask), len(names)
+    )
+    known = [ratio for ratio in found if ratio is not None]
+    common = float(np.median(known)) if known else 1.0
+    return {name: common if ratio is None else ratio for name, ratio in zip(names, found, strict=True)}
+
+
+def _exposure(cross: ImageRgb, parallel: ImageRgb, inside: Bool[np.ndarray, "h w"]) -> float | None:
+    size = (max(cross.shape[1] // REDUCED, 1), max(cross.shape[0] // REDUCED, 1))
+    scattered, both, share = (
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        for image in (LINEAR[cross], LINEAR[parallel], inside.astype(np.float32))
+    )
+    kept = (share >= 1.0) & (np.maximum(scattered.max(axis=2), both.max(axis=2)) < CLIPPED)
+    x, y = (np.diff(image[kept], axis=1).ravel() for image in (scattered, both))
+    if not len(x) or np.abs(x).mean() < MIN_COLOUR:
+        return None
+    return _weighted_median(y / np.where(x == 0, 1e-9, x), np.abs(x))
+
+
+def _weighted_median(values: Float32[np.ndarray, " n"], weights: Float32[np.ndarray, " n"]) -> float:
+    order = np.argsort(values)
+    passed = np.cumsum(weights[order], dtype=float)
+    return float(values[order[np.searchsorted(passed, 0.5 * passed[-1])]])
+
+
+@traced
+def specular_light(
+    cross: Mapping[str, ImageRgb],
+    parallel: Mapping[str, ImageRgb],
+    gains: Float[np.ndarray, "k 3"],
+    decision: Decision,
+    silhouettes: Mapping[str, Silhouette],
+    layout: Layout,
+    *,
+    size: int,
+) -> Specular:
+    """Computes the mirrored light of every texel.
+
+    Args:
+        cross: pictures without mirrored light, by camera.
+        parallel: pictures with it.
+        gains: of the cameras and channels, as the crossed set's texture has them.
+        decision: how well the cameras see each vertex.
+        silhouettes: by camera.
+        layout: of the head.
+        size: of the map, texels.
+    """
+    views = decision.views
+    exposure = exposure_ratios(cross, parallel, silhouettes, views.names)
+
+    def mirrored(k: int) -> Float32[np.ndarray, "_ _ 3"]:
+        name = views.names[k]
+        box = box_around(silhouettes[name].mask, TAPS)  # as ``pack_pictures`` cuts it: places begin at its corner
+        light = LINEAR[parallel[name][box]] / np.float32(exposure[name]) - LINEAR[cross[name][box]]
+        return light * gains[k].astype(np.float32)
+
+    pictures = map_in_threads(mirrored, len(views))
+    texels, ones = size * layout.uv - 0.5, np.ones(len(layout.uv))
+    _, shown = rasterise(texels, ones, layout.faces, size, size)
+    weights = decision.weights[:, layout.source]
+    seen = (weights[:, layout.faces] > 0).all(axis=2)
+    light = np.zeros((size, size, 3), np.float32)
+
+    def work(first: int, last: int) -> None:
+        for row in range(first * STRIP_ROWS, min(last * STRIP_ROWS, size), STRIP_ROWS):
+            strip = shown[row : row + STRIP_ROWS]
+            total = np.full(strip.shape, 1e-12, np.float32)
+            for k, picture in enumerate(pictures):
+                values = np.concatenate([decision.pictures.places[k][layout.source], weights[k][:, None]], axis=1)
+                at = interpolate(strip, texels - (0.0, row), ones, layout.faces, values.astype(np.float32))
+                weight = np.where((strip >= 0) & seen[k][np.maximum(strip, 0)], at[:, :, 2], np.float32(0.0))
+                if not weight.any():
+                    continue
+                x, y = np.nan_to_num(at[:, :, 0]), np.nan_to_num(at[:, :, 1])
+                found = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                light[row : row + STRIP_ROWS] += weight[:, :, None] * found
+                total += weight
+            light[row : row + STRIP_ROWS] /= total[:, :, None]
+
+    in_threads(-(-size // STRIP_ROWS), work)
+    strength = light.mean(axis=2)
+    above, below = (float(np.maximum(sign * strength, 0.0).mean()) for sign in (1.0, -1.0))
+    exchanged = below > EXCHANGED * above and below > MIN_EXCHANGED * float((shown >= 0).mean())
+    coloured = np.maximum(strength, 0.0)[:, :, None] * _lamp_colour(light)
+    stored = spread_texels(coloured, shown >= 0).astype(np.float16)
+    return Specular(stored, exposure, below / max(above, 1e-12), exchanged)
+
+
+def _lamp_colour(light: Float32[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "s s 3"]:
+    """The colour of mirrored light around each texel, of mean 1: it is the lamps', so that what differs from texel to
+    texel is noise."""
+    size = len(light)
+    coarse = cv2.resize(light, (COLOUR_SIDE, COLOUR_SIDE), interpolation=cv2.INTER_AREA)
+    coarse = cv2.GaussianBlur(coarse, (0, 0), 1.0)
+    mean = coarse.mean(axis=2, keepdims=True)
+    colour = np.where(mean > MIN_MIRRORED, coarse / np.maximum(mean, MIN_MIRRORED), np.float32(1.0))
+    colour = np.clip(colour, 1 / MAX_TINT, MAX_TINT)
+    colour /= colour.mean(axis=2, keepdims=True)
+    return cv2.resize(colour, (size, size), interpolation=cv2.INTER_LINEAR)
