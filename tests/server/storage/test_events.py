@@ -2,11 +2,13 @@
 one."""
 
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from psycopg import Cursor
 from sqlalchemy import event as sa_event
 from sqlalchemy.exc import OperationalError
 
@@ -117,3 +119,20 @@ def test_a_database_that_is_away_costs_an_event_and_nothing_else(engine: sa.Engi
     sa_event.remove(engine, "before_cursor_execute", refuse)
     meter.report("read", 0.6)
     assert [event.seq for event in log.since("other", 0)] == [1]
+
+
+def test_a_transaction_that_a_cut_link_held_up_costs_an_event_alone(tmp_path: Path, postgres: str) -> None:
+    """PostgreSQL ends its session, which the next statement hears."""
+    engine = open_database(ServiceSettings(data=tmp_path / "data", database_url=postgres, silent_s=0.2))
+    log, held = EventLog(engine), list[int]()
+
+    @sa_event.listens_for(engine, "before_cursor_execute")
+    def hold_up(connection: sa.Connection, cursor: Cursor[object], *_: object) -> None:
+        if not held:
+            held.append(1)
+            cursor.execute("SELECT 1")  # the transaction begins
+            time.sleep(0.5)
+
+    assert log.append("held up", {"state": "running"}) is None
+    assert log.append("held up", {"state": "running"}) == 1
+    engine.dispose()
