@@ -13,7 +13,7 @@ from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import event
-from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import IntegrityError, InterfaceError, InternalError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from rig.errors import EigenheadError
@@ -21,7 +21,9 @@ from server.settings import ServiceSettings
 
 CONNECT_S = 10  # a database that does not even refuse
 SCRUB_TRIES, SCRUB_PAUSE_S = 20, 0.05
-AWAY = (OperationalError, InterfaceError, PoolTimeout)  # what is raised where the database does not answer
+AWAY = (OperationalError, InterfaceError, InternalError, PoolTimeout)
+"""What is raised where the database does not answer. InternalError: PostgreSQL ended a transaction that was silent for
+longer than it may be, as over a link that was cut."""
 
 metadata = sa.MetaData()
 

@@ -203,7 +203,8 @@ class Farm:
         blobs = self._bucket.list_objects_v2(Bucket="heads", Prefix="captures/").get("Contents", ())
         return {
             "states": dict(Counter(job["state"] for job in ended)),
-            "different_results": len({json.dumps(job["files"], sort_keys=True) for job in ended}),
+            "failures": [job["error"] for job in ended if job["state"] == "failed"],
+            "different_results": len({json.dumps(job["files"], sort_keys=True) for job in ended if job["files"]}),
             "ends_never_said": unsaid,
             "ends_said_more_than_once": said_twice,
             "objects_left_over": len(keys) - 3 * everything,

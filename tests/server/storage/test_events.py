@@ -2,11 +2,15 @@
 one."""
 
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from psycopg import Cursor
+from sqlalchemy import event as sa_event
+from sqlalchemy.exc import OperationalError
 
 from server.settings import ServiceSettings
 from server.storage.database import open_database
@@ -93,25 +97,42 @@ def test_a_job_ends_once_however_many_write_it(engine: sa.Engine) -> None:
         thread.join()
     assert sorted(firsts) == [False] * 19 + [True]
     assert log.append("job", {"state": "running", "stage": "late"}) == 2, "of a worker that was thought dead"
-    assert [(event.seq, event.document["state"]) for event in log.since("job", 0)][1:] == [
+    assert [(event.seq, event.document.get("state")) for event in log.since("job", 0)][1:] == [
         (2, "running"),
         (END, "failed"),
     ]
     assert log.latest(["job"])["job"].document == {"state": "failed"}
     assert failure_counts(engine) == {"no-hull": 1}
     log.replace_end("job", {"state": "cancelled"})
-    assert [event.document["state"] for event in log.since("job", 2)] == ["cancelled"]
+    assert [event.document.get("state") for event in log.since("job", 2)] == ["cancelled"]
 
 
 def test_a_database_that_is_away_costs_an_event_and_nothing_else(engine: sa.Engine) -> None:
     log = EventLog(engine)
 
-    @sa.event.listens_for(engine, "before_cursor_execute")
+    @sa_event.listens_for(engine, "before_cursor_execute")
     def refuse(*_: object) -> None:
-        raise sa.exc.OperationalError("INSERT", None, ConnectionRefusedError("away"))
+        raise OperationalError("INSERT", None, ConnectionRefusedError("away"))
 
     meter = ProgressMeter(log, "other", JobProgress({"read": 1.0}), every_s=0.0)
     meter.report("read", 0.5)
-    sa.event.remove(engine, "before_cursor_execute", refuse)
+    sa_event.remove(engine, "before_cursor_execute", refuse)
     meter.report("read", 0.6)
     assert [event.seq for event in log.since("other", 0)] == [1]
+
+
+def test_a_transaction_that_a_cut_link_held_up_costs_an_event_alone(tmp_path: Path, postgres: str) -> None:
+    """PostgreSQL ends its session, which the next statement hears."""
+    engine = open_database(ServiceSettings(data=tmp_path / "data", database_url=postgres, silent_s=0.2))
+    log, held = EventLog(engine), list[int]()
+
+    @sa_event.listens_for(engine, "before_cursor_execute")
+    def hold_up(connection: sa.Connection, cursor: Cursor[object], *_: object) -> None:
+        if not held:
+            held.append(1)
+            cursor.execute("SELECT 1")  # the transaction begins
+            time.sleep(0.5)
+
+    assert log.append("held up", {"state": "running"}) is None
+    assert log.append("held up", {"state": "running"}) == 1
+    engine.dispose()

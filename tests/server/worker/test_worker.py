@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 from dbos import DBOS
+from sqlalchemy import event
+from sqlalchemy.exc import OperationalError
 
 from rig.errors import Cancelled, InputError
 from server.services.failures import JobFailed
@@ -158,11 +160,11 @@ def test_a_job_without_a_report_ends_without_a_word(worker: Worker) -> None:
 def test_an_end_waits_for_the_database_and_is_written_once(worker: Worker) -> None:
     refused = list[int]()
 
-    @sa.event.listens_for(worker.engine, "before_cursor_execute")
+    @event.listens_for(worker.engine, "before_cursor_execute")
     def refuse(*_: object) -> None:
         if len(refused) < 2:
             refused.append(1)
-            raise sa.exc.OperationalError("INSERT", None, ConnectionRefusedError("away"))
+            raise OperationalError("INSERT", None, ConnectionRefusedError("away"))
 
     for _ in range(2):  # the worker is killed before the engine knows of the end; the next one repeats it
         worker.outcomes.publish(JOB, "failed", failure="no-hull")
