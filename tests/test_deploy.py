@@ -172,8 +172,34 @@ def test_the_store_of_the_containers_has_one_key_and_one_address() -> None:
     assert {name for name in users[0] if name.startswith(PREFIX)} <= known
     assert store["environment"].items() <= users[0].items()
     assert users[0]["EIGENHEAD_STORE_ENDPOINT"] == "http://store:8333"
+    assert {f"{PREFIX}{what}_{of}" for what in ("CAPTURES", "RESULTS") for of in ("STORE", "BYTES")} <= users[0].keys()
     assert "-s3.port=8333" in store["command"]
     assert "ports" not in store, "it has no TLS"
+
+
+def composed(*files: str) -> dict[str, Any]:
+    """What Compose makes of the files together, or a visible skip."""
+    for command in (["docker", "compose"], ["docker-compose"]):
+        if shutil.which(command[0]) and subprocess.run([*command, "version"], capture_output=True).returncode == 0:
+            break
+    else:
+        pytest.skip("Compose is not installed (apt-get install docker-compose)")
+    named = [word for file in files for word in ("-f", str(DEPLOY / file))]
+    secrets = {"POSTGRES_PASSWORD": "of the test", "STORE_SECRET": "of the test"}
+    call = [*command, "-p", "heads", *named, "config"]
+    done = subprocess.run(call, env=os.environ | secrets, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return yaml.safe_load(done.stdout)
+
+
+def test_compose_accepts_the_containers_with_and_without_a_store() -> None:
+    assert "EIGENHEAD_CAPTURES_STORE" not in composed("compose.yaml")["services"]["worker"]["environment"]
+    services = composed("compose.yaml", "compose.store.yaml")["services"]
+    for name in ("service", "worker"):
+        environment = services[name]["environment"]
+        assert environment["EIGENHEAD_CAPTURES_STORE"] == "s3://heads/captures/"
+        assert int(environment["EIGENHEAD_CAPTURES_BYTES"]) == ServiceSettings().captures_bytes
+        assert "EIGENHEAD_DATABASE_URL" in environment, "which the other file says"
 
 
 def kustomized() -> list[dict[str, Any]]:
@@ -207,6 +233,17 @@ def test_the_manifests_name_settings_and_each_other() -> None:
     generated = [g for d in documents for g in d.get("configMapGenerator", ())]
     variables = {literal.partition("=")[0] for g in generated for literal in g["literals"]}
     assert variables <= {PREFIX + name.upper() for name in ServiceSettings.model_fields}
+
+
+def test_the_volume_holds_what_the_bounds_let_it_hold() -> None:
+    (base,) = yaml.safe_load_all((DEPLOY / "kubernetes" / "base" / "kustomization.yaml").read_text())
+    literals = dict(literal.split("=", 1) for literal in base["configMapGenerator"][0]["literals"])
+    stores = [literals[f"EIGENHEAD_{what}_STORE"] for what in ("CAPTURES", "RESULTS")]
+    assert len({*stores}) == 2, "a place each"
+    bounds = [int(literals[f"EIGENHEAD_{what}_BYTES"]) for what in ("CAPTURES", "RESULTS")]
+    (claim,) = (document for document in manifests() if document["kind"] == "PersistentVolumeClaim")
+    size = claim["spec"]["resources"]["requests"]["storage"]
+    assert sum(bounds) < 0.7 * int(size.removesuffix("Gi")) * (1 << 30)
 
 
 def test_workers_are_scaled_by_what_the_engine_calls_a_job() -> None:

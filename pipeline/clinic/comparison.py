@@ -20,7 +20,7 @@ from pipeline.verification.judgement import weighted_quantiles
 from pipeline.verification.reference import Reference
 from rig.errors import InputError
 from rig.geometry import RigidTransform, rigid_fit
-from rig.messages.message import compose
+from rig.messages.message import Message, compose
 
 SURE = 2.0  # combined standard deviations
 SHARE = 0.8  # of the stable region that must agree: the rest may be hair or a scar
@@ -36,6 +36,7 @@ START_NAMES = (
     ),
 )
 MIN_MARKS = 3
+MAX_STABLE_CHANGED = 0.05  # share of what no growth moves: two deviations leave as much to chance
 NOT_THIS_MM = 1.5  # scatter on bone: one person has 0.02 to 0.3 mm, others 0.8 to 2.7; hair may be in the way
 
 
@@ -90,6 +91,12 @@ class Comparison:
     def sure_mm(self) -> Float[np.ndarray, " v"]:
         """Returns the distances with NaN where no change is sure."""
         return np.where(self.changed, self.distance_mm, np.nan)
+
+    @property
+    def warnings(self) -> tuple[Message, ...]:
+        """Returns what makes the comparison doubtful: forehead and bridge of the nose that differ for sure."""
+        share = self.regions["stable"].changed_share
+        return (compose("maybe-other-person", share=share),) if share > MAX_STABLE_CHANGED else ()
 
 
 def compare(earlier: Visit, later: Visit) -> Comparison:

@@ -73,6 +73,7 @@ def comparison_document(comparison: Comparison, date: str) -> dict[str, Any]:
             "std_mm": fit.std_mm,
             "kept_share": fit.kept_share,
         },
+        "warnings": [warning.document() for warning in comparison.warnings],
         "sure": SURE,
         "changed_share": comparison.regions["whole"].changed_share,
         "scale_end_mm": scale_end(comparison.sure_mm),

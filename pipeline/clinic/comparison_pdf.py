@@ -46,6 +46,8 @@ def _tables_page(pdf: PdfPage, document: Mapping[str, Any]) -> None:
         f"Aligned on {fit['region']}: scatter {fit['std_mm']:.3f} mm, {fit['kept_share']:.0%} of it used. "
         f"Changed for sure: {document['changed_share']:.1%} of the surface."
     )
+    for warning in document["warnings"]:
+        pdf.line_of(f"Doubtful: {warning['message']}", ink=BAD)
     pdf.ln(2)
     pdf.line_of("Change by region, mm", size=11, bold=True)
     regions = [

@@ -7,6 +7,8 @@ wrong: matching windows make thin things (frames of glasses, the edge of a colla
 view alike.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,7 +17,7 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction_kernels import BLOCK, mark_contradicted
 from pipeline.fusion.view_stack import ViewStack
-from pipeline.fusion.vote_kernels import OUTLINE
+from pipeline.fusion.vote_kernels import OUTLINE, PIXEL_STEP
 
 MIN_VIEWS = 2  # that see something solid
 WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines
@@ -30,20 +32,20 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
     def wrong_pixels(v: int) -> Bool[np.ndarray, "h w"] | None:
         height, width = views.sizes[v]
         blocks = np.zeros((height // BLOCK + 1, width // BLOCK + 1), np.uint64)
-        mark_contradicted(v, views.cameras, views.sizes, views.starts, views.pixels, blocks, width)
+        mark_contradicted(v, views.packed(), blocks, width)
         solid = np.bitwise_count(blocks) >= MIN_VIEWS
-        outline_px = views.pixels[views.starts[v] : views.starts[v] + height * width, OUTLINE]
+        outline_px = PIXEL_STEP * views.shown[views.starts[v] : views.starts[v] + height * width, OUTLINE]
         return _beyond_windows(solid, outline_px.reshape(height, width)) if solid.any() else None
 
     wrong = map_in_threads(wrong_pixels, len(views.cameras))
     shares = np.array([0.0 if mask is None else mask.mean() for mask in wrong])
-    if not shares.any():  # as usual: a hundred megabytes need no copy
+    if not shares.any():  # as usual: fifty megabytes need no copy
         return views, shares
-    pixels = views.pixels.copy()
+    shown = views.shown.copy()
     for start, mask in zip(views.starts, wrong, strict=True):
         if mask is not None:
-            pixels[start : start + mask.size, OUTLINE][mask.ravel()] = SILENT_PX
-    return ViewStack(views.cameras, views.sizes, views.starts, pixels), shares
+            shown[start : start + mask.size, OUTLINE][mask.ravel()] = SILENT_PX / PIXEL_STEP
+    return replace(views, shown=shown, steady=shares == 0.0), shares
 
 
 def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -3,7 +3,18 @@
 import numpy as np
 
 from pipeline.compute.jit import njit
-from pipeline.fusion.vote_kernels import CENTRE, DEPTH, FRAME, OUTLINE, SIGMA, nearest_pixel, seen_at
+from pipeline.fusion.vote_kernels import (
+    CENTRE,
+    FRAME,
+    OUTLINE,
+    PIXEL_STEP,
+    SIGMA,
+    SIGMA_STEP_MM,
+    UNKNOWN,
+    Pixels,
+    nearest_pixel,
+    seen_at,
+)
 from pipeline.geometry.projection_kernels import LENS, NEAREST_MM
 
 BLOCK = 4  # pixels along the side of what is decided at once
@@ -15,19 +26,16 @@ SURE_MM = 1.0  # points with a larger deviation do not count
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_contradicted(
     target: int,
-    cameras: np.ndarray,
-    sizes: np.ndarray,
-    starts: np.ndarray,
-    pixels: np.ndarray,
+    views: Pixels,
     blocks: np.ndarray,
     width: int,
 ) -> None:
     """Marks blocks of the view ``target`` in which other views have a precise surface point outside of its outline:
     sets bit v % 64 of ``blocks`` (rows, columns; words of 64 bits, changed in place) for each such view v.
 
-    ``cameras``, ``sizes``, ``starts`` and ``pixels`` are those of ``view_stack.ViewStack``; ``width`` is the target's
-    width in pixels. A block is ``BLOCK`` pixels wide.
+    ``width`` is the target's width in pixels. A block is ``BLOCK`` pixels wide.
     """
+    cameras, sizes, starts, depths, shown = views
     place = np.empty(3)
     for v in range(len(cameras)):
         if v == target:
@@ -36,9 +44,9 @@ def mark_contradicted(
         for row in range(0, sizes[v, 0], STRIDE):
             for column in range(0, sizes[v, 1], STRIDE):
                 at = starts[v] + row * sizes[v, 1] + column
-                if not pixels[at, SIGMA] < SURE_MM:
+                if shown[at, SIGMA] == UNKNOWN or shown[at, SIGMA] * SIGMA_STEP_MM >= SURE_MM:
                     continue
-                depth = pixels[at, DEPTH]
+                depth = depths[at]
                 x, y = (column - p[LENS + 2]) / p[LENS] * depth, (row - p[LENS + 3]) / p[LENS + 1] * depth
                 for axis in range(3):  # the rotation's inverse, from the camera's centre
                     place[axis] = p[axis] * x + p[3 + axis] * y + p[6 + axis] * depth + p[CENTRE + axis]
@@ -47,5 +55,5 @@ def mark_contradicted(
                     continue
                 near, beyond = nearest_pixel(at_column, at_row, sizes[target])
                 there = starts[target] + near
-                if beyond == 0.0 and pixels[there, FRAME] < 0.0 and pixels[there, OUTLINE] > CLEAR_PX:
+                if beyond == 0.0 and shown[there, FRAME] < 0 and shown[there, OUTLINE] * PIXEL_STEP > CLEAR_PX:
                     blocks[near // width // BLOCK, near % width // BLOCK] |= bit

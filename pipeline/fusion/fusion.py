@@ -145,10 +145,12 @@ def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.nd
     vertices, faces, cells = net.vertices, net.faces, np.flatnonzero(net.of_cell >= 0)
     head = None if head_world is None else (head_world.vertices - grid.corner) / grid.step_mm
     kept = _subject(vertices, faces, head)
-    used, corners = np.unique(faces[kept], return_inverse=True)
+    taken = np.zeros(len(vertices), bool)
+    taken[faces[kept]] = True
+    used, row = np.flatnonzero(taken), np.cumsum(taken, dtype=np.int32) - 1
     placed = grid.corner + grid.step_mm * vertices[used]
     safe = grid.corner + grid.step_mm * (grid.index[cells[used]] + 0.5)
-    return Mesh(placed, corners.reshape(-1, 3).astype(np.int32)), safe
+    return Mesh(placed, row[faces[kept]]), safe
 
 
 def _subject(

@@ -25,11 +25,14 @@ def compose_well(field: np.ndarray, neighbours: np.ndarray, outer: np.ndarray, l
     ``neighbours`` (n, 6) has the rows of adjacent nodes, -1 for none. ``outer`` nodes (n) are never changed, since the
     surface would then lie in cells that the grid does not have.
     """
-    corners = np.empty(8, np.int64)
+    corners, stale = np.empty(8, np.int64), np.ones(len(field), np.bool_)  # cells that have changed since their turn
     turned, changes, rounds = 0, 1, 0
     while changes:
         changes = 0
         for n in range(len(field)):
+            if not stale[n]:
+                continue
+            stale[n] = False
             if not corners_of(n, neighbours, corners):
                 continue
             inside = 0
@@ -41,9 +44,24 @@ def compose_well(field: np.ndarray, neighbours: np.ndarray, outer: np.ndarray, l
             if node >= 0:
                 field[node] = least if field[node] < 0 else -least
                 changes += 1
+                _mark_cells_about(node, neighbours, stale)
         turned += changes
         rounds += 1
     return turned
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mark_cells_about(node, neighbours, marked):
+    for c in range(8):
+        at = node
+        if c & 1:
+            at = neighbours[at, 4]
+        if at >= 0 and c & 2:
+            at = neighbours[at, 2]
+        if at >= 0 and c & 4:
+            at = neighbours[at, 0]
+        if at >= 0:
+            marked[at] = True
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -5,12 +5,13 @@ import numpy as np
 
 from pipeline.compute.jit import njit
 from pipeline.fusion.vote_kernels import (
-    DEPTH,
     FLATTEST,
     MAX_VIEWS,
     NORMAL,
+    NORMAL_STEP,
     SIGMA,
-    UNKNOWN_MM,
+    SIGMA_STEP_MM,
+    UNKNOWN,
     Pixels,
     agreed,
     cosine,
@@ -45,7 +46,7 @@ def measure(
     agree. ``limits`` are the distance (mm) beyond which a view shows another surface, the largest difference (mm) of
     agreeing views, and a lower limit of a view's standard deviation (mm).
     """
-    cameras, sizes, starts, pixels = seen
+    cameras, sizes, starts, depths, shown = seen
     gate, agreement, floor = limits
     votes, weights = np.empty(MAX_VIEWS), np.empty(MAX_VIEWS)
     for n in range(first, last):
@@ -56,16 +57,15 @@ def measure(
                 continue
             near, beyond = nearest_pixel(column, row, sizes[v])
             near += starts[v]
-            sigma = pixels[near, SIGMA]
-            if beyond > 0.0 or not sigma < UNKNOWN_MM:
+            if beyond > 0.0 or shown[near, SIGMA] == UNKNOWN:
                 continue
-            turn = 0.0
+            sigma, turn = SIGMA_STEP_MM * shown[near, SIGMA], 0.0
             for axis in range(3):
-                turn += pixels[near, NORMAL + axis] * normals[n, axis]
-            facing = cosine(cameras[v], place, depth, pixels[near])
+                turn += NORMAL_STEP * shown[near, NORMAL + axis] * normals[n, axis]
+            facing = cosine(cameras[v], place, depth, shown[near])
             if turn < TURNED or facing < FLATTEST:
                 continue
-            behind = (depth - depth_between(pixels, starts[v], sizes[v], column, row, near)) * facing
+            behind = (depth - depth_between(depths, shown, starts[v], sizes[v], column, row, near)) * facing
             if abs(behind) > gate:
                 continue
             votes[count] = behind
@@ -83,19 +83,23 @@ def measure(
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def depth_between(pixels: np.ndarray, start: int, size: np.ndarray, column: float, row: float, near: int) -> float:
+def depth_between(
+    depths: np.ndarray, shown: np.ndarray, start: int, size: np.ndarray, column: float, row: float, near: int
+) -> float:
     """Returns the depth (mm) at a point between four pixels: interpolated if all four know the depth of one surface,
-    else that of the nearest pixel, whose row in ``pixels`` is ``near``. ``start`` is the row of the view's first
+    else that of the nearest pixel, whose row in ``shown`` is ``near``. ``start`` is the row of the view's first
     pixel."""
     c, r = min(int(column), size[1] - 2), min(int(row), size[0] - 2)
     a = start + r * size[1] + c
     b, d, e = a + 1, a + size[1], a + size[1] + 1
-    sigma = max(max(pixels[a, SIGMA], pixels[b, SIGMA]), max(pixels[d, SIGMA], pixels[e, SIGMA]))
-    low = min(min(pixels[a, DEPTH], pixels[b, DEPTH]), min(pixels[d, DEPTH], pixels[e, DEPTH]))
-    high = max(max(pixels[a, DEPTH], pixels[b, DEPTH]), max(pixels[d, DEPTH], pixels[e, DEPTH]))
-    if not sigma < UNKNOWN_MM or high - low > STEP_MM:
-        return pixels[near, DEPTH]
-    return bilinear(pixels[a, DEPTH], pixels[b, DEPTH], pixels[d, DEPTH], pixels[e, DEPTH], column - c, row - r)
+    least = min(min(shown[a, SIGMA], shown[b, SIGMA]), min(shown[d, SIGMA], shown[e, SIGMA]))
+    low, high = (
+        min(min(depths[a], depths[b]), min(depths[d], depths[e])),
+        max(max(depths[a], depths[b]), max(depths[d], depths[e])),
+    )
+    if least == UNKNOWN or high - low > STEP_MM:
+        return depths[near]
+    return bilinear(depths[a], depths[b], depths[d], depths[e], column - c, row - r)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

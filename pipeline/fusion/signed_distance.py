@@ -16,11 +16,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int32
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
+from pipeline.fusion.exclusion_kernels import BLOCK, mark_excluded
 from pipeline.fusion.grid import Grid, everywhere, marked_box, refined, whole_box
 from pipeline.fusion.prior import distance_to_head
 from pipeline.fusion.relaxation_kernels import Membrane, relax
@@ -88,28 +89,55 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
     blend = np.where(votes.weight < 0, UNDECIDED_BLEND_MM, BLEND_MM)
     pull = np.where(unseen, (grid.step_mm / blend) ** 2, DATA_WEIGHT * votes.weight).astype(np.float32)
     field = np.where(grid.outer, start, np.maximum(target, votes.bound)).astype(np.float32)
-    fixed = grid.outer | (votes.bound >= reach)
-    membrane = Membrane(target, pull, votes.bound, fixed)
+    free, odd = ~grid.outer & (votes.bound < reach), (np.bitwise_xor.reduce(grid.index, axis=1) & 1) == 1
+    colours = [np.flatnonzero(free & ~odd).astype(np.int32), np.flatnonzero(free & odd).astype(np.int32)]
+    membrane = Membrane(target, pull, votes.bound)
     for sweep in range(2 * sweeps):
+        rows = colours[sweep % 2]
 
-        def sweep_nodes(first: int, last: int, parity: int = sweep % 2) -> None:
-            relax(field, membrane, grid.index, grid.neighbours, parity, factor, first, last)
+        def sweep_nodes(first: int, last: int, rows: np.ndarray = rows) -> None:
+            relax(field, membrane, rows, grid.neighbours, factor, first, last)
 
-        in_threads(len(grid), sweep_nodes)
+        in_threads(len(rows), sweep_nodes)
     return Level(grid, field, votes.weight)
 
 
 def votes_at(grid: Grid, views: ViewStack) -> Votes:
     """Combines the views at every node of the grid."""
-    value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
-    step = grid.step_mm
+    return _votes(grid.index, grid.corner, grid.step_mm, views)
+
+
+def votes_in_box(box: Grid, views: ViewStack) -> Votes:
+    """Combines the views at every node of a whole box. Blocks of nodes that two silhouettes exclude by more than the
+    reach of a vote are decided at once: that is most of a box."""
+    reach = REACH * box.step_mm
+    near = np.flatnonzero(~excluded_by_outlines(box, views, reach))
+    votes = _votes(box.index[near], box.corner, box.step_mm, views)
+    value, weight, bound = (np.full(len(box), at, np.float32) for at in (reach, 0.0, reach))
+    value[near], weight[near], bound[near] = votes.value, votes.weight, votes.bound
+    return Votes(value, weight, bound)
+
+
+def excluded_by_outlines(box: Grid, views: ViewStack, reach_mm: float) -> Bool[np.ndarray, " n"]:
+    """Tells which nodes of a whole box lie in a block that is more than ``reach_mm`` outside two silhouettes."""
+    excluded, packed = np.zeros(len(box), bool), views.packed()
+
+    def mark(first: int, last: int) -> None:
+        mark_excluded(box.shape, box.corner, box.step_mm, packed, views.steady, reach_mm, excluded, first, last)
+
+    in_threads(-(-box.shape[0] // BLOCK), mark)
+    return excluded
+
+
+def _votes(index: Int32[np.ndarray, "n 3"], corner: Float[np.ndarray, " 3"], step: float, views: ViewStack) -> Votes:
+    value, weight, bound = (np.zeros(len(index), np.float32) for _ in range(3))
     limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
     packed = views.packed()
 
     def fill(first: int, last: int) -> None:
-        vote(grid.index, grid.corner, step, packed, limits, value, weight, bound, first, last)
+        vote(index, corner, step, packed, limits, value, weight, bound, first, last)
 
-    in_threads(len(grid), fill)
+    in_threads(len(index), fill)
     return Votes(value, weight, bound)
 
 
@@ -122,7 +150,7 @@ def solve(depth_maps: Sequence[DepthMap], views: ViewStack, head_world: Mesh | N
         halvings += 1
     seen = np.concatenate([points_world(depth_map)[::EVERY] for depth_map in depth_maps])
     grid = whole_box(*_box(depth_maps, seen, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
-    votes = votes_at(grid, views)
+    votes = votes_in_box(grid, views)
     level = solve_level(grid, votes, _prior(grid, votes, head_world, seen), SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
     for halving in range(halvings):

@@ -4,7 +4,8 @@ it, from its own shape and from patches that have no window bias.
 Where the two lie as far apart as their errors, the vertex moves to their weighted mean. Where they lie farther apart,
 the surroundings decide. If most of them agree with the head, the vertex is in a crater or on a speck (a chance match,
 the rest of a highlight), and moves to the head. If not, one of the two shows something else (hair, a fold that the head
-lacks, a wrong head), and the vertex stays.
+lacks, a wrong head), and the vertex stays. What no view sees is skin, too, where seen skin encloses it: gaps of a few
+vertices would stand as pits.
 
 What the two differ by over whole neighbourhoods is no noise of the surface: the head has the wrong shape there. Where
 that is much of the skin, by what the head states about itself, the model cannot make this subject (a statue, say), its
@@ -30,6 +31,7 @@ SAME_MM = 1.0  # distance at which agreement has fallen to 1 / e, at least ...
 SAME_DEVIATIONS = 6.0
 SURROUNDINGS = 24  # steps of a mean over neighbours: 5 mm (standard deviation) where vertices are 1.5 mm apart
 CONSENT = (0.5, 0.75)  # mean agreement of the surroundings from which on the head counts, and counts whole
+ENCLOSED = (0.5, 0.75)  # mean probability of seen skin around what no view sees, from which on that is skin, and surely
 # The upper quartile of the distances of the two over neighbourhoods, by the head's median deviation, up to which the
 # head counts whole and from which on it counts for nothing: 0.25 to 0.33 of scan-a, draw-b and scan-a's oily version,
 # 0.40 under a beard, 0.84 of the photographs of a Buddha, whose head the model cannot make.
@@ -65,14 +67,16 @@ def drawn_to_skin(
         mesh_world: the fused surface, mm.
         skin: probability that a vertex shows skin; 0 where no view sees it.
         head: its skin, as far as photographs measured it.
-        deviation_mm: standard deviation along the normal of the vertices that a view sees.
+        deviation_mm: standard deviation along the normal; 0 where no view sees the vertex.
     """
     vertices = mesh_world.vertices.copy()
     beside = neighbours(mesh_world.faces, len(vertices))
     same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * mean_around(beside, deviation_mm, skin))
     reach = FARTHEST * float(same_mm.max(initial=SAME_MM))
     low, high = head.mesh_world.vertices.min(axis=0) - reach, head.mesh_world.vertices.max(axis=0) + reach
-    candidates = np.flatnonzero((skin > 0.0) & ((vertices > low) & (vertices < high)).all(axis=1))
+    enclosed = _ramp(mean_around(beside, skin, np.ones(len(vertices))), ENCLOSED)
+    drawn = np.where(deviation_mm > 0.0, skin, enclosed)
+    candidates = np.flatnonzero((drawn > 0.0) & ((vertices > low) & (vertices < high)).all(axis=1))
     if not len(candidates) or not len(head.mesh_world.faces):
         return mesh_world
     normals = normals_of(mesh_world)[candidates]
@@ -82,9 +86,9 @@ def drawn_to_skin(
     agreement[candidates] = same * np.exp(-((hit.distances / same_mm[candidates]) ** 2))
     shown[candidates] = skin[candidates]
     around = mean_around(beside, agreement, shown)[candidates]
-    consent = np.clip((around - CONSENT[0]) / (CONSENT[1] - CONSENT[0]), 0.0, 1.0)
+    consent = _ramp(around, CONSENT)
     near = agreement[candidates]
-    share = skin[candidates] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
+    share = drawn[candidates] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
     apart_mm, compared = np.zeros(len(vertices)), np.zeros(len(vertices))
     apart_mm[candidates] = ((hit.points - vertices[candidates]) * hit.normals).sum(axis=1)
     compared[candidates] = skin[candidates] * same
@@ -93,6 +97,11 @@ def drawn_to_skin(
     share *= trust_of(offset_mm, stated_mm, compared[candidates])
     vertices[candidates] += share[:, None] * (hit.points - vertices[candidates])
     return Mesh(vertices, mesh_world.faces)
+
+
+def _ramp(values: Float[np.ndarray, " n"], ends: tuple[float, float]) -> Float[np.ndarray, " n"]:
+    """Returns 0 up to the first end, 1 from the second on, and a straight line between them."""
+    return np.clip((values - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
 
 
 def trust_of(

@@ -8,7 +8,10 @@ import numpy as np
 from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, pinhole, placed
 
-DEPTH, NORMAL, SIGMA, OUTLINE, FRAME = 0, 1, 4, 5, 6  # columns of a pixel; the normal has three
+NORMAL, SIGMA, OUTLINE, FRAME = 0, 3, 4, 5  # columns of ``Pixels.shown``; the normal has three
+# What one step of a column is: a thousandth of a millimetre and a 32nd of a pixel are far below what is measured.
+NORMAL_STEP, SIGMA_STEP_MM, PIXEL_STEP = 1 / 32767, 1e-3, 1 / 32
+UNKNOWN = -1  # deviation of a pixel whose depth is not known
 CENTRE = 16  # of a camera's row: its centre
 MAX_VIEWS = 64
 PLANE_SHARE = 0.3  # of the way along the ray that a place before a surface is off at least, however flat that is seen
@@ -16,7 +19,6 @@ THICKEST_MM = 60.0  # of a body behind its surface, where no silhouette bounds i
 UNDECIDED = -1.0  # weight of a place inside of the outlines that only their guess beyond the photographs leaves out
 WIDENING = 1.0  # beyond a photograph a body may widen by as much as it lies beyond it: shoulders do
 FLATTEST = 0.1  # cosine beyond which a tangent plane says nothing of a place beside it
-UNKNOWN_MM = 1e9  # deviations beyond are infinite
 
 
 class Pixels(NamedTuple):
@@ -25,7 +27,8 @@ class Pixels(NamedTuple):
     cameras: np.ndarray
     sizes: np.ndarray
     starts: np.ndarray
-    pixels: np.ndarray
+    depth_mm: np.ndarray
+    shown: np.ndarray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -53,7 +56,7 @@ def vote(
     ``index`` (n, 3) and ``corner`` (3, world, mm) place the nodes, ``step_mm`` apart. ``limits`` are reach, behind,
     largest difference of agreeing votes, and the deviation (mm) at which a vote has unit weight and its lower limit.
     """
-    cameras, sizes, starts, pixels = views
+    cameras, sizes, starts, depths, shown = views
     reach, behind, agreement, unit, floor = limits
     votes, weights, place = np.empty(MAX_VIEWS), np.empty(MAX_VIEWS), np.empty(3)
     for n in range(first, last):
@@ -71,7 +74,7 @@ def vote(
             at, beyond = nearest_pixel(column, row, sizes[v])
             at += starts[v]
             scale = depth / cameras[v, LENS]
-            edge, off = (pixels[at, FRAME] + beyond) * scale, pixels[at, OUTLINE] * scale
+            edge, off = (PIXEL_STEP * shown[at, FRAME] + beyond) * scale, PIXEL_STEP * shown[at, OUTLINE] * scale
             framed, framed_next = min(framed, edge), min(framed_next, max(framed, edge))
             guess = max(guess, off - WIDENING * beyond * scale)
             if edge > 0.0:
@@ -79,24 +82,26 @@ def vote(
             hull, hull_next = max(hull, off), max(hull_next, min(hull, off))
             if hull_next > reach:
                 break  # two silhouettes say that nobody is there
-            sigma = pixels[at, SIGMA]
-            if beyond > 0.0 or not sigma < UNKNOWN_MM:
+            if beyond > 0.0 or shown[at, SIGMA] == UNKNOWN:
                 continue
-            facing = max(cosine(cameras[v], place, depth, pixels[at]), FLATTEST)
-            before = (pixels[at, DEPTH] - depth) * facing
+            sigma = SIGMA_STEP_MM * shown[at, SIGMA]
+            facing = max(cosine(cameras[v], place, depth, shown[at]), FLATTEST)
+            before = (depths[at] - depth) * facing
             if before < -behind:
-                hidden = min(hidden, depth - pixels[at, DEPTH])
+                hidden = min(hidden, depth - depths[at])
                 continue
             share = min(unit * unit / (sigma * sigma + floor * floor) * min(1.0, 2.0 * facing), 2.0)
             if before < 0.0:
                 share *= 1.0 + 0.75 * before / behind
-            votes[count] = min(max(before, PLANE_SHARE * (pixels[at, DEPTH] - depth)), reach)
+            votes[count] = min(max(before, PLANE_SHARE * (depths[at] - depth)), reach)
             weights[count] = share
             count += 1
         hull = max(hull, framed_next)
         bound[n] = min(max(hull, -reach), reach)
         value[n], weight[n] = agreed(votes, weights, count, agreement)
-        if count == 0:
+        if hull_next > reach:  # whatever views before those two say
+            value[n], weight[n] = reach, 0.0
+        elif count == 0:
             body = min(max(guess, hull), max(hidden - THICKEST_MM, hull))
             value[n] = min(max(body, -reach), reach)
             if hull < 0.0 < body:
@@ -108,7 +113,8 @@ def seen_at(camera: np.ndarray, place: np.ndarray) -> tuple[float, float, float]
     """Returns the depth (mm), column and row (px) of a point (world, mm) in a camera, a row of
     ``view_stack.ViewStack.cameras``."""
     x, y, depth = placed(camera, place[0], place[1], place[2])
-    column, row = pinhole(x / depth, y / depth, camera[LENS:])
+    inverse = 1.0 / depth  # one division: they are what takes long here
+    column, row = pinhole(inverse * x, inverse * y, camera[LENS:])
     return depth, column, row
 
 
@@ -117,16 +123,18 @@ def nearest_pixel(column: float, row: float, size: np.ndarray) -> tuple[int, flo
     """Returns the number (row by row) of the pixel nearest to a point, and how far (px) the point lies outside of the
     image. ``size`` is height and width."""
     inside_column, inside_row = min(max(column, 0.0), size[1] - 1.0), min(max(row, 0.0), size[0] - 1.0)
-    beyond = np.sqrt((column - inside_column) ** 2 + (row - inside_row) ** 2)
+    beyond = 0.0
+    if inside_column != column or inside_row != row:
+        beyond = np.sqrt((column - inside_column) ** 2 + (row - inside_row) ** 2)
     return int(inside_row + 0.5) * size[1] + int(inside_column + 0.5), beyond
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
-def cosine(camera: np.ndarray, place: np.ndarray, depth: float, pixel: np.ndarray) -> float:
+def cosine(camera: np.ndarray, place: np.ndarray, depth: float, shown: np.ndarray) -> float:
     """Returns the cosine between a pixel's normal and the direction to the camera, times the ray's length for each mm
     of depth. Multiplied by a difference in depth, it gives the distance to the pixel's tangent plane."""
     x, y, z = place[0] - camera[CENTRE], place[1] - camera[CENTRE + 1], place[2] - camera[CENTRE + 2]
-    return -(x * pixel[NORMAL] + y * pixel[NORMAL + 1] + z * pixel[NORMAL + 2]) / depth
+    return -NORMAL_STEP * (x * shown[NORMAL] + y * shown[NORMAL + 1] + z * shown[NORMAL + 2]) / depth
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")

@@ -7,14 +7,15 @@ from pipeline.compute.jit import njit
 
 @njit(cache=True, nogil=True, fastmath=True)
 def spread_parts(slope, offset, size_px, grey, mask, out):
-    """Fills ``out`` (h, w, 3) with the probabilities of the three parts at the pixels of ``mask`` (h, w): ``slope *
-    grey + offset``, limited to 0 to 1 and to a sum of at most 1. Other pixels are left as they are.
+    """Fills ``out`` (h, w, 3; uint8) with the probabilities of the three parts, in 255ths, at the pixels of ``mask``
+    (h, w): ``slope * grey + offset``, limited to 0 to 1 and to a sum of at most 1. Other pixels are left as they are.
 
     ``slope`` and ``offset`` (r, c, 3) are interpolated between the middles of cells of ``size_px`` pixels, and constant
     beyond the outermost ones; ``grey`` (h, w) is 0 to 255, and counts as 0 to 1.
     """
     rows, columns = slope.shape[:2]
     one, per = np.float32(1.0), np.float32(1.0 / 255.0)
+    share = np.empty(3, np.float32)
     between = np.empty((columns, 6), np.float32)  # slopes and offsets at the height of a row of pixels
     for y in range(len(mask)):
         at = min(max((y + 0.5) / size_px - 0.5, 0.0), rows - 1.0)
@@ -34,8 +35,10 @@ def spread_parts(slope, offset, size_px, grey, mask, out):
             for part in range(3):
                 steep = (one - right) * between[left, part] + right * between[next_, part]
                 level = (one - right) * between[left, 3 + part] + right * between[next_, 3 + part]
-                out[y, x, part] = min(max(steep * shade + level, np.float32(0.0)), one)
-                total += out[y, x, part]
-            if total > one:
-                for part in range(3):
-                    out[y, x, part] /= total
+                share[part] = min(max(steep * shade + level, np.float32(0.0)), one)
+                total += share[part]
+            per_part, left = np.float32(255.0) / max(total, one), 255
+            for part in range(3):
+                rounded = min(int(share[part] * per_part + np.float32(0.5)), left)
+                out[y, x, part] = rounded
+                left -= rounded

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from pipeline.compute.threads import map_in_threads
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.appearance_cells import Cells, head_guide, make_cells
-from pipeline.part_labels.codes import CHANNELS
+from pipeline.part_labels.codes import CHANNELS, Part
 from pipeline.part_labels.label_kernels import spread_parts
 from pipeline.settings import PartSettings
 from rig.mesh import Mesh
@@ -46,11 +46,21 @@ FLOOR = 0.02  # of a part's looks that its histogram has not shown
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartMap:
-    """Holds one view's probabilities of skin, hair and clothes at each pixel of the photograph. Where they sum to less
-    than one, the rest is unknown; outside the subject all of it is."""
+    """Holds one view's probabilities of skin, hair and clothes at each pixel of the photograph, in 255ths: a byte each,
+    since a view has millions. Where they sum to less than 255, the rest is unknown; outside the subject all of it
+    is."""
 
     camera: str
-    probability: Float32[np.ndarray, "h w 3"]
+    of_255: UInt8[np.ndarray, "h w 3"]
+
+    @property
+    def probability(self) -> Float32[np.ndarray, "h w 3"]:
+        """Returns all probabilities, 0 to 1."""
+        return self.of_255 * np.float32(1 / 255)
+
+    def probability_of(self, part: Part) -> Float32[np.ndarray, "h w"]:
+        """Returns the probability of one part at every pixel."""
+        return self.of_255[..., part.channel] * np.float32(1 / 255)
 
 
 def classify_parts(
@@ -284,13 +294,13 @@ def upsample_guided(
     image: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
     settings: PartSettings,
-) -> Float32[np.ndarray, "h w 3"]:
-    """Returns the cells' probabilities at each pixel of the photograph, smooth except at its edges."""
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns the cells' probabilities (255ths) at each pixel of the photograph, smooth except at its edges."""
     grid = np.zeros((*inside.shape, 3), np.float32)
     grid[inside] = share
     radius = max(1, round(0.5 * settings.smooth_mm / settings.cell_mm))
     slope, offset = guided(view.grey, grid, inside.astype(np.float32), radius, settings.edge)
-    grey, smooth = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), np.zeros((*mask.shape, 3), np.float32)
+    grey, smooth = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), np.zeros((*mask.shape, 3), np.uint8)
     spread_parts(slope, offset, view.size_px, grey, mask, smooth)
     return smooth
 

@@ -73,10 +73,10 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
 
 
 def _shown(points: Float[np.ndarray, "n 3"], part: PartMap, rig: Rig) -> Float[np.ndarray, "n 3"]:
-    height, width = part.probability.shape[:2]
+    height, width = part.of_255.shape[:2]
     column, row = np.rint(np.nan_to_num(project_points(rig[part.camera], points), nan=-1.0)).astype(int).T
     framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return part.probability[np.where(framed, row, 0), np.where(framed, column, 0)] * framed[:, None]
+    return part.of_255[np.where(framed, row, 0), np.where(framed, column, 0)] * (framed / 255.0)[:, None]
 
 
 def _keys(cell: Int[np.ndarray, "n 3"], size: Int[np.ndarray, " 3"]) -> Int[np.ndarray, " n"]:

@@ -78,6 +78,7 @@ class Options:
         folders: captures, of people and relief; of scaling, those to run a job on; of meshes, results.
         only: which rows of people, growth, wrap and hair-shell to run.
         detail: level of detail of people.
+        realism: names of ``rig.studio.sensor.realism``, of hidden and visible.
         job: command that scaling runs.
     """
 
@@ -87,6 +88,7 @@ class Options:
     folders: tuple[Path, ...] = ()
     only: tuple[str, ...] = ()
     detail: str | None = None
+    realism: tuple[str, ...] = ()
     job: JobCommand | None = None
 
 
@@ -207,6 +209,7 @@ def _hidden(task: Task) -> Outcome:
             report=task.report,
             others=_facekit(task.shared),
             subjects=task.subjects or 4,
+            realism=task.options.realism,
             folder=task.folder,
         )
 
@@ -214,7 +217,10 @@ def _hidden(task: Task) -> Outcome:
 def _visible(task: Task) -> Outcome:
     count = {"subjects": task.subjects} if task.subjects else {}
     with Renderer.create() as renderer:
-        return visible(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
+        return visible(
+            task.head, _captures(task), renderer=renderer, report=task.report, realism=task.options.realism,
+            folder=task.folder, **count,
+        )  # fmt: skip
 
 
 def _texture(task: Task) -> Outcome:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from pipeline.faces.networks import FaceNetworks, load_networks
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import segment
@@ -30,7 +29,6 @@ class ReconstructionContext:
         renderer: an OpenGL context of the calling thread.
         progress: called with a stage's name and the share of it that is done; raises Cancelled to stop.
         segment: computes the silhouettes of a capture; a caller that caches them passes its own function.
-        networks: neural networks that find faces; a caller of many jobs loads them once.
         read_original: reads a picture at the size of its file, for the detail ``pores``; None where there are no files.
         device: GPU that compares the photographs; None uses the processor.
     """
@@ -42,7 +40,6 @@ class ReconstructionContext:
     renderer: Renderer
     progress: Progress = discard_progress
     segment: Segment = field(default=segment)
-    networks: FaceNetworks = field(default_factory=load_networks)
     device: ComputeDevice | None = None
     read_original: ReadImage | None = None
 

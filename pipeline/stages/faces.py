@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from pipeline.faces.eyes import eye_openings
+from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import SubjectFaces, find_subject
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Staged, stage
@@ -27,7 +28,7 @@ def find_faces(context: ReconstructionContext, capture: Capture) -> Staged[Faces
     """Finds the subject's face in every photograph that shows it."""
     if not context.settings.faces.find:
         return Staged(Faces(None))
-    subject = find_subject(
-        capture.images, context.rig, context.networks, report=lambda share: context.progress("faces", share)
+    subject = find_subject(  # the networks end with it: 60 MB that no later stage needs
+        capture.images, context.rig, load_networks(), report=lambda share: context.progress("faces", share)
     )
     return Staged(Faces(subject, {} if subject.matched is None else eye_openings(subject.matched, context.rig)))

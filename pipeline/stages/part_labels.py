@@ -1,6 +1,6 @@
 """Labels what the pixels show: skin, hair or clothes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from jaxtyping import Float32
@@ -23,13 +23,31 @@ class PartLabels:
 
     maps: Mapping[str, PartMap]
 
-    def hair_probability(self) -> dict[str, Float32[ndarray, "_ _"]]:
+    def hair_probability(self) -> "OnePart":
         """Returns, for each camera, the probability of hair at every pixel."""
-        return {name: part.probability[..., Part.HAIR.channel] for name, part in self.maps.items()}
+        return OnePart(self.maps, Part.HAIR)
 
-    def skin_probability(self) -> dict[str, Float32[ndarray, "_ _"]]:
+    def skin_probability(self) -> "OnePart":
         """Returns, for each camera, the probability of skin at every pixel."""
-        return {name: part.probability[..., Part.SKIN.channel] for name, part in self.maps.items()}
+        return OnePart(self.maps, Part.SKIN)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
+    """Gives the probability of one part at every pixel, by camera. Each map is computed when it is read: all of them
+    would take four times the memory of what they follow from."""
+
+    maps: Mapping[str, PartMap]
+    part: Part
+
+    def __getitem__(self, camera: str) -> Float32[ndarray, "_ _"]:
+        return self.maps[camera].probability_of(self.part)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.maps)
+
+    def __len__(self) -> int:
+        return len(self.maps)
 
 
 @stage("parts")

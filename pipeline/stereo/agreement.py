@@ -88,6 +88,4 @@ def _depth_map(
         normal=normals_of_known(field.depth, field.slopes, known, *placing(crop.camera)[:2]),
         deviation_mm=np.where(known, deviation, np.float32(np.inf)),
         views=np.where(known, agreeing + 1, 0).astype(np.uint8),
-        mask=crop.mask,
-        colour=crop.colour,
     )

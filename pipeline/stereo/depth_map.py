@@ -22,8 +22,6 @@ class DepthMap:
     normal: Float32[np.ndarray, "h w 3"]  # unit, world frame, towards the camera
     deviation_mm: Float32[np.ndarray, "h w"]  # standard deviation along the ray; inf where nothing is known
     views: UInt8[np.ndarray, "h w"]  # that agree on the place, this one counted
-    mask: Float32[np.ndarray, "h w"]  # the subject's coverage, 0 to 1
-    colour: UInt8[np.ndarray, "h w 3"]  # the photograph, RGB
 
     @property
     def known(self) -> Bool[np.ndarray, "h w"]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder, warn
 
 if TYPE_CHECKING:
     from pipeline.clinic.comparison import Comparison
@@ -50,6 +50,8 @@ def compare(
     comparison = compare_visits(read_visit(earlier, model), read_visit(later, model))
     prepare_folder(out)
     document = write_comparison(out, comparison, date.today().isoformat())
+    for warning in comparison.warnings:
+        warn(str(warning))
     answer(document | {"out": str(out)}, json_out, _comparison_lines(comparison, out))
 
 

@@ -7,7 +7,7 @@ import typer
 
 from rig.errors import EigenheadError
 from rig.messages.message import compose
-from server.cli.answers import Json, answer, chosen, progress_bar
+from server.cli.answers import Json, answer, chosen, progress_bar, wrong_usage
 from server.processes import python_command, python_environment
 
 if TYPE_CHECKING:
@@ -18,6 +18,19 @@ app = typer.Typer(rich_markup_mode=None)
 
 def _detail_levels() -> tuple[str, ...]:
     return "span", "kernel", "photo", "fine"
+
+
+Only = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="people: rows of this rig (front-3, circle-24), evidence (plates, masks, neither) or subject alone; "
+        "or eyes. growth: views or pixels alone. wrap, hair-shell: this capture alone. May be repeated."
+    ),
+]
+Realism = Annotated[
+    str | None,
+    typer.Option(help="hidden, visible: the studio's heads once more with these names of simulate --realism."),
+]
 
 
 @app.command(epilog="Example: eigenhead experiments limit --subjects 3 --json")
@@ -47,14 +60,9 @@ def experiments(
     ] = None,
     captures: Annotated[bool, typer.Option(help="hidden, visible, texture: the captures of --shared, too.")] = False,
     openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="people: rows of this rig (front-3, circle-24), evidence (plates, masks, neither) or subject alone; "
-            "or eyes. growth: views or pixels alone. wrap, hair-shell: this capture alone. May be repeated."
-        ),
-    ] = None,
+    only: Only = None,
     detail: Annotated[str | None, chosen("people: span, kernel, photo or fine (the default).", _detail_levels)] = None,
+    realism: Realism = None,
     front: Annotated[str | None, typer.Option(help="real: the view that the subject faces.")] = None,
     outlines: Annotated[
         Path | None, typer.Option(help="real: outlines drawn by hand, outlines.json.", exists=True, dir_okay=False)
@@ -70,10 +78,13 @@ def experiments(
     if name == "real":
         _experiment_real(folders or [], model, front, outlines, out, json_out)
         return
-    _check_options(name, folders, only, detail)
+    _check_options(name, folders, only, detail, realism)
+    skin = _realism_names(realism)
     from pipeline.research.runner import Options, run_experiment
 
-    options = Options(simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail, _job_command())
+    options = Options(
+        simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail, skin, job=_job_command()
+    )
     with progress_bar() as report:
         found = run_experiment(
             name, model=model, subjects=subjects, shared=shared, folder=out, report=report, options=options
@@ -82,13 +93,28 @@ def experiments(
     answer(found, json_out, lines or [f"{key:<40} {value:.6g}" for key, value in found["figures"].items()])
 
 
-def _check_options(name: str, folders: list[Path] | None, only: list[str] | None, detail: str | None) -> None:
+def _check_options(
+    name: str, folders: list[Path] | None, only: list[str] | None, detail: str | None, realism: str | None
+) -> None:
     if folders and name not in ("people", "relief", "scaling", "meshes"):
         raise typer.BadParameter("only real, people, relief, scaling and meshes take folders", param_hint="FOLDERS")
     if only and name not in ("people", "growth", "wrap", "hair-shell"):
         raise typer.BadParameter("only people, growth, wrap and hair-shell take it", param_hint="--only")
     if detail and name != "people":
         raise typer.BadParameter("only people takes it", param_hint="--detail")
+    if realism and name not in ("hidden", "visible"):
+        raise typer.BadParameter("only hidden and visible take it", param_hint="--realism")
+
+
+def _realism_names(text: str | None) -> tuple[str, ...]:
+    """Returns the names in ``--realism``. Raises typer.BadParameter for an unknown one."""
+    from rig.studio.sensor.preset import PRESET
+    from rig.studio.sensor.realism import made_real, realism_names
+
+    names = realism_names(text)
+    with wrong_usage("--realism"):
+        made_real(PRESET, names)
+    return names
 
 
 def check_research() -> None:

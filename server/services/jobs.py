@@ -228,12 +228,12 @@ class Jobs:
     def cancel(self, job_id: str) -> tuple[Job, bool]:
         """Cancels a queued or running job; a finished one stays as it is. Returns the job, and whether this call
         cancelled it. A worker notices within about a second. Raises NotFound."""
-        before = self.state(job_id)
-        if before not in FINISHED:
+        if runs := self.state(job_id) not in FINISHED:
             self.client.cancel_workflow(job_id)
-            self.events.append(job_id, {"state": self.state(job_id)})
         job = self.get(job_id)
-        return job, before not in FINISHED and job.state == "cancelled"
+        if job.state == "cancelled":
+            self.events.replace_end(job_id, {"state": "cancelled"})
+        return job, runs and job.state == "cancelled"
 
     def files(self, job_id: str) -> dict[str, FileEntry]:
         """Returns size and SHA-256 of the files of a job's result, by name. Raises NotFound, and Conflict if the job

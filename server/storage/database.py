@@ -13,13 +13,15 @@ from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import event
-from sqlalchemy.exc import IntegrityError, SQLAlchemyError
+from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from rig.errors import EigenheadError
 from server.settings import ServiceSettings
 
 CONNECT_S = 10  # a database that does not even refuse
 SCRUB_TRIES, SCRUB_PAUSE_S = 20, 0.05
+AWAY = (OperationalError, InterfaceError, PoolTimeout)  # what is raised where the database does not answer
 
 metadata = sa.MetaData()
 

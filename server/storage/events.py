@@ -4,10 +4,17 @@ import json
 from dataclasses import dataclass
 
 import sqlalchemy as sa
+import structlog
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 
-from server.storage.database import events, now_sql
+from server.storage.database import AWAY, events, now_sql
+from server.storage.failure_counts import note_failure
 from server.storage.records import EventDocument
+
+END = 2**31 - 1  # the number of a job's end, the largest of the column: the table's key holds that a job has one
+
+log = structlog.get_logger()
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,17 +28,18 @@ class JobEvent:
 
 class EventLog:
     """Reads and writes the events of jobs. Within a job their numbers grow, from 1, also if another worker takes the
-    job over. A number is missing where its event was superseded."""
+    job over. A number is missing where its event was superseded. The last event is the job's end, under ``END``."""
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
 
     def append(self, job_id: str, document: EventDocument, instead_of: int | None = None) -> int | None:
         """Adds an event to a job under the next number, which it returns. ``instead_of``: the number of an event that
-        the new one supersedes. If another writer takes the next number first, it tries again, twenty times; after that
-        the event is dropped and it returns None."""
+        the new one supersedes. If another writer takes the next number first, it tries again, twenty times; after that,
+        and where the database is away, the event is dropped and it returns None: the next one tells more."""
         event, text = events.c, json.dumps(document)
-        following = sa.select(sa.func.coalesce(sa.func.max(event.seq), 0) + 1).where(event.job_id == job_id)
+        following = sa.select(sa.func.coalesce(sa.func.max(event.seq), 0) + 1)
+        following = following.where(event.job_id == job_id, event.seq < END)
         row = {"job_id": job_id, "seq": following.scalar_subquery(), "document": text, "at": now_sql(self._engine)}
         changes: list[sa.UpdateBase] = [sa.insert(events).values(**row).returning(event.seq)]
         if instead_of is not None:
@@ -45,7 +53,28 @@ class EventLog:
                             return seq
             except IntegrityError:
                 continue
+            except AWAY as error:
+                log.info("an event is not written", reason=str(error)[:200])
+                return None
         return None
+
+    def end(self, job_id: str, document: EventDocument, *, failure: str | None = None) -> bool:
+        """Adds the end of a job, and counts ``failure``, the kind of a failed job, with it. Returns whether the job had
+        no end before; otherwise nothing changes. A worker may be killed before the job engine knows of the end; whoever
+        takes the job over then repeats the call."""
+        insert = self._end(job_id, document).on_conflict_do_nothing().returning(events.c.seq)
+        with self._engine.begin() as connection:
+            is_first = connection.scalar(insert) is not None
+            if is_first and failure is not None:
+                note_failure(connection, failure)
+        return is_first
+
+    def replace_end(self, job_id: str, document: EventDocument) -> None:
+        """Adds the end of a job in place of one that a worker wrote and that did not come to pass."""
+        insert = self._end(job_id, document)
+        new = {"document": insert.excluded.document, "at": insert.excluded.at}
+        with self._engine.begin() as connection:
+            connection.execute(insert.on_conflict_do_update(index_elements=[events.c.job_id, events.c.seq], set_=new))
 
     def since(self, job_id: str, seq: int, limit: int = 1000) -> list[JobEvent]:
         """Returns the events of a job with numbers above ``seq``, in order, ``limit`` at most."""
@@ -70,3 +99,8 @@ class EventLog:
         """Removes all events of these jobs."""
         with self._engine.begin() as connection:
             connection.execute(sa.delete(events).where(events.c.job_id.in_(job_ids)))
+
+    def _end(self, job_id: str, document: EventDocument) -> "sqlite.Insert | postgresql.Insert":
+        insert = sqlite.insert if self._engine.dialect.name == "sqlite" else postgresql.insert
+        row = {"job_id": job_id, "seq": END, "document": json.dumps(document), "at": now_sql(self._engine)}
+        return insert(events).values(**row)

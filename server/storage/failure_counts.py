@@ -7,13 +7,12 @@ from sqlalchemy.dialects import postgresql, sqlite
 from server.storage.database import failures
 
 
-def note_failure(engine: sa.Engine, kind: str) -> None:
-    """Adds one to the count of a kind of failure, atomically."""
-    insert = sqlite.insert if engine.dialect.name == "sqlite" else postgresql.insert
+def note_failure(connection: sa.Connection, kind: str) -> None:
+    """Adds one to the count of a kind of failure in the caller's transaction."""
+    insert = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
     first = insert(failures).values(kind=kind, count=1)
-    with engine.begin() as connection:
-        more = {"count": failures.c["count"] + 1}
-        connection.execute(first.on_conflict_do_update(index_elements=["kind"], set_=more))
+    more = {"count": failures.c["count"] + 1}
+    connection.execute(first.on_conflict_do_update(index_elements=["kind"], set_=more))
 
 
 def failure_counts(engine: sa.Engine) -> dict[str, int]:

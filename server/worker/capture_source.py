@@ -21,7 +21,7 @@ from server.services.stored_captures import bound_captures, forget_erased
 from server.settings import ServiceSettings
 from server.storage.objects import StoreUnavailable
 from server.storage.store import Store
-from server.worker.pauses import pause
+from server.worker.pauses import insist, pause
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 15.0
 TIDY_S = 30.0
@@ -84,11 +84,11 @@ class CaptureSource:
         pause_s = FIRST_PAUSE_S
         while True:
             try:
-                return self._store.capture_files(capture)
+                return insist(self._stop, lambda: self._store.capture_files(capture))
             except StoreUnavailable as error:
                 log.warning("a job waits for its capture", reason=error.detail.text)
             except Conflict as error:  # it is being stored, or somebody removed it from the store
-                if not self._is_expected(capture):
+                if not insist(self._stop, lambda: self._is_expected(capture)):
                     raise JobFailed(error.kind, error.detail) from error
             except Refused as error:
                 raise JobFailed(error.kind, error.detail, error.errors) from error

@@ -22,7 +22,7 @@ from server.storage.object_places import locate, open_objects
 from server.storage.objects import ObjectStore, StoreDenied, StoreUnavailable, sha256_of
 from server.storage.records import DeliveryRequest, FileEntry
 from server.storage.store import Store, StoredFile
-from server.worker.pauses import pause
+from server.worker.pauses import insist, pause
 
 DELIVERIES_AT_ONCE = 4  # of one worker; they wait for the store, not for cores
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0  # between two tries where the store is away
@@ -63,7 +63,8 @@ class Deliverer:
     def announce(self, wanted: DeliveryRequest, state: str) -> None:
         """Announces to the webhooks of the service and of the job whether its result was delivered."""
         hook, place = wanted.get("webhook"), place_of(wanted) if state == "delivered" else None
-        self._webhooks.announce(wanted["job_id"], state, DBOS.enqueue_workflow_with_options, hook, place)
+        enqueue = DBOS.enqueue_workflow_with_options
+        insist(self._stop, lambda: self._webhooks.announce(wanted["job_id"], state, enqueue, hook, place))
 
     def deliver(self, wanted: DeliveryRequest) -> bool:
         """Delivers a job's result, and waits for a store that is away. Returns False where the job or its delivery was

@@ -1,6 +1,17 @@
 """Pauses of a worker's steps, which its stop ends."""
 
 import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+import structlog
+
+from server.storage.database import AWAY
+
+T = TypeVar("T")
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0  # of the database: it answers all or none, and many wait for it
+
+log = structlog.get_logger()
 
 
 class WorkerStopped(BaseException):
@@ -12,3 +23,16 @@ def pause(stop: threading.Event, seconds: float) -> None:
     """Waits so many seconds. Raises WorkerStopped as soon as ``stop`` is set."""
     if stop.wait(seconds):
         raise WorkerStopped
+
+
+def insist(stop: threading.Event, action: Callable[[], T]) -> T:
+    """Calls ``action``, again and again while the database is away; what it does may then be done twice. Raises
+    WorkerStopped, and what else ``action`` raises."""
+    pause_s = FIRST_PAUSE_S
+    while True:
+        try:
+            return action()
+        except AWAY as error:
+            log.warning("a job waits for the database", reason=str(error)[:200])
+        pause(stop, pause_s)
+        pause_s = min(2 * pause_s, LONGEST_PAUSE_S)

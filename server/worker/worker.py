@@ -45,13 +45,11 @@ from server.settings import ServiceSettings
 from server.storage.capture_blobs import open_capture_blobs
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
-from server.storage.failure_counts import note_failure
 from server.storage.folders import move_durably
 from server.storage.records import (
     CalibrationOutcome,
     FileEntry,
     JobRequest,
-    JobWebhook,
     WebhookMessage,
 )
 from server.storage.store import Store
@@ -64,8 +62,9 @@ from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
 from server.worker.engine import engine_config, take_over
 from server.worker.heartbeat import dead_workers
-from server.worker.pauses import pause
-from server.worker.result_files import described, warnings_of
+from server.worker.outcome import Outcomes
+from server.worker.pauses import insist, pause
+from server.worker.result_files import described
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
 
@@ -90,6 +89,7 @@ class Worker:
         self._states = _StateWatch(settings.poll_s)
         self.results = Results(self.store, settings)
         self._captures = CaptureSource(self.store, settings, self._states.runs, self._stop)
+        self.outcomes = Outcomes(self.engine, self.store, self._webhooks, self._stop)
         self._deliverer = Deliverer(settings, self.store, self._webhooks, self.results, self._stop)
 
     def start(self) -> None:
@@ -115,10 +115,8 @@ class Worker:
         log.info("worker ready", worker=self.id, queue=self.settings.queue, concurrency=limit)
 
     def run_until_stopped(self) -> None:
-        """Runs jobs until ``stop`` is called or SIGTERM or SIGINT arrives, then ends the process. A job that is running
-        then is taken over by another worker."""
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self._stop.set())
+        """Runs jobs until ``stop`` is called, then ends the process. A job that is running then is taken over by
+        another worker."""
         while not self._stop.wait(0.5):
             pass
         with suppress(SQLAlchemyError), self.engine.begin() as connection:
@@ -135,7 +133,7 @@ class Worker:
 
         @DBOS.step(name="ingest")
         def ingest(job_id: str, request: JobRequest) -> None:
-            worker.ingest(job_id, request)
+            insist(worker._stop, lambda: worker.ingest(job_id, request))
 
         @DBOS.step(name="fit")
         def fit(job_id: str, request: JobRequest) -> str:
@@ -143,7 +141,7 @@ class Worker:
 
         @DBOS.step(name="publish")
         def publish(job_id: str, attempt: str) -> dict[str, FileEntry]:
-            return worker.publish(job_id, attempt)
+            return insist(worker._stop, lambda: worker.publish(job_id, attempt))
 
         @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=self.settings.attempts)
         def reconstruct_job(request: JobRequest) -> dict[str, FileEntry]:
@@ -155,13 +153,12 @@ class Worker:
                     files = publish(job_id, fit(job_id, request))
                 except JobFailed as error:
                     log.warning("job failed", kind=error.kind, detail=error.detail.text)
-                    worker.publish_outcome(job_id, "failed", request.get("webhook"))
-                    worker.count_failure(error.kind)
+                    worker.outcomes.publish(job_id, "failed", request.get("webhook"), failure=error.kind)
                     raise
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
                     worker.results.discard(job_id)
                     raise
-                worker.publish_outcome(job_id, "succeeded", request.get("webhook"))
+                worker.outcomes.publish(job_id, "succeeded", request.get("webhook"))
                 worker._captures.leave(job_id, request["capture_id"])
                 if "deliver_to" in request:
                     place, hook = request["deliver_to"], request.get("webhook")
@@ -287,22 +284,6 @@ class Worker:
         log.info("job finished", bytes=sum(file["bytes"] for file in files.values()))
         return files
 
-    def publish_outcome(self, job_id: str, state: str, job_webhook: JobWebhook | None = None) -> None:
-        """Writes how a job ended as the last event of its stream, with the warnings that an operator must act on, and
-        queues messages to the webhooks of the service and of the job."""
-        warnings = warnings_of(self.store.folder("jobs", job_id) / "result" / "report.json")
-        for warning in warnings:
-            log.warning(warning["message"], code=warning["code"])
-        moved = [warning["message"] for warning in warnings if warning["code"] == "camera-moved"]
-        with suppress(SQLAlchemyError):
-            self.events.append(job_id, {"state": state, "camera_moved": moved} if moved else {"state": state})
-        self._webhooks.announce(job_id, state, DBOS.enqueue_workflow_with_options, job_webhook=job_webhook)
-
-    def count_failure(self, kind: str) -> None:
-        """Counts a failed job for the metrics. If the database does not answer, the failure is not counted."""
-        with suppress(SQLAlchemyError):
-            note_failure(self.engine, kind)
-
     def _failure(self, error: BaseException) -> BaseException:
         if isinstance(error, Cancelled):
             return error
@@ -347,6 +328,8 @@ class Worker:
         if gone:
             for job_id in take_over(gone):
                 log.warning("job taken over", job=job_id)
+        for job_id in self.outcomes.publish_set_aside():
+            log.warning("job set aside", job=job_id)
         with self.engine.begin() as connection:
             old = sa.and_(workers.c.id.in_(dead), workers.c.seen < now_sql(connection) - FORGET_S)
             connection.execute(sa.delete(workers).where(old))
@@ -381,9 +364,11 @@ class _StateWatch:
 
 
 def run_worker(settings: ServiceSettings, *, until_eof: bool = False) -> None:
-    """Runs a worker until it is stopped; does not return. With ``until_eof`` it also stops at the end of its standard
-    input, that is when its parent ends."""
+    """Runs a worker until SIGTERM or SIGINT stops it; does not return. With ``until_eof`` it also stops at the end of
+    its standard input, that is when its parent ends."""
     worker = Worker(settings)
+    for number in (signal.SIGTERM, signal.SIGINT):  # before its row says that it lives: one that is ended says so there
+        signal.signal(number, lambda *_: worker.stop())
     worker.start()
     if until_eof:
         threading.Thread(target=_stop_at_eof, args=(worker.stop,), daemon=True).start()

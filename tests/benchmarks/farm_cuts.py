@@ -13,7 +13,8 @@ silent (what was connected stays connected, nothing comes through), the others r
 same of a fourth of the jobs before anything is killed. ``lost_to``: seconds of slots that were not slept for results in
 the disturbed part, by cause: ``starting``, from a kill to the heartbeat of the next process; ``begun_again``, what was
 slept for jobs whose worker was killed then; the rest are cuts, children that start, steps around a job and the last
-jobs. ``taken_over_s``: from a kill until another worker goes on with a job, the median.
+jobs. ``taken_over_s``: from a kill until another worker goes on with a job, the median. ``connections``: of all to the
+database, before anything is killed.
 """
 
 import json
@@ -28,11 +29,13 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import httpx
 import psycopg
@@ -49,9 +52,13 @@ SEED = 37
 BLOCK = 1 << 16
 STARTED = "SELECT started FROM eigenhead_workers ORDER BY started"
 BEGUN = """SELECT job_id, at FROM eigenhead_events WHERE document::json ->> 'stage' = 'read' ORDER BY job_id, at"""
+CONNECTIONS = "SELECT count(*) FROM pg_stat_activity WHERE backend_type = 'client backend'"
+MORE_CONNECTIONS = "-c max_connections=400"
 NOW = "SELECT extract(epoch FROM clock_timestamp())"
-ENDED = """SELECT document::json ->> 'state', count(*) FROM eigenhead_events
-           WHERE document::json ->> 'state' IN ('succeeded', 'failed', 'cancelled') GROUP BY 1"""
+ENDED = """SELECT count(*) FILTER (WHERE ends = 0), count(*) FILTER (WHERE ends > 1) FROM
+           (SELECT job.job_id, count(event.seq) AS ends FROM eigenhead_job_index job LEFT JOIN eigenhead_events event
+            ON event.job_id = job.job_id AND document::json ->> 'state' IN ('succeeded', 'failed', 'cancelled')
+            GROUP BY 1) AS of_jobs"""
 
 
 class Link:
@@ -136,19 +143,33 @@ def farm_worker(number: int, folder: Path, service: RunningService, database: st
 class Farm:
     """The service, its database and its workers."""
 
-    def __init__(self, client: httpx.Client, database: "psycopg.Connection[Any]", workers: list[FarmWorker]) -> None:
+    def __init__(
+        self,
+        client: httpx.Client,
+        database: "psycopg.Connection[Any]",
+        bucket: Any,
+        capture: str,
+        workers: list[FarmWorker],
+    ) -> None:
         self.client, self.database, self.workers = client, database, workers
+        self._bucket, self._capture = bucket, capture
         self.killed = list[float]()
 
-    def submit(self, capture: str, jobs: int, seconds: float) -> list[str]:
-        wanted = {"capture_id": capture, "settings": {"front": f"{seconds:g}"}}
-        return [self.client.post("/v1/jobs", json=wanted).raise_for_status().json()["id"] for _ in range(jobs)]
+    def submit(self, jobs: int, seconds: float) -> list[str]:
+        wanted = {"capture_id": self._capture, "settings": {"front": f"{seconds:g}"}}
+        return [self._submit(wanted, str(uuid4())) for _ in range(jobs)]
+
+    def _submit(self, wanted: dict[str, Any], key: str) -> str:
+        """Until it is accepted, as a client does; the key makes it one job."""
+        while (said := self.client.post("/v1/jobs", json=wanted, headers={"Idempotency-Key": key})).status_code == 503:
+            time.sleep(float(said.headers["Retry-After"]))
+        return said.raise_for_status().json()["id"]
 
     def under_way(self) -> int:
         query = "SELECT count(*) FROM dbos.workflow_status WHERE status IN ('PENDING', 'ENQUEUED')"
         return self.database.execute(query).fetchall()[0][0]
 
-    def finish(self, timeout_s: float = 400.0) -> None:
+    def finish(self, timeout_s: float = 1200.0) -> None:
         deadline = time.monotonic() + timeout_s
         while self.under_way():
             assert time.monotonic() < deadline, self.under_way()
@@ -171,6 +192,24 @@ class Farm:
             "taken_over_s": statistics.median(taken_over) if taken_over else 0.0,
         }
 
+    def found(self, ids: list[str]) -> dict[str, Any]:
+        """How jobs ended, what of that was written, and what is left once their capture is removed."""
+        ended = [self.client.get(f"/v1/jobs/{job}").raise_for_status().json() for job in ids]
+        objects = self._bucket.get_paginator("list_objects_v2").paginate(Bucket="heads", Prefix="of/")
+        keys = {entry["Key"] for page in objects for entry in page.get("Contents", ())} - {"of/owner"}
+        everything = self.client.get("/v1/jobs", params={"limit": 1}).json()["total"]
+        ((unsaid, said_twice),) = self.database.execute(ENDED).fetchall()
+        assert self.client.delete(f"/v1/captures/{self._capture}").status_code == 204
+        blobs = self._bucket.list_objects_v2(Bucket="heads", Prefix="captures/").get("Contents", ())
+        return {
+            "states": dict(Counter(job["state"] for job in ended)),
+            "different_results": len({json.dumps(job["files"], sort_keys=True) for job in ended}),
+            "ends_never_said": unsaid,
+            "ends_said_more_than_once": said_twice,
+            "objects_left_over": len(keys) - 3 * everything,
+            "captures_left_over": len({entry["Key"] for entry in blobs} - {"captures/owner"}),
+        }
+
     def harm(self, kills: int, cuts: int, seconds: float) -> None:
         """Kills and cuts at random moments of about so many seconds."""
         rng = random.Random(SEED)
@@ -189,10 +228,13 @@ class Farm:
                 cut += 1
 
 
-def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, folder: Path) -> dict[str, Any]:
+@contextmanager
+def running_farm(workers: int, folder: Path) -> Iterator[Farm]:
+    """Database, store, a service with one capture, and so many workers, each of which has run jobs."""
     with ExitStack() as stack:
         os.environ.update(KEYS)
-        database_url, store = stack.enter_context(running_postgres()), stack.enter_context(running_object_server())
+        database_url = stack.enter_context(running_postgres(MORE_CONNECTIONS))
+        store = stack.enter_context(running_object_server())
         bucket = client_of(store)
         bucket.create_bucket(Bucket="heads")
         settings: dict[str, Any] = {
@@ -209,47 +251,45 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         database = stack.enter_context(psycopg.connect(database_url, autocommit=True))
         capture = uploaded_capture(service, folder)
         made = [farm_worker(number, folder, service, database_url, store) for number in range(workers)]
-        farm = Farm(client, database, made)
+        farm = Farm(client, database, bucket, capture, made)
         for worker in made:
             worker.start()
             stack.callback(worker.kill)
-        farm.submit(capture, 2 * workers * SLOTS, 0.5)
+        farm.submit(2 * workers * SLOTS, 0.5)
         farm.finish()  # every child is started
+        yield farm
+
+
+def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, folder: Path) -> dict[str, Any]:
+    slots = workers * SLOTS
+    few = max(jobs // 4 // slots, 1) * slots  # no slot without a job while the last ones run
+    with running_farm(workers, folder) as farm:
         began = time.monotonic()
-        farm.submit(capture, jobs // 4, seconds)
+        farm.submit(few, seconds)
         farm.finish()
         undisturbed_s = time.monotonic() - began
+        ((connections,),) = farm.database.execute(CONNECTIONS).fetchall()
         began = time.monotonic()
-        ids = farm.submit(capture, jobs, seconds)
-        farm.harm(kills, cuts, 0.9 * jobs * seconds / (workers * SLOTS))
+        ids = farm.submit(jobs, seconds)
+        farm.harm(kills, cuts, 0.9 * jobs * seconds / slots)
         farm.finish()
         took = time.monotonic() - began
         lost = farm.losses()
-        ended = [client.get(f"/v1/jobs/{job}").json() for job in ids]
-        files = Counter(json.dumps(job["files"], sort_keys=True) for job in ended)
-        objects = bucket.get_paginator("list_objects_v2").paginate(Bucket="heads", Prefix="of/")
-        keys = {entry["Key"] for page in objects for entry in page.get("Contents", ())} - {"of/owner"}
-        everything = client.get("/v1/jobs", params={"limit": 1}).json()["total"]
-        said = dict(database.execute(ENDED).fetchall())
-        assert client.delete(f"/v1/captures/{capture}").status_code == 204
-        blobs = bucket.list_objects_v2(Bucket="heads", Prefix="captures/").get("Contents", ())
+        found = farm.found(ids)
     return {
         "workers": workers,
-        "slots": workers * SLOTS,
+        "slots": slots,
         "jobs": jobs,
         "kills": kills,
         "cuts": cuts,
-        "states": dict(Counter(job["state"] for job in ended)),
-        "different_results": len(files),
-        "ends_said_more_than_once": sum(said.values()) - everything,
-        "objects_left_over": len(keys) - 3 * everything,
-        "captures_left_over": len({entry["Key"] for entry in blobs} - {"captures/owner"}),
+        "connections": connections,
+        **found,
         "seconds": round(took, 1),
-        "slot_seconds_lost": round(workers * SLOTS * took - jobs * seconds, 1),
+        "slot_seconds_lost": round(slots * took - jobs * seconds, 1),
         "lost_to": {name: round(lost[name], 1) for name in ("starting", "begun_again")},
         "taken_over_s": round(lost["taken_over_s"], 1),
-        "efficiency_undisturbed": round(jobs // 4 * seconds / (workers * SLOTS * undisturbed_s), 3),
-        "efficiency": round(jobs * seconds / (workers * SLOTS * took), 3),
+        "efficiency_undisturbed": round(few * seconds / (slots * undisturbed_s), 3),
+        "efficiency": round(jobs * seconds / (slots * took), 3),
     }
 
 

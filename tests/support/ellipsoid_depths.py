@@ -85,8 +85,6 @@ def known_depth(camera: Camera, bodies: Sequence[Ellipsoid], noise_mm: float, rn
         np.where(known[..., None], normals, 0).astype(np.float32),
         np.where(known, max(noise_mm, 0.05), np.inf).astype(np.float32),
         np.where(known, 3, 0).astype(np.uint8),
-        np.isfinite(depth).astype(np.float32),
-        np.full((*depth.shape, 3), 128, np.uint8),
     )
 
 

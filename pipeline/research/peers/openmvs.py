@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from pipeline.stereo.depth_map import DepthMap
+from pipeline.stereo.crops import Crop
 from rig.camera import Camera
 from rig.errors import EigenheadError, InputError
 from rig.formats.meshes.mesh_file import read_mesh
@@ -46,19 +46,19 @@ def programs_in(folder: Path) -> dict[str, Path]:
 
 
 def surface_by_openmvs(
-    depth_maps: Sequence[DepthMap], hull_world: Mesh, programs: Mapping[str, Path], folder: Path
+    crops: Sequence[Crop], hull_world: Mesh, programs: Mapping[str, Path], folder: Path
 ) -> tuple[Mesh, float]:
     """Runs OpenMVS. Returns its refined surface (world frame, mm) and the processor seconds of its programs.
 
     Args:
-        depth_maps: for their cameras, photographs and masks; their depth is not used.
+        crops: of the photographs, with their masks.
         hull_world: the visual hull.
         programs: by name.
         folder: empty; receives the input and all that the programs write.
 
     Raises PeerFailed with the program's last words.
     """
-    write_input(depth_maps, hull_world, folder)
+    write_input(crops, hull_world, folder)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     masks = ("--mask-path", str(folder / "masks"), "--ignore-mask-label", "0")
     images = ("--image-folder", str(folder / "images"))
@@ -86,17 +86,17 @@ def _run(programs: Mapping[str, Path], name: str, folder: Path, *arguments: str)
         raise PeerFailed(name, f"ended with {done.returncode}: {' / '.join(said) or 'it said nothing'}")
 
 
-def write_input(depth_maps: Sequence[DepthMap], hull_world: Mesh, folder: Path) -> None:
+def write_input(crops: Sequence[Crop], hull_world: Mesh, folder: Path) -> None:
     """Writes ``images``, ``masks`` and ``sparse`` (cameras.txt, images.txt, points3D.txt) as the programs read them."""
     rng = np.random.default_rng(0)
     rows = rng.permutation(len(hull_world.vertices))[:SEEDS]
     points, normals = hull_world.vertices[rows], hull_world.normals()[rows]
-    seen = np.stack([_faces_camera(each.camera, points, normals) for each in depth_maps])
+    seen = np.stack([_faces_camera(each.camera, points, normals) for each in crops])
     points, seen = points[seen.sum(axis=0) >= 2], seen[:, seen.sum(axis=0) >= 2]
     for name in ("images", "masks", "sparse"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     cameras, images = [], []
-    for number, (view, at) in enumerate(zip(depth_maps, seen, strict=True), start=1):
+    for number, (view, at) in enumerate(zip(crops, seen, strict=True), start=1):
         camera = view.camera
         write_image(folder / "images" / f"{camera.name}.png", view.colour)
         label = (view.mask > 0.5).astype(np.uint8) * 255

@@ -59,13 +59,13 @@ class Farm:
 
 @dataclass(frozen=True, slots=True)
 class Prices:
-    """Holds list prices in US dollars, without tax and discounts: those of Amazon in Virginia as of 2025, to be
-    replaced by one's own. A worker has two virtual cores and 4 GB (c7i.large), the database two and 16 GB
-    (db.r6g.large)."""
+    """Holds list prices in US dollars, without tax and discounts: those of Amazon in Virginia, to be replaced by one's
+    own. A worker and the service have two virtual cores and 4 GB (c5.large), the database two and 8 GB (RDS,
+    db.m6g.large). docs/scale.md says who states each, and when."""
 
-    worker_hour: float = 0.0893
-    database_hour: float = 0.225
-    service_hour: float = 0.0893
+    worker_hour: float = 0.085
+    database_hour: float = 0.159
+    service_hour: float = 0.085
     put: float = 5e-6
     get: float = 4e-7
     gb_month: float = 0.023

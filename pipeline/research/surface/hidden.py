@@ -50,6 +50,7 @@ from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS
 from rig.studio.sensor.preset import PRESET
+from rig.studio.sensor.realism import made_real
 
 Level = Literal["span", "kernel", "photo", "fine"]
 HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm down the forehead
@@ -65,7 +66,8 @@ REACHED_MM = 1.5  # a surface in front of a place by less is its own
 MIN_DIRECTIONS = 8  # skin under hair is seen from 16 and more, a nostril and the inside of a mouth from 6 at most
 MIN_PLACES = 50  # of a region, for figures of its own
 LEVELS: tuple[Level, ...] = ("span", "kernel", "photo", "fine")
-POOLED = ("studio", "draws")  # every subject of which counts alike in the figures of ``all``
+# Groups every subject of which counts alike in the figures of all populations together.
+POOLED = {"studio": "all", "draws": "all", "studio-real": "all-real", "draws-real": "all-real"}
 
 
 def hidden(
@@ -76,11 +78,13 @@ def hidden(
     report: Progress,
     others: HeadModel | None = None,
     subjects: int = 4,
+    realism: tuple[str, ...] = (),
     folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is
     ``<group>_<level>_<seen|hidden>_<region>_<quantity>`` or ``<group>_<level>_<landmarks|measurements>_within_95``, the
-    mean over the group: ``studio``, ``draws``, both as ``all``, or a capture by its name.
+    mean over the group: ``studio``, ``draws``, both as ``all``; the same with ``realism`` as ``studio-real``,
+    ``draws-real`` and ``all-real``; or a capture by its name.
 
     Args:
         model: fitted; heads are drawn from it, too.
@@ -89,6 +93,7 @@ def hidden(
         report: called with the subject and the share done.
         others: another population, from which as many heads are drawn.
         subjects: heads of each population.
+        realism: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
         folder: keeps rows, so that a stopped run can continue.
     """
     key = key_of(
@@ -96,11 +101,15 @@ def hidden(
     )
     records = Records(folder, "hidden", key)
     seeds = range(FIRST_SEED, FIRST_SEED + subjects)
-    drawn = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer, preset=HEAVY_HAIR)
-    jobs = [("studio", f"studio-{seed:02}", partial(drawn, seed)) for seed in seeds]
-    if others is not None:
-        drawn = partial(photographed, others, len(others.modes), 1.0, renderer=renderer)
-        jobs += [("draws", f"draw-{seed:02}", partial(drawn, seed)) for seed in seeds]
+    jobs: list[tuple[str, str, Callable[[], Known]]] = []
+    for suffix, names in (("", ()), ("-real", realism)) if realism else (("", ()),):
+        end = "-".join(("", *names))
+        heavy, plain = made_real(HEAVY_HAIR, names), made_real(PRESET, names)
+        drawn = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer, preset=heavy)
+        jobs += [(f"studio{suffix}", f"studio-{seed:02}{end}", partial(drawn, seed)) for seed in seeds]
+        if others is not None:
+            drawn = partial(photographed, others, len(others.modes), 1.0, renderer=renderer, preset=plain)
+            jobs += [(f"draws{suffix}", f"draw-{seed:02}{end}", partial(drawn, seed)) for seed in seeds]
     jobs += [(name, name, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, read) in enumerate(jobs):
@@ -236,7 +245,7 @@ def figures(rows: Sequence[Row]) -> dict[str, float]:
     """Returns means over the subjects of each group, and over those of all populations together."""
     values: dict[str, list[float]] = {}
     for row in rows:
-        groups = (row["group"], "all") if row["group"] in POOLED else (row["group"],)
+        groups = (row["group"], POOLED[row["group"]]) if row["group"] in POOLED else (row["group"],)
         for level in LEVELS:
             for key, value in row.get(level, {}).items():
                 for group in groups if isinstance(value, float) else ():

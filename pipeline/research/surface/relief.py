@@ -12,9 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import scipy.sparse as sparse
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from pipeline import reconstruct as composition
 from pipeline.fusion.fusion import BustSurface
@@ -26,6 +24,7 @@ from pipeline.research import markdown
 from pipeline.research.outcome import Outcome
 from pipeline.research.people.view_subsets import azimuths_deg
 from pipeline.research.records import CONTOUR, Records, Row, key_of
+from pipeline.research.surface.local_means import means_within
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
@@ -143,18 +142,9 @@ def compare_relief(whole: BustSurface, first: BustSurface, second: BustSurface) 
     places, normals = whole.mesh_world.vertices[skin], whole.mesh_world.normals()[skin]
     one, two = heights_mm(places, normals, first), heights_mm(places, normals, second)
     both = np.isfinite(one) & np.isfinite(two)
-    near = sparse_mean(places[both])
+    near = means_within(places[both], SMOOTH_MM)
     known = np.diff(near.indptr) >= MIN_AROUND
     return Relief(*((height[both] - near @ height[both])[known] for height in (one, two)))
-
-
-def sparse_mean(places: Float[np.ndarray, "n 3"]) -> sparse.csr_array:
-    """Returns the sparse matrix that maps values at the points to their means around each point, itself included."""
-    pairs = KDTree(places).query_pairs(SMOOTH_MM, output_type="ndarray")
-    diagonal = np.arange(len(places))
-    rows, columns = np.r_[pairs[:, 0], pairs[:, 1], diagonal], np.r_[pairs[:, 1], pairs[:, 0], diagonal]
-    share = 1.0 / np.bincount(rows, minlength=len(places))
-    return sparse.csr_array((share[rows], (rows, columns)), shape=(len(places), len(places)))
 
 
 def heights_mm(

@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.visual_hull import visual_hull
+from pipeline.multiview.visual_hull import hull_extent, visual_hull
 from pipeline.reconstruct import reconstruct
 from pipeline.research import markdown
 from pipeline.research.outcome import Outcome, Row
@@ -37,6 +37,7 @@ from pipeline.research.surface.visible_surface import score_visible
 from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
+from pipeline.stereo.crops import Crop, make_crops
 from pipeline.stereo.depth_map import DepthMap, points_world
 from pipeline.stereo.estimate import estimate_depth
 from rig.errors import EigenheadError
@@ -65,6 +66,12 @@ class Shown:
     def silhouettes(self) -> dict[str, Silhouette]:
         """Computes the silhouettes of the capture, by camera."""
         return segment(self.known.capture, self.known.rig, Settings().segmentation, report=discard_progress)
+
+    def crops(self) -> list[Crop]:
+        """Cuts out the subject in the photographs, undistorted, as the depth maps show it."""
+        at_world, pixel_mm = hull_extent(self.silhouettes, self.known.rig)[0], Settings().dense.pixel_mm
+        images = self.known.capture.images
+        return make_crops(images, self.silhouettes, self.known.rig, pixel_mm=pixel_mm, at_world=at_world)
 
     @cached_property
     def depth_maps(self) -> tuple[DepthMap, ...]:
@@ -174,7 +181,7 @@ def by_openmvs(shown: Shown, *, programs: Mapping[str, Path]) -> tuple[Mesh, flo
     seconds."""
     with tempfile.TemporaryDirectory(prefix="openmvs-") as folder:
         body = visual_hull(shown.silhouettes, shown.known.rig)
-        return surface_by_openmvs(shown.depth_maps, body, programs, Path(folder))
+        return surface_by_openmvs(shown.crops(), body, programs, Path(folder))
 
 
 def figures(rows: Sequence[Row]) -> dict[str, float]:

@@ -2,7 +2,8 @@
 beside them.
 
 Figures are recall and precision by part, errors of the face and of the head's regions, the difference between head.ply
-and bust.ply, and seconds; each surface is drawn in clay beside the truth. ``precision`` is of the whole closed surface
+and bust.ply, their normals, the bust's craters at highlights, and seconds; each surface is drawn in clay beside the
+truth, and its craters on the truth. ``precision`` is of the whole closed surface
 within 25 mm of what is seen. The surface's guess at what nobody sees begins there, too, so that no closed surface
 reaches 1. ``precision_seen`` is of what the file itself calls seen.
 """
@@ -29,6 +30,13 @@ from pipeline.research.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known,
 from pipeline.research.paper.span import weighted_quantile
 from pipeline.research.pictures import labelled
 from pipeline.research.records import Records, key_of
+from pipeline.research.surface.face_skin import (
+    crater_map,
+    face_places,
+    find_craters,
+    normal_figures,
+    shining_places,
+)
 from pipeline.research.surface.visible_surface import score_visible
 from pipeline.results.clay import clay
 from pipeline.settings import Settings
@@ -40,6 +48,7 @@ from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS, VisiblePoints
 from rig.studio.sensor.preset import PRESET
+from rig.studio.sensor.realism import made_real
 
 STYLES = (
     "short", "over-ears", "long", "curly", "fringe", "bun", "beard", "bald", "cap", "glasses", "long,beard",
@@ -65,10 +74,11 @@ def visible(
     renderer: Renderer,
     report: Progress,
     subjects: int = len(STYLES),
+    realism: tuple[str, ...] = (),
     folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``,
-    the mean over the group: ``studio``, or a capture by its name.
+    the mean over the group: ``studio``, ``real`` (the same heads with ``realism``), or a capture by its name.
 
     Args:
         model: fitted; heads are drawn from it, too.
@@ -76,6 +86,7 @@ def visible(
         renderer: for the studio.
         report: called with the subject and the share done.
         subjects: heads in the studio, with the hair styles of ``STYLES`` in turn.
+        realism: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
         folder: keeps rows, so that a stopped run can continue, and a picture of every subject.
     """
     records = Records(folder, "visible", key_of(model.sha256, Settings()))
@@ -84,7 +95,10 @@ def visible(
         style = STYLES[number % len(STYLES)]
         preset = replace(PRESET, hairstyle=tuple(style.split(",")))
         draw = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, 300 + number, renderer=renderer)
-        jobs.append(("studio", f"{number:02}-{style.replace(',', '-')}", partial(draw, preset=preset)))
+        name = f"{number:02}-{style.replace(',', '-')}"
+        jobs.append(("studio", name, partial(draw, preset=preset)))
+        if realism:
+            jobs.append(("real", f"{name}-{'-'.join(realism)}", partial(draw, preset=made_real(preset, realism))))
     jobs += [(name, name, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, read) in enumerate(jobs):
@@ -110,6 +124,14 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
         write_image(
             picture, _row(subject.name, {k: Mesh(in_head.apply(m.vertices), m.faces) for k, m in meshes.items()})
         )
+    places = face_places(subject)
+    shining = shining_places(places, subject.capture.images, subject.rig, subject.mesh)
+    craters = find_craters(places, bust.mesh_world, shining)
+    if picture is not None:
+        in_head = found.head.fit.world_from_head.inverse()
+        true_local = Mesh(in_head.apply(subject.mesh.vertices), subject.mesh.faces)
+        drawn = crater_map(craters, in_head.apply(places.points), true_local)
+        write_image(picture.with_name(f"{picture.stem}-craters.png"), drawn)
     whole = score_visible(subject.visible, bust.mesh_world)
     faces = {"head": found.mesh_world, "bust": bust.mesh_world}
     seen = score_visible(subject.visible, seen_of(bust))
@@ -117,6 +139,8 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
         **{key: value for key, value in whole.flat().items() if key.endswith(("within_2mm", "median", "closed"))},
         **{f"precision_seen_{part}_within_2mm": figures["within_2mm"] for part, figures in seen.precision.items()},
         **{f"{k}_face_{key}": v for k, mesh in faces.items() for key, v in surface_error(subject, mesh).items()},
+        **{f"{k}_{key}": v for k, mesh in faces.items() for key, v in normal_figures(places, mesh).items()},
+        **craters.figures(),
         **region_errors(subject, found.mesh_world, head_regions(model)),
         "head_to_bust_median_mm": float(np.median(head_to_bust(found.mesh_world, bust))),
         "cpu_s": seconds,

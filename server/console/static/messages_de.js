@@ -658,6 +658,7 @@ export default {
   "landmarks-lacking": "hat nicht die Landmarken {names}",
   "no-frankfurt-plane": "hat keine Frankfurter Ebene: die Porien liegen {width_mm:.0f} mm auseinander, und die Orbitalia {reach_mm:.0f} mm vor ihnen; sind die gesetzten Punkte richtig benannt und in denselben Achsen?",
   "not-same-person": "liegt auf Stirn und Nasenrücken {off_mm:.1f} mm neben {earlier}: sind es Köpfe derselben Person, beide in mm?",
+  "maybe-other-person": "Stirn und Nasenrücken unterscheiden sich sicher auf {share:.0%} ihrer Fläche: ist der spätere Kopf der einer anderen Person, oder liegt in einer der Aufnahmen Haar über der Stirn?",
   "surface-not-this-head": "hat das Gesicht von {head} nicht (Streuung nach der besten Anpassung: {off_mm:.1f} mm): ist es die Oberfläche dieser Person, in mm, nach außen gewandt, und stimmen ihre Achsen (--axes)? Sonst ihre Landmarken geben (--landmarks)",
   "no-result-folder": "hat keine report.json, die sagt, woraus das Ergebnis entstand: den Ordner angeben, den eigenhead reconstruct geschrieben hat",
   "result-of-other-file": "entstand aus einer anderen {file} als der dieser Aufnahme",

@@ -16,6 +16,7 @@ from rig.errors import InputError
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.pictures.images import read_image
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from tests.support.measured_heads import LEVEL, mannequin, model
 from tests.support.visits import MOVED, bumped, moved, visit
 
@@ -105,6 +106,16 @@ def test_another_head_is_refused() -> None:
     wavy = mannequin().vertices + 4.0 * np.sin(mannequin().vertices[:, :1] / 6.0) * mannequin().normals()
     with pytest.raises(InputError, match="are both heads of one person"):
         compare(EARLIER, moved(visit(wavy)))
+
+
+def test_a_head_that_differs_where_nobody_changes_is_doubted(tmp_path: Path) -> None:
+    """Waves of .6 mm everywhere: too small to be refused, and no person's forehead gets them between two visits."""
+    wavy = mannequin().vertices + 0.6 * np.sin(mannequin().vertices[:, :1] / 6.0) * mannequin().normals()
+    found = compare(EARLIER, moved(visit(wavy)))
+    [warning] = found.warnings
+    assert warning == compose("maybe-other-person", share=found.regions["stable"].changed_share)
+    assert write_comparison(tmp_path, found, "2026-03-01")["warnings"] == [warning.document()]
+    assert not compare(EARLIER, moved(visit(bumped("zygion_left", 3.0)))).warnings
 
 
 def test_the_files_hold_what_was_found(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,15 @@ def test_both_axes_are_one_place_in_slicer(tmp_path: Path) -> None:
     np.testing.assert_allclose(scenes[0][0], scenes[1][0], atol=1e-4)
     for name, point in scenes[0][1].items():
         np.testing.assert_allclose(point, scenes[1][1][name], atol=1e-9)
+
+
+def test_what_a_head_lacks_for_the_plane_is_named_unless_it_is_marked() -> None:
+    ears = {name: place for name, place in HERE.measured.landmarks.items() if name != "tragion_left"}
+    head = replace(HERE.measured, landmarks=ears)
+    with pytest.raises(InputError, match=r"lacks the landmarks tragion_left$"):
+        frankfurt_axes(head, "LPS")
+    marked = {"porion_left": HERE.measured.landmarks["tragion_left"]}
+    assert frankfurt_axes(head, "LPS", marked).sources["porion_left"] == "marked"
 
 
 def test_the_frankfurt_plane_holds_its_four_points() -> None:

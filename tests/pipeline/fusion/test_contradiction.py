@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.fusion.contradiction import SILENT_PX, WIDENED_PX, silence_contradicted
 from pipeline.fusion.view_stack import ViewStack, stack_views
-from pipeline.fusion.vote_kernels import OUTLINE
+from pipeline.fusion.vote_kernels import OUTLINE, PIXEL_STEP
 from pipeline.imaging.silhouette import silhouette_from_mask
 from tests.support.ellipsoid_depths import Ellipsoid, Scene, scene
 from tests.support.scenes import fan
@@ -27,9 +27,9 @@ def narrower(made: Scene, by_px: int) -> ViewStack:
 
 def silent(views: ViewStack) -> list[int]:
     """Pixels of each view without an outline."""
-    ends = [*views.starts[1:], len(views.pixels)]
+    ends = [*views.starts[1:], len(views.depth_mm)]
     return [
-        int((views.pixels[first:last, OUTLINE] == SILENT_PX).sum())
+        int((PIXEL_STEP * views.shown[first:last, OUTLINE] == SILENT_PX).sum())
         for first, last in zip(views.starts, ends, strict=False)
     ]
 
@@ -46,4 +46,5 @@ def test_an_outline_far_within_what_others_see_says_nothing(ball: Scene) -> None
     third = [depth_map.camera.name for depth_map in ball.maps].index("cam03")
     assert [n for n, count in enumerate(silent(found)) if count] == [third]
     assert shares[third] > 0.05
-    assert np.array_equal(views.pixels[:, :OUTLINE], found.pixels[:, :OUTLINE])
+    assert np.array_equal(views.shown[:, :OUTLINE], found.shown[:, :OUTLINE])
+    assert found.steady.tolist() == [n != third for n in range(len(ball.maps))]

@@ -1,10 +1,24 @@
 """What the guess beyond the photographs loses: horns, and nothing that is thick or lies beside what is seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.fusion.grid import Grid, whole_box
-from pipeline.fusion.signed_distance import AWAY_MM, HORN_MM, Votes, without_horns
+from pipeline.fusion.signed_distance import (
+    AWAY_MM,
+    HORN_MM,
+    REACH,
+    Votes,
+    excluded_by_outlines,
+    votes_at,
+    votes_in_box,
+    without_horns,
+)
+from pipeline.fusion.view_stack import stack_views
+from tests.support.ellipsoid_depths import Ellipsoid, scene
+from tests.support.scenes import fan
 
 STEP_MM, BODY_MM = 6.0, 60.0
 HORN_WIDE_MM = 12.0
@@ -48,3 +62,23 @@ def test_only_what_lies_away_from_the_seen_is_judged() -> None:
     assert (left[near] < 0).all()
     far = horn & (places[:, 1] < 110.0 - AWAY_MM - STEP_MM)
     assert (left[far] > 0).all()
+
+
+def test_blocks_outside_two_outlines_are_what_every_node_says_for_itself() -> None:
+    """A distorting lens and a ball in a box of 500 mm: what is decided at once is most of it, and the same."""
+    made = scene([Ellipsoid((0, 0, 0), (60, 60, 60))], fan(400, 300))
+    views = stack_views(made.maps, made.silhouettes, made.rig)
+    box = whole_box(np.full(3, -250.0), np.full(3, 500.0), STEP_MM)
+    at_once, alone = votes_in_box(box, views), votes_at(box, views)
+    excluded = excluded_by_outlines(box, views, REACH * STEP_MM)
+    assert excluded.mean() > 0.7 * (alone.bound == np.float32(REACH * STEP_MM)).mean() > 0.4
+    for name in ("value", "weight", "bound"):
+        assert np.array_equal(getattr(at_once, name), getattr(alone, name))
+
+
+def test_a_view_with_a_silenced_outline_excludes_no_block() -> None:
+    made = scene([Ellipsoid((0, 0, 0), (60, 60, 60))], fan(400, 300))
+    views = stack_views(made.maps, made.silhouettes, made.rig)
+    box = whole_box(np.full(3, -250.0), np.full(3, 500.0), 2 * STEP_MM)
+    only = np.arange(len(made.maps)) == 0
+    assert not excluded_by_outlines(box, replace(views, steady=only), REACH * STEP_MM).any()

@@ -75,6 +75,22 @@ def test_a_crater_and_a_speck_go_to_the_head_that_their_surroundings_agree_with(
     assert left.max() < 0.6
 
 
+def test_a_gap_that_no_view_sees_goes_to_the_head_where_seen_skin_encloses_it() -> None:
+    """A pit of a few vertices; the unseen back of the head is no gap, and stays but at its rim."""
+    head = ellipsoid(5)
+    surface, front = off_by(head, 0.1), head.vertices[:, 2] > 0.0
+    middle = head.vertices[head.vertices[:, 2].argmax()]
+    pit = np.linalg.norm(head.vertices - middle, axis=1) < 4.0
+    assert 4 < pit.sum() < 20
+    dented = Mesh(surface.vertices - 1.5 * pit[:, None] * head.normals(), head.faces)
+    seen = front & ~pit
+    drawn = drawn_to_skin(dented, seen.astype(float), stating(head), np.where(seen, 0.15, 0.0))
+    left = ((drawn.vertices - head.vertices) * head.normals()).sum(axis=1)
+    assert np.abs(left[pit]).max() < 0.3
+    behind = head.vertices[:, 2] < -10.0
+    assert np.abs(drawn.vertices - dented.vertices)[behind].max() == 0.0
+
+
 def test_a_crust_gives_way_to_the_head_where_the_surface_itself_is_unsure() -> None:
     """Noise of 1.4 mm (RMS) about the head: a surface that states 0.5 mm takes the head's shape; one that is sure of it
     (hair, say) is believed."""

@@ -26,8 +26,6 @@ def seen_wall(camera: Camera) -> DepthMap:
         normal=np.broadcast_to(np.array([0, 0, -1], np.float32), (*shape, 3)).copy(),
         deviation_mm=np.full(shape, 0.2, np.float32),
         views=np.full(shape, 2, np.uint8),
-        mask=np.ones(shape, np.float32),
-        colour=np.zeros((*shape, 3), np.uint8),
     )
 
 
@@ -35,7 +33,7 @@ def part_map(camera: Camera, border_mm: float) -> PartMap:
     """Hair to the right of the border."""
     x = np.arange(SIZE) - (SIZE - 1) / 2 + camera.centre_world[0]
     hair = np.broadcast_to(x > border_mm, (SIZE, SIZE))
-    return PartMap(camera.name, np.stack([~hair, hair, np.zeros_like(hair)], axis=-1).astype(np.float32))
+    return PartMap(camera.name, 255 * np.stack([~hair, hair, np.zeros_like(hair)], axis=-1).astype(np.uint8))
 
 
 def test_cells_say_what_most_of_their_pixels_show() -> None:

@@ -16,7 +16,7 @@ def test_points_project_to_their_pixels_at_their_depths() -> None:
     known = np.isfinite(deviation)
     depth = np.where(known, rng.uniform(900, 1100, known.shape), 0.0).astype(np.float32)
     grid = np.zeros((23, 31, 3), np.float32)
-    maps = DepthMap(camera, depth, grid, deviation, known.astype(np.uint8), depth, grid.astype(np.uint8))
+    maps = DepthMap(camera, depth, grid, deviation, known.astype(np.uint8))
     points = points_world(maps)
     row, column = np.nonzero(known)
     np.testing.assert_allclose(camera.project(points), np.stack([column, row], axis=1), atol=1e-9)

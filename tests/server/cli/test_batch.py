@@ -129,7 +129,8 @@ def test_results_of_another_version_stay_and_are_told(shots: Path, tmp_path: Pat
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_scheduler_and_ctrl_c_end_it_and_leave_nothing(shots: Path, tmp_path: Path, number: int) -> None:
     out, log = tmp_path / "heads", tmp_path / "log"
-    script = (
+    script = (  # without a terminal a shell has its background ignore SIGINT, and what that starts, too
+        "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from server.batch import run\nfrom tests.support.pinned_work import work\nreal = run.BatchRun\n"
         "run.BatchRun = lambda *a, **n: real(*a, **n, work=work)\nfrom server.cli.main import main\nmain()"
     )

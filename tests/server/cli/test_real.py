@@ -58,10 +58,14 @@ def test_wrong_usage_is_told_before_anything_is_loaded(tmp_path: Path) -> None:
     for option, value, takes in (
         ("--only", "front-3", "only people, growth, wrap and hair-shell take it"),
         ("--detail", "span", "only people takes it"),
+        ("--realism", "all", "only hidden and visible take it"),
     ):
         elsewhere = run(app, ["experiments", "views", option, value])
         assert elsewhere.exit_code == 2
         assert takes in " ".join(elsewhere.stderr.replace("│", " ").split())
+    unknown = run(app, ["experiments", "visible", "--realism", "oily,waxy"])
+    assert unknown.exit_code == 2
+    assert "waxy" in unknown.stderr
     drawn = outlines(tmp_path / "outlines.json", "cam00")
     with pytest.raises(InputError, match="belongs to one folder"):
         judge_folders([folder, folder], model="default", front=None, outlines=drawn, kept=None, report=quiet)

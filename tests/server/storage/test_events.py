@@ -1,21 +1,39 @@
-"""The events of jobs: numbers that grow, one writer or two, and no more rows for a long job than for a short one."""
+"""The events of jobs: numbers that grow, one writer or two, one end, and no more rows for a long job than for a short
+one."""
 
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
 from server.settings import ServiceSettings
 from server.storage.database import open_database
-from server.storage.events import EventLog
+from server.storage.events import END, EventLog
+from server.storage.failure_counts import failure_counts
 from server.tasks.progress import JobProgress, ProgressMeter
+from tests.support.postgres import running_postgres
+
+
+@pytest.fixture(scope="module")
+def postgres() -> Iterator[str]:
+    with running_postgres() as url:
+        yield url
 
 
 @pytest.fixture
 def log(tmp_path: Path) -> Iterator[EventLog]:
     engine = open_database(ServiceSettings(data=tmp_path / "data"))
     yield EventLog(engine)
+    engine.dispose()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def engine(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[sa.Engine]:
+    where = {} if request.param == "sqlite" else {"database_url": request.getfixturevalue("postgres")}
+    engine = open_database(ServiceSettings(data=tmp_path / "data", **where))
+    yield engine
     engine.dispose()
 
 
@@ -59,3 +77,41 @@ def test_a_long_job_has_as_many_events_as_it_has_stages(log: EventLog) -> None:
     assert len(seen) == len({*seen}) == 100, "whoever looks often sees each"
     kept = [(event.document.get("stage"), event.seq) for event in log.since("job", 0)]
     assert kept == [("read", 1), ("fit", 11), ("fit", 100)]
+
+
+def test_a_job_ends_once_however_many_write_it(engine: sa.Engine) -> None:
+    log, firsts = EventLog(engine), list[bool]()
+    log.append("job", {"state": "running", "stage": "fit"})
+
+    def write() -> None:
+        firsts.extend(log.end("job", {"state": "failed"}, failure="no-hull") for _ in range(5))
+
+    threads = [threading.Thread(target=write) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(firsts) == [False] * 19 + [True]
+    assert log.append("job", {"state": "running", "stage": "late"}) == 2, "of a worker that was thought dead"
+    assert [(event.seq, event.document["state"]) for event in log.since("job", 0)][1:] == [
+        (2, "running"),
+        (END, "failed"),
+    ]
+    assert log.latest(["job"])["job"].document == {"state": "failed"}
+    assert failure_counts(engine) == {"no-hull": 1}
+    log.replace_end("job", {"state": "cancelled"})
+    assert [event.document["state"] for event in log.since("job", 2)] == ["cancelled"]
+
+
+def test_a_database_that_is_away_costs_an_event_and_nothing_else(engine: sa.Engine) -> None:
+    log = EventLog(engine)
+
+    @sa.event.listens_for(engine, "before_cursor_execute")
+    def refuse(*_: object) -> None:
+        raise sa.exc.OperationalError("INSERT", None, ConnectionRefusedError("away"))
+
+    meter = ProgressMeter(log, "other", JobProgress({"read": 1.0}), every_s=0.0)
+    meter.report("read", 0.5)
+    sa.event.remove(engine, "before_cursor_execute", refuse)
+    meter.report("read", 0.6)
+    assert [event.seq for event in log.since("other", 0)] == [1]

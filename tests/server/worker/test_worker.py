@@ -17,6 +17,7 @@ from rig.errors import Cancelled, InputError
 from server.services.failures import JobFailed
 from server.settings import ServiceSettings
 from server.storage.database import workers
+from server.storage.failure_counts import failure_counts
 from server.storage.records import CaptureRecord, DeliveryRequest, FileEntry, JobRequest
 from server.storage.store import Store, new_id
 from server.tasks.child import WorkFailed
@@ -145,13 +146,29 @@ def test_a_cancelled_job_stops_also_where_it_does_not_listen(worker: Worker, cap
 def test_the_last_event_names_cameras_that_moved(worker: Worker, capture: str) -> None:
     worker.ingest(JOB, request(capture))
     worker.publish(JOB, worker.fit(JOB, request(capture, "moved")))
-    worker.publish_outcome(JOB, "succeeded")
+    worker.outcomes.publish(JOB, "succeeded")
     assert events_of(worker)[-1] == {"state": "succeeded", "camera_moved": ["cam02 has moved by 5.0 px"]}
 
 
 def test_a_job_without_a_report_ends_without_a_word(worker: Worker) -> None:
-    worker.publish_outcome(JOB, "failed")
+    worker.outcomes.publish(JOB, "failed")
     assert events_of(worker) == [{"state": "failed"}]
+
+
+def test_an_end_waits_for_the_database_and_is_written_once(worker: Worker) -> None:
+    refused = list[int]()
+
+    @sa.event.listens_for(worker.engine, "before_cursor_execute")
+    def refuse(*_: object) -> None:
+        if len(refused) < 2:
+            refused.append(1)
+            raise sa.exc.OperationalError("INSERT", None, ConnectionRefusedError("away"))
+
+    for _ in range(2):  # the worker is killed before the engine knows of the end; the next one repeats it
+        worker.outcomes.publish(JOB, "failed", failure="no-hull")
+    assert len(refused) == 2
+    assert events_of(worker) == [{"state": "failed"}]
+    assert failure_counts(worker.engine) == {"no-hull": 1}
 
 
 @pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"warnings": 3'])

@@ -10,16 +10,19 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from pipeline.research.peers.openmvs import PROGRAMS, PeerFailed, programs_in, surface_by_openmvs, write_input
+from pipeline.stereo.crops import Crop, make_crops
 from rig.errors import InputError
 from rig.mesh import Mesh
 from rig.messages.message import texts_of
-from tests.support.ellipsoid_depths import Ellipsoid, Scene, scene
+from tests.support.ellipsoid_depths import Ellipsoid, scene
 from tests.support.scenes import ellipsoid, fan
 
 
 @pytest.fixture(scope="module")
-def ball() -> Scene:
-    return scene([Ellipsoid((0, 0, 0), (60, 60, 60))], fan(200, 150))
+def ball() -> list[Crop]:
+    made = scene([Ellipsoid((0, 0, 0), (60, 60, 60))], fan(200, 150))
+    images = {name: np.full((*seen.mask.shape, 3), 128, np.uint8) for name, seen in made.silhouettes.items()}
+    return make_crops(images, made.silhouettes, made.rig, pixel_mm=0.1, at_world=np.zeros(3))
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +37,8 @@ def program(folder: Path, name: str, script: str) -> None:
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
 
 
-def test_the_model_projects_its_points_where_it_says(tmp_path: Path, ball: Scene, hull: Mesh) -> None:
-    write_input(ball.maps, hull, tmp_path)
+def test_the_model_projects_its_points_where_it_says(tmp_path: Path, ball: list[Crop], hull: Mesh) -> None:
+    write_input(ball, hull, tmp_path)
     rows = {n: (tmp_path / "sparse" / f"{n}.txt").read_text().splitlines() for n in ("cameras", "images", "points3D")}
     points = {int(line.split()[0]): line.split() for line in rows["points3D"]}
     places = {number: np.array(words[1:4], float) for number, words in points.items()}
@@ -63,7 +66,7 @@ def test_the_model_projects_its_points_where_it_says(tmp_path: Path, ball: Scene
             assert seen[view][row] == number
 
 
-def test_programs_run_in_turn_and_the_refined_surface_comes_back(tmp_path: Path, ball: Scene, hull: Mesh) -> None:
+def test_programs_run_in_turn_and_the_refined_surface_comes_back(tmp_path: Path, ball: list[Crop], hull: Mesh) -> None:
     bin_folder, folder = tmp_path / "bin", tmp_path / "work"
     bin_folder.mkdir()
     trimesh.Trimesh(hull.vertices, hull.faces, process=False).export(tmp_path / "given.ply")
@@ -71,7 +74,7 @@ def test_programs_run_in_turn_and_the_refined_surface_comes_back(tmp_path: Path,
         program(bin_folder, name, f'echo "{name} $*" >> said.txt')
     busy = "i=0; while [ $i -lt 20000 ]; do i=$((i+1)); done"
     program(bin_folder, "RefineMesh", f"cp {tmp_path / 'given.ply'} refined.ply; {busy}")
-    found, seconds = surface_by_openmvs(ball.maps, hull, programs_in(bin_folder), folder)
+    found, seconds = surface_by_openmvs(ball, hull, programs_in(bin_folder), folder)
     assert found.vertices.shape == hull.vertices.shape
     assert seconds > 0.0
     said = (folder / "said.txt").read_text().splitlines()
@@ -79,15 +82,15 @@ def test_programs_run_in_turn_and_the_refined_surface_comes_back(tmp_path: Path,
     assert "--mask-path" in said[1]
 
 
-def test_a_program_that_fails_is_named_with_its_last_words(tmp_path: Path, ball: Scene, hull: Mesh) -> None:
+def test_a_program_that_fails_is_named_with_its_last_words(tmp_path: Path, ball: list[Crop], hull: Mesh) -> None:
     for name in PROGRAMS:
         program(tmp_path, name, "true")
     program(tmp_path, "DensifyPointCloud", "echo error: no points; exit 1")
     with pytest.raises(PeerFailed, match="DensifyPointCloud: ended with 1: error: no points"):
-        surface_by_openmvs(ball.maps, hull, programs_in(tmp_path), tmp_path / "work")
+        surface_by_openmvs(ball, hull, programs_in(tmp_path), tmp_path / "work")
     program(tmp_path, "DensifyPointCloud", "true")
     with pytest.raises(PeerFailed, match=r"RefineMesh: left no refined\.ply"):
-        surface_by_openmvs(ball.maps, hull, programs_in(tmp_path), tmp_path / "again")
+        surface_by_openmvs(ball, hull, programs_in(tmp_path), tmp_path / "again")
 
 
 def test_every_missing_program_is_named(tmp_path: Path) -> None:

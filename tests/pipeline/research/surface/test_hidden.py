@@ -75,12 +75,13 @@ def test_landmarks_count_by_coordinate_and_measurements_by_length() -> None:
 def test_figures_are_means_of_a_group_and_of_all_populations() -> None:
     rows = [{"name": "a", "group": "studio", "fine": {"reached": "fine", "seen_all_median_mm": 0.1}},
             {"name": "b", "group": "draws", "fine": {"reached": "fine", "seen_all_median_mm": 0.3}},
+            {"name": "c", "group": "draws-real", "fine": {"reached": "fine", "seen_all_median_mm": 0.4}},
             {"name": "scan", "group": "scan", "photo": {"reached": "photo", "hidden_ears_within_95": 0.9}}]  # fmt: skip
-    expected = {"studio": 0.1, "draws": 0.3, "all": 0.2}
+    expected = {"studio": 0.1, "draws": 0.3, "all": 0.2, "draws-real": 0.4, "all-real": 0.4}
     found = figures(rows)
     assert {name: found[f"{name}_fine_seen_all_median_mm"] for name in expected} == pytest.approx(expected)
     assert found["scan_photo_hidden_ears_within_95"] == pytest.approx(0.9)
-    assert len(found) == 4
+    assert len(found) == 6
 
 
 def test_the_table_has_a_row_for_each_group_and_level() -> None:
