@@ -135,7 +135,7 @@ def specular_light(
     texels, ones = size * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, size, size)
     weights = decision.weights[:, layout.source]
-    seen = (weights[:, layout.faces] > 0).all(axis=2)
+    seen = np.asarray(np.all(weights[:, layout.faces] > 0, axis=2))
     light = np.zeros((size, size, 3), np.float32)
 
     def work(first: int, last: int) -> None:
