@@ -69,8 +69,10 @@ def smooth_skin(factor: float, noise_levels: float) -> tuple[float, float]:
     small, settings = rig.scaled(factor), DenseSettings()
     maps = estimate_depth(shot.images, silhouettes, small, None, settings, report=lambda stage, share: None)
     distance, _, part = errors(maps, np.load(truth / "visible.npz"))
-    known_share = sum(int(each.known.sum()) for each in maps) / sum(int((each.mask > 0.5).sum()) for each in maps)
-    return float(np.mean(distance[part == HEAD] < 2.0)), known_share
+    names = [each.camera.name for each in maps]
+    scales = [each.camera.intrinsics.fx / small[each.camera.name].intrinsics.fx for each in maps]
+    shown = sum(scale**2 * silhouettes[name].mask.sum() for name, scale in zip(names, scales, strict=True))
+    return float(np.mean(distance[part == HEAD] < 2.0)), sum(int(each.known.sum()) for each in maps) / shown
 
 
 def errors(
