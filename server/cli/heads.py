@@ -28,6 +28,7 @@ from server.cli.answers import (
 if TYPE_CHECKING:
     from rig.studio.sensor.preset import Preset
 
+MAX_GAZE_DEG = 35.0  # of the studio's eyeballs: lids hide more
 app = typer.Typer(rich_markup_mode=None)
 
 
@@ -258,6 +259,10 @@ def simulate(
         list[str] | None,
         typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
     ] = None,
+    gaze: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Azimuth (to the subject's left) and elevation, degrees: eyeballs that look there."),
+    ] = None,
     fault: Annotated[
         list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
     ] = None,
@@ -277,6 +282,8 @@ def simulate(
     given) with which the rig commands and the service work as with a real rig."""
     chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
     preset = _studio_preset(realism, hair=not no_hair, hairstyle=tuple(hair.split(",")) if hair else (), **chosen)
+    if gaze is not None and (serve or not max(map(abs, gaze)) <= MAX_GAZE_DEG):
+        raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees, and not with --serve", param_hint="--gaze")
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
                       faults=fault or [], expression=expression or [])  # fmt: skip
@@ -291,7 +298,7 @@ def simulate(
     with progress_bar() as report, Renderer.create() as renderer:
         report("simulate", 0.0)
         truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer,
-                                expression=expression or [])  # fmt: skip
+                                expression=expression or [], gaze_deg=gaze)  # fmt: skip
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
 
 
