@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.eyes import LIDS
@@ -36,16 +36,21 @@ CORNERS = {"right": RIGHT_EYE_CORNERS, "left": LEFT_EYE_CORNERS}
 VERGENCE_DEG = (3.0, 2.5)  # between both eyes: mean (a point 1.2 m away) and deviation
 ELEVATIONS_DEG = 1.0
 MAX_CONTRADICTION = 9.0  # squared deviations, of two
-RAYS = 64
+RAYS = 96
 REACHES = (0.35, 0.35, 0.25, 0.25, 0.18, 0.18, 0.15, 0.15)  # of the search about the circle, by its radius
-MAX_OFF_AXIS = 0.69  # cosine: beyond 46 degrees the cornea hides the limbus behind it
+MIN_FACING = 0.5  # cosine between gaze and view
+CORNEA = np.array([0.656, 0.755])  # its normal at the limbus (7.8 mm of radius): along the gaze, and outwards
+MIN_SEEN = 0.25  # cosine between that and the view: the cornea hides, or bends, the limbus behind it
 MIN_RADIUS_PX = 5.0  # of an iris in a view that counts
 MIN_VIEWS = 2
-MIN_RAYS = 8  # of a view that counts
+MIN_RAYS = 6  # with an edge, of a view that counts
+MIN_SIDE, ASIDE = 8, 0.5  # of rays over all views on each side of an iris: one side alone tells little; a cosine
 ROBUST_PX, MIN_NOISE_PX = 0.7, 0.15
-SHARED = 4.0  # edges of a view err together (lids' shade, highlights): so many count as one
+SHARED = 6.0  # edges of a view err together (lids' shade, highlights): so many count as one
 MAX_NETWORK_OFF = 0.6  # between a view's network and the circle's centre, by the iris' radius
 MAX_RMS = 0.09  # of the edges, by the iris' radius
+MAX_RADIUS_OFF_MM = 0.75
+MAX_GAZE_STD_DEG = 6.0
 Cause = Literal["closed", "few-views", "coarse", "unclear"]
 IRISES = {"right": 0, "left": 5}  # rows of ``FaceDetection.irises_px``: the centre
 
@@ -220,9 +225,9 @@ def _nearest_to_rays(seen: Sequence[_Seen], start: Float[np.ndarray, " 3"]) -> F
 
 
 def _faces(circle: _Circle, seen: _Seen) -> bool:
-    """Tells whether a view sees the limbus whole."""
+    """Tells whether an eye looks towards a view."""
     towards = seen.view.camera.centre_world - circle.centre
-    return bool(towards @ circle.gaze > MAX_OFF_AXIS * np.linalg.norm(towards))
+    return bool(towards @ circle.gaze > MIN_FACING * np.linalg.norm(towards))
 
 
 def _radius_px(circle: _Circle, view: EyeView) -> float:
@@ -237,21 +242,22 @@ def _fitted(seen: Sequence[_Seen], circle: _Circle, eyeball: Float[np.ndarray, "
         for each in seen:
             if _faces(circle, each) and _agrees(circle, each):
                 rows = _edges(circle, each.view, reach)
-                if len(rows[0]) >= MIN_RAYS:
+                if rows is not None:
                     evidence[each.name] = rows
-        if len(evidence) < MIN_VIEWS:
+        if len(evidence) < MIN_VIEWS or sum(rows[-1] for rows in evidence.values()).min() < MIN_SIDE:
             return UnseenEye("unclear")
         step, matrix = _step(circle, evidence, eyeball)
         circle = circle.after(step)
-    offsets = np.concatenate([offsets for offsets, _, _ in evidence.values()])
+    offsets = np.concatenate([offsets for offsets, *_ in evidence.values()])
     rms = float(1.4826 * np.median(np.abs(offsets)))
     scale = float(np.mean([_radius_px(circle, each.view) for each in seen if each.name in evidence]))
-    if rms > MAX_RMS * scale:
+    if rms > MAX_RMS * scale or abs(circle.radius - RADIUS_MM) > MAX_RADIUS_OFF_MM:
         return UnseenEye("unclear")
     spread = np.zeros((7, 6))
     spread[:3, :3], spread[3:6, 3:5], spread[6, 5] = np.eye(3), circle.axes().T, 1.0
     covariance = spread @ np.linalg.inv(matrix) @ spread.T
-    return Iris(circle.centre, circle.gaze, circle.radius, covariance, tuple(evidence), rms)
+    found = Iris(circle.centre, circle.gaze, circle.radius, covariance, tuple(evidence), rms)
+    return found if found.gaze_std_deg < MAX_GAZE_STD_DEG else UnseenEye("unclear")
 
 
 def _agrees(circle: _Circle, seen: _Seen) -> bool:
@@ -261,12 +267,13 @@ def _agrees(circle: _Circle, seen: _Seen) -> bool:
     return bool(np.linalg.norm(pixel[0] - seen.network_px) < limit)
 
 
-Rows = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 6"], float]
+Rows = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 6"], float, Int[np.ndarray, " 2"]]
 
 
-def _edges(circle: _Circle, view: EyeView, reach: float) -> Rows:
+def _edges(circle: _Circle, view: EyeView, reach: float) -> Rows | None:
     """Returns how far beyond the circle a view has its edges (px), the derivatives of the circle's image along these
-    rays by a step, and the deviation of an edge."""
+    rays by a step, their deviation, and how many lie towards the subject's left and right. Returns None where there are
+    too few."""
     angles = np.arange(RAYS) * 2.0 * np.pi / RAYS
     axes = circle.axes()
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ axes
@@ -277,14 +284,19 @@ def _edges(circle: _Circle, view: EyeView, reach: float) -> Rows:
     radial = np.einsum("nij,nj->ni", slopes, spokes)
     outwards *= np.sign((outwards * radial).sum(axis=1))[:, None]
     offsets = limbus_offsets(view, points, outwards, reach * _radius_px(circle, view))
-    there = np.isfinite(offsets)
+    towards = view.camera.centre_world - circle.centre
+    bulge = CORNEA[0] * circle.gaze + CORNEA[1] * spokes
+    there = np.isfinite(offsets) & (bulge @ towards > MIN_SEEN * np.linalg.norm(towards))
+    if np.count_nonzero(there) < MIN_RAYS:
+        return None
+    sides = np.array([np.count_nonzero(there & (sign * np.cos(angles) > ASIDE)) for sign in (1.0, -1.0)])
     by_point = np.einsum("ni,nij->nj", outwards, slopes)[there]
     turns = [np.cross(axis, circle.radius * spokes[there]) for axis in axes]
     columns = [by_point, *(np.einsum("ni,ni->n", by_point, turn)[:, None] for turn in turns)]
     columns.append(np.einsum("ni,ni->n", by_point, spokes[there])[:, None])
     found = offsets[there]
-    noise = max(1.4826 * float(np.median(np.abs(found))) if len(found) else 0.0, MIN_NOISE_PX)
-    return found, np.concatenate(columns, axis=1), noise
+    noise = max(1.4826 * float(np.median(np.abs(found))), MIN_NOISE_PX)
+    return found, np.concatenate(columns, axis=1), noise, sides
 
 
 def _step(
@@ -292,7 +304,7 @@ def _step(
 ) -> tuple[Float[np.ndarray, " 6"], Float[np.ndarray, "6 6"]]:
     """Returns the step of the circle that the edges and the priors ask for, and the inverse of its covariance."""
     matrix, right = np.zeros((6, 6)), np.zeros(6)
-    for offsets, slopes, noise in evidence.values():
+    for offsets, slopes, noise, _ in evidence.values():
         weights = 1.0 / (1.0 + (offsets / max(ROBUST_PX, 2.0 * noise)) ** 2) ** 2 / (SHARED * noise**2)
         matrix += slopes.T @ (weights[:, None] * slopes)
         right += slopes.T @ (weights * offsets)

@@ -18,9 +18,10 @@ BLUR_PX = 0.8  # of pictures before their slope is taken: noise of a pixel is no
 STEP_PX = 0.25  # along a ray
 FINE = 4  # cells a pixel of the lids' map
 CLEAR_PX = -3.0  # inside the lids' edges, which the network has up to three pixels off
-BEYOND_PX = (1.5, 2.5)  # where white, and no skin, must show beyond the edge
+BEYOND_PX = (1.2, 2.0)  # where white, and no skin, must show beyond the edge
 SKIN_PX = 3.0  # beyond the lids' edges there is skin
-MAX_SKIN = 0.5
+MAX_SKIN = 0.55  # half way
+MAX_WHITE = 1.5  # brightness, by the white's: what is brighter mirrors a lamp
 WHITE = 0.8  # quantile of brightness between the lids
 BRIGHT, PALE = 0.6, 0.15  # quantiles: of brightness between the lids, and of the redness of what is brighter
 MIN_PIXELS = 20
@@ -90,8 +91,10 @@ def limbus_offsets(
     profile = _sampled(view.brightness, at)
     slope = (profile[:, 2:] - profile[:, :-2]) / (2.0 * STEP_PX)
     clear = _sampled(view.clear_px, (at[:, 1:-1] + 0.5) * FINE - 0.5)
-    beyond = [_sampled(view.skin, at[:, 1:-1] + px * outwards[:, None]) for px in BEYOND_PX]
-    slope = np.where((clear > CLEAR_PX) & (np.maximum(*beyond) < MAX_SKIN), slope, 0.0)
+    near, far = (at[:, 1:-1] + px * outwards[:, None] for px in BEYOND_PX)
+    skin = np.maximum(_sampled(view.skin, near), _sampled(view.skin, far))
+    glare = np.maximum(_sampled(view.brightness, near), _sampled(view.brightness, far))
+    slope = np.where((clear > CLEAR_PX) & (skin < MAX_SKIN) & (glare < MAX_WHITE), slope, 0.0)
     best = np.clip(slope.argmax(axis=1), 1, slope.shape[1] - 2)
     rows = np.arange(len(best))
     before, peak, after = (slope[rows, best + step] for step in (-1, 0, 1))

@@ -37,6 +37,7 @@ from rig.studio.sensor.realism import REALISM, made_real
 SEED, SPREAD = 387, 0.8
 HEADS = 6  # of each model
 GAZE_DEG = (12.0, 6.0)  # deviations of azimuth and elevation
+FACEKIT_VERTICES = 11248  # of ICT-FaceKit's face and head
 AIMS = {"iris_mm": 0.5, "gaze_deg": 3.0, "pupils_mm": 0.5}
 CODE: tuple[ModuleType, ...] = (finding, edges, studio_eyes)
 
@@ -66,7 +67,7 @@ def looking_head(model: HeadModel, number: int) -> Subject:
     """Draws a head with eyeballs that look at a point."""
     rng = np.random.default_rng((SEED, number))
     vertices, faces = model.vertices(SPREAD * rng.standard_normal(len(model.modes))), model.levels["full"].faces
-    if len(vertices) and model.name != "default":
+    if len(vertices) == FACEKIT_VERTICES:  # what follows closes its eyes and mouth
         faces = faces[:OPEN_TRIANGLES]
     marks = {name: vertices[row] for name, row in model.landmarks.items()}
     azimuth, elevation = rng.normal(0.0, GAZE_DEG)

@@ -146,7 +146,7 @@ def _cut(mesh: Mesh, landmarks: Landmarks, side: str) -> tuple[Mesh, Int[np.ndar
         corners = vertices[faces]
         patch = np.linalg.norm(corners.mean(axis=1) - middle, axis=1) < PATCH_MM
         edges = np.linalg.norm(corners[patch] - np.roll(corners[patch], 1, axis=1), axis=2)
-        if np.median(edges) < EDGE_MM:
+        if not patch.any() or np.median(edges) < EDGE_MM:
             break
         vertices, faces, *_ = subdivide(vertices, faces, face_index=np.flatnonzero(patch))
     inside = _between_lids(vertices, inner, outer)[faces].all(axis=1)
