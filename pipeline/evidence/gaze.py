@@ -14,18 +14,21 @@ from pipeline.evidence.measurements import Measurement
 from pipeline.faces.irises import Iris, UnseenEye
 
 PUPIL_DISTANCE = "pupil_distance"
+MAX_BETWEEN_DEG = 12.0  # of two gazes: a point 0.3 m away. More is a squint or, more often, an error of one
 
 
 def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:
-    """Returns the far pupil distance by its name among the measurements; nothing unless both irises were found."""
+    """Returns the far pupil distance by its name among the measurements; nothing where there is none."""
     found = pupil_distance(eyes)
     return {} if found is None else {PUPIL_DISTANCE: found}
 
 
 def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
-    """Returns the far pupil distance (mm), None unless both irises were found."""
+    """Returns the far pupil distance (mm), None unless both irises were found and look at one point."""
     right, left = eyes.get("right"), eyes.get("left")
     if not isinstance(right, Iris) or not isinstance(left, Iris):
+        return None
+    if right.gaze @ left.gaze < np.cos(np.radians(MAX_BETWEEN_DEG)):
         return None
     apart = left.eyeball - right.eyeball
     value = float(np.linalg.norm(apart))

@@ -68,7 +68,7 @@ def measurement_columns() -> tuple[Column, ...]:
     """Returns two columns for each of Farkas's distances (*Anthropometry of the Head and Face*) and for the pupil
     distance: the value and its standard deviation (mm)."""
     what = {name: f"distance from {first} to {second}" for name, (first, second) in DISTANCES.items()}
-    what[PUPIL_DISTANCE] = "far pupil distance; empty unless both irises are seen"
+    what[PUPIL_DISTANCE] = "far pupil distance; empty unless both irises are seen and look at one point"
     return tuple(
         column
         for name, meaning in what.items()
