@@ -236,7 +236,7 @@ def _radius_px(circle: _Circle, view: EyeView) -> float:
 
 
 def _fitted(seen: Sequence[_Seen], circle: _Circle, eyeball: Float[np.ndarray, " 3"]) -> Iris | UnseenEye:
-    matrix, evidence = np.zeros((6, 6)), {}
+    matrix, evidence = np.zeros((6, 6)), dict[str, Rows]()
     for reach in REACHES:
         evidence = {}
         for each in seen:
@@ -244,7 +244,7 @@ def _fitted(seen: Sequence[_Seen], circle: _Circle, eyeball: Float[np.ndarray, "
                 rows = _edges(circle, each.view, reach)
                 if rows is not None:
                     evidence[each.name] = rows
-        if len(evidence) < MIN_VIEWS or sum(rows[-1] for rows in evidence.values()).min() < MIN_SIDE:
+        if len(evidence) < MIN_VIEWS or np.sum([rows[-1] for rows in evidence.values()], axis=0).min() < MIN_SIDE:
             return UnseenEye("unclear")
         step, matrix = _step(circle, evidence, eyeball)
         circle = circle.after(step)
