@@ -31,6 +31,7 @@ ISO_NAMES: Mapping[str, str] = {
     "head_circumference": "head circumference (ISO 7250-1), head girth (ISO 8559-1)",
     "head_length": "head length (ISO 7250-1)",
     "head_breadth": "head breadth (ISO 7250-1)",
+    "pupil_distance": "interpupillary distance, far (ISO 13666)",
     "face_height": "face length, nasion to menton (ISO 7250-1)",
 }
 BRIDGE_BELOW_NASION_MM = 7.0

@@ -25,6 +25,7 @@ from pipeline.research.paper.posterior_check import posterior_check
 from pipeline.research.paper.robustness import robustness
 from pipeline.research.paper.views import views
 from pipeline.research.people.expressions import expressions
+from pipeline.research.people.gazes import gazes
 from pipeline.research.people.people import people
 from pipeline.research.speed.farm import scale
 from pipeline.research.speed.growth import growth, sizes
@@ -307,12 +308,15 @@ def _shapes(task: Task) -> Outcome:
     return shapes(task.head, _facekit(task.shared), report=task.report, folder=task.folder)
 
 
-def _eyeballs(task: Task) -> Outcome:
-    return eyeballs(_facekit(task.shared), report=task.report, folder=task.folder)
+def _of_facekit(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
+    return lambda task: experiment(_facekit(task.shared), report=task.report, folder=task.folder)
 
 
-def _inner_mouth(task: Task) -> Outcome:
-    return inner_mouths(_facekit(task.shared), report=task.report, folder=task.folder)
+def _gazes(task: Task) -> Outcome:
+    count = {"subjects": task.subjects} if task.subjects else {}
+    models = {"default": task.head, "ict": _facekit(task.shared)}
+    with Renderer.create() as renderer:
+        return gazes(models, renderer=renderer, report=task.report, folder=task.folder, **count)
 
 
 def _wrap(task: Task) -> Outcome:
@@ -372,8 +376,9 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "light": _drawn(light),
     "templates": _templates,
     "shapes": _shapes,
-    "eyeballs": _eyeballs,
-    "inner-mouth": _inner_mouth,
+    "eyeballs": _of_facekit(eyeballs),
+    "gazes": _gazes,
+    "inner-mouth": _of_facekit(inner_mouths),
     "wrap": _wrap,
     "hair-shell": _hair_shell,
     "meshes": _meshes,

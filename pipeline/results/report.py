@@ -15,6 +15,7 @@ from pipeline.faces.detection import FaceDetection
 from pipeline.faces.subject import SubjectFaces
 from pipeline.imaging.silhouette import Silhouette, ViewQuality
 from pipeline.part_labels.votes import PART_NAMES
+from pipeline.results.eye_report import eyes_document
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report_types import (
     FORMAT,
@@ -90,6 +91,7 @@ def report_document(
             name: {"value": length.value_mm, "std": _finite(length.std_mm)}
             for name, length in evidence.measurements.items()
         },
+        "eyes": eyes_document(result.faces.eyes, head.fit.world_from_head),
         "quality": {"median": _finite(np.median(refined.deviation_mm)), "max": _finite(refined.deviation_mm.max())},
         "texture": _texture(result.texturing),
         "bust": None if result.bust is None else _bust(result.bust),

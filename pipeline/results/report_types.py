@@ -78,6 +78,32 @@ class Placed(TypedDict):
     std: list[float] | None
 
 
+class GazeReport(TypedDict):
+    """Describes the direction of a gaze in one frame (degrees)."""
+
+    azimuth_deg: float
+    elevation_deg: float
+
+
+class EyeReport(TypedDict):
+    """Describes an eye. ``seen`` is false where its iris was not found, and ``cause`` says why: ``closed``,
+    ``few-views``, ``coarse`` (too few pixels) or ``unclear`` (no clear border of the iris); all else is null then.
+
+    ``iris`` is the middle of the limbus (world, mm), ``radius`` the limbus' (mm). ``gaze`` is the unit vector of the
+    optical axis (world), ``std_deg`` its standard deviation in each direction. Azimuth and elevation of ``rig`` are in
+    the world frame (from z towards x, then towards y), of ``face`` in the head frame (to the subject's left, up)."""
+
+    seen: bool
+    cause: str | None
+    iris: Placed | None
+    radius: Measured | None
+    gaze: list[float] | None
+    std_deg: float | None
+    rig: GazeReport | None
+    face: GazeReport | None
+    views: list[str]
+
+
 class ExpressionReport(TypedDict):
     """Describes one expression of the face: the model's name of it, the same in words, its weight from 0 to 1, and the
     weight's standard deviation."""
@@ -215,6 +241,7 @@ class Report(TypedDict):
     world_from_head: SimilarityReport
     landmarks: dict[str, Placed]
     measurements: dict[str, Measured]
+    eyes: NotRequired[dict[str, EyeReport]]  # not in files of earlier versions
     quality: dict[str, float | None]
     texture: TextureReport
     bust: BustReport | None

@@ -2,28 +2,33 @@
 
 Head frame; the GLB in metres, the archive in mm. Vertices keep the template's order; in the GLB, eyeballs are parts of
 their own (``extras.rows`` of a node says which vertices it has). Eyeballs, teeth and a tongue that the mesh lacks are
-added, and have none.
+added, and have none. With the formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` are the same
+without shapes: parts by name.
 """
 
 import io
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.evidence.expression import BlendshapeRig
+from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.head_model.visemes import VISEMES
 from pipeline.results.metadata import asset_extras
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.templates.animated import AnimatedMesh, animated_mesh
+from pipeline.templates.eyeballs import AHEAD, turn_to
 from pipeline.templates.inner_mouth import WITH_JAW
 from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.glb import glb_bytes
 from rig.formats.meshes.morph_glb import with_morphs
+from rig.formats.meshes.parts_files import PlacedPart, parts_obj_bytes, parts_usdz_bytes
 from rig.formats.meshes.pivot_glb import NECK, MovingPart, with_pivots
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh, vertex_normals
@@ -52,6 +57,7 @@ def write_template_shapes(
         blendshape_rig.neutral_world.faces,
         blendshape_rig.morphs,
         model.landmarks,
+        gazes=_gazes(result.faces.eyes, head_from_world),
     )
     name = f"head-{template.name}"
     extras = asset_extras(result) | {"template": template.name, "template_sha256": template.source_sha256}
@@ -59,6 +65,36 @@ def write_template_shapes(
     data = animated_glb(animated, triangles, colours, blendshape_rig.weights, extras)
     write_atomically(folder / f"{name}.glb", data)
     write_atomically(folder / f"{name}-shapes.npz", _archive(animated, template, blendshape_rig))
+    formats = result.settings.outputs.formats
+    if "obj" in formats or "usdz" in formats:
+        parts = animated_parts(animated, triangles, colours)
+        if "obj" in formats:
+            write_atomically(folder / f"{name}-parts.obj", parts_obj_bytes(parts))
+        if "usdz" in formats:
+            write_atomically(folder / f"{name}-parts.usdz", parts_usdz_bytes(parts))
+
+
+def _gazes(eyes: Mapping[str, Iris | UnseenEye], head_from_world: RigidTransform) -> dict[str, Float[np.ndarray, " 3"]]:
+    """Returns where eyes that are seen look, by pivot (head frame)."""
+    return {f"eye_{side}": head_from_world.rotation @ eye.gaze for side, eye in eyes.items() if isinstance(eye, Iris)}
+
+
+def animated_parts(
+    animated: AnimatedMesh, triangles: Int[np.ndarray, "g 3"], colours: UInt8[np.ndarray, "t 3"]
+) -> dict[str, PlacedPart]:
+    """Returns the mesh without expression by named parts (head frame, mm): head, eyeballs about their pivots, turned as
+    the eyes look, teeth and tongue."""
+    turning = np.zeros(len(animated.neutral), bool)
+    eyes = {name: replace(eyeball, gaze=AHEAD).mesh() for name, eyeball in animated.added.items()}
+    for name, rows in animated.eyeballs.items():
+        turning[rows] = True
+        eyes[name] = _part(animated, triangles, colours, rows)
+    out = {"head": PlacedPart(_part(animated, triangles, colours, np.flatnonzero(~turning)), RigidTransform.identity())}
+    for name, mesh in eyes.items():
+        pivot = animated.pivots[name]
+        place = RigidTransform(turn_to(animated.gazes.get(name, AHEAD)), pivot)
+        out[name] = PlacedPart(Mesh(mesh.vertices - pivot, mesh.faces, mesh.colours), place)
+    return out | {name: PlacedPart(mesh, RigidTransform.identity()) for name, mesh in animated.inner.parts.items()}
 
 
 def animated_glb(
@@ -79,12 +115,13 @@ def animated_glb(
     glb = with_morphs(glb, head.vertices, head.faces, morphs, weights)
     parts = {name: _part(animated, triangles, colours, part) for name, part in animated.eyeballs.items()}
     named = {"head": rows.tolist()} | {name: part.tolist() for name, part in animated.eyeballs.items()}
-    parts |= {name: eyeball.mesh() for name, eyeball in animated.added.items()}
+    parts |= {name: replace(eyeball, gaze=AHEAD).mesh() for name, eyeball in animated.added.items()}
     inner = {
         name: MovingPart(JAW if name in WITH_JAW else NECK, part, animated.inner.moves[name], weights)
         for name, part in animated.inner.parts.items()
     }
-    return with_pivots(glb, animated.pivots, parts, named if turning.any() else {}, inner)
+    turns = {name: turn_to(gaze) for name, gaze in animated.gazes.items() if name in parts}
+    return with_pivots(glb, animated.pivots, parts, named if turning.any() else {}, inner, turns)
 
 
 def _part(
@@ -135,6 +172,7 @@ def _archive(animated: AnimatedMesh, template: Template, blendshape_rig: Blendsh
             name: {"radius_mm": eyeball.radius_mm, "gaze": eyeball.gaze.tolist()}
             for name, eyeball in animated.added.items()
         },
+        "gazes": {name: gaze.tolist() for name, gaze in animated.gazes.items()},
         "inner_mouth": {"parts": list(animated.inner.parts), "absence": animated.inner.absence},
     }
     packed = io.BytesIO()

@@ -22,6 +22,7 @@ from pipeline.evidence.expression import (
     found_expressions,
     shut_eyes,
 )
+from pipeline.evidence.gaze import pupils
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
 from pipeline.evidence.plausibility import (
     UnexplainedOutlines,
@@ -92,7 +93,7 @@ def judge_head(
         fitted,
         cameras,
         landmarks(model, fit, refined.mesh_world.vertices),
-        measurements(model, fit, refined.mesh_world.vertices),
+        measurements(model, fit, refined.mesh_world.vertices) | pupils(faces.eyes),
         expression,
         build_blendshape_rig(model, fit.world_from_head, refined.mesh_world, expression) if posed else None,
     )

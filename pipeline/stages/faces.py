@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from pipeline.detail.eyelids import MIN_HALF_OPENING
 from pipeline.faces.eyes import eye_openings
+from pipeline.faces.irises import Iris, UnseenEye, find_irises
 from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import SubjectFaces, find_subject
 from pipeline.stages.context import ReconstructionContext
@@ -15,12 +17,13 @@ from rig.capture import Capture
 class Faces:
     """Holds the subject's faces in the photographs; ``subject`` is None if the settings do not ask for them.
 
-    ``eye_openings`` says how far the lids of each eye stand apart (``faces.eyes``), if the views agree on the subject's
-    face.
+    ``eye_openings`` says how far the lids of each eye stand apart (``faces.eyes``), and ``eyes`` has the irises or why
+    they are not seen, if the views agree on the subject's face.
     """
 
     subject: SubjectFaces | None
     eye_openings: Mapping[str, float] = field(default_factory=dict)
+    eyes: Mapping[str, Iris | UnseenEye] = field(default_factory=dict)
 
 
 @stage("faces")
@@ -31,4 +34,8 @@ def find_faces(context: ReconstructionContext, capture: Capture) -> Staged[Faces
     subject = find_subject(  # the networks end with it: 60 MB that no later stage needs
         capture.images, context.rig, load_networks(), report=lambda share: context.progress("faces", share)
     )
-    return Staged(Faces(subject, {} if subject.matched is None else eye_openings(subject.matched, context.rig)))
+    if subject.matched is None:
+        return Staged(Faces(subject))
+    openings = eye_openings(subject.matched, context.rig)
+    closed = frozenset(side for side, opening in openings.items() if opening < MIN_HALF_OPENING)
+    return Staged(Faces(subject, openings, find_irises(subject.matched, capture.images, context.rig, closed)))

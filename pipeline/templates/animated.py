@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from pipeline.head_model.visemes import VISEMES, mixed
 from pipeline.templates.carrying import SurfaceBinding
 from pipeline.templates.contact import RestSurface, kept_apart, rest_surface
-from pipeline.templates.eyeballs import Eyeball, lifted, placed_eyeballs
+from pipeline.templates.eyeballs import STRAIGHT, Eyeball, lifted, placed_eyeballs
 from pipeline.templates.inner_mouth import InnerMouth, kept_off_teeth, placed_inner_mouth
 from pipeline.templates.pivots import EYE_REACH_MM, Points, jaw_motions, pivots
 from pipeline.templates.shape_carrying import Neutral, carried_shapes, loose_parts
@@ -28,6 +28,7 @@ class AnimatedMesh:
     eyeballs: Mapping[str, Int[np.ndarray, " b"]]  # rows of the mesh, by pivot
     added: Mapping[str, Eyeball] = field(default_factory=dict)  # eyeballs that the mesh lacks, by pivot
     inner: InnerMouth = field(default_factory=InnerMouth)  # teeth and tongue that the mesh lacks
+    gazes: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # of eyes that were seen, by pivot
 
 
 def animated_mesh(
@@ -37,6 +38,8 @@ def animated_mesh(
     faces: Int[np.ndarray, "f 3"],
     shapes: Mapping[str, Float[np.ndarray, "v 3"]],
     landmark_rows: Mapping[str, int],
+    *,
+    gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
     """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots, eyeballs, teeth and
     tongue.
@@ -48,6 +51,7 @@ def animated_mesh(
         faces: its triangles.
         shapes: displacements of that level, by Apple's names or the model's.
         landmark_rows: the model's landmarks, rows of that level.
+        gazes: where eyes look (unit vectors, head frame), by pivot; straight ahead where there is none.
     """
     mesh = surface_binding.on(vertices, faces)
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
@@ -63,7 +67,7 @@ def animated_mesh(
         if name.startswith("eye_") and np.linalg.norm(mesh[rows].mean(axis=0) - pivot) < 0.5 * EYE_REACH_MM
     }
     lacking = {name: pivot for name, pivot in found.items() if name.startswith("eye_") and name not in eyes}
-    added = placed_eyeballs(mesh, triangles, landmarks, lacking)
+    added = placed_eyeballs(mesh, triangles, landmarks, lacking, gazes)
     found |= {name: eyeball.centre for name, eyeball in added.items()}
     shapes_of_mesh = parted_shapes(rest_surface(mesh, triangles), carried)
     if added:
@@ -71,7 +75,8 @@ def animated_mesh(
     loose = np.where(surface_binding.wholes >= 0, -1, loose_parts(surface_binding, triangles, len(mesh)))
     jaw = jaw_motions(landmarks, vertices, shapes)
     inner = placed_inner_mouth(mesh, triangles, shapes_of_mesh, landmarks, jaw, loose)
-    return AnimatedMesh(mesh, kept_off_teeth(mesh, triangles, shapes_of_mesh, inner), found, eyes, added, inner)
+    moves = kept_off_teeth(mesh, triangles, shapes_of_mesh, inner)
+    return AnimatedMesh(mesh, moves, found, eyes, added, inner, gazes)
 
 
 def parted_shapes(

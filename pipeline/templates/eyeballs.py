@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.templates.pivots import EYE_RADIUS_MM, Points
+from rig.geometry import rotation_from_vector
 from rig.mesh import Mesh, boundary_edges
 
 CORNEA_MM, LIMBUS_MM, PUPIL_MM = 7.8, 5.9, 2.0
@@ -22,6 +23,8 @@ WEIGHTS = (0.5, 1.0)
 ROUNDS = 30
 RINGS, SECTORS = 40, 48
 OPEN_SHARE = 0.4  # of the eye's length, within which lids of an open eye have a border about its middle
+AHEAD = np.array([0.0, 0.0, 1.0])
+STRAIGHT: Mapping[str, Float[np.ndarray, " 3"]] = {}
 WHITE, IRIS, PUPIL = (225, 220, 214), (96, 72, 52), (12, 12, 12)  # sRGB; no photograph tells them
 
 
@@ -101,11 +104,20 @@ def _colours(angles: Float[np.ndarray, " n"], pupil: float, limbus: float) -> UI
     return out
 
 
+def turn_to(gaze: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """Returns the rotation that turns an eye from straight ahead to ``gaze`` (unit, head frame), without roll about
+    either (Listing)."""
+    axis = np.cross(AHEAD, gaze)
+    sine = float(np.linalg.norm(axis))
+    return rotation_from_vector(axis * (np.arctan2(sine, gaze @ AHEAD) / sine if sine > 0.0 else 1.0))
+
+
 def placed_eyeballs(
     mesh: Float[np.ndarray, "t 3"],
     triangles: Int[np.ndarray, "g 3"],
     landmarks: Points,
     centres: Mapping[str, Float[np.ndarray, " 3"]],
+    gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> dict[str, Eyeball]:
     """Returns eyeballs behind the open eyes of a mesh without expression, by pivot; none where the mesh closes an eye.
 
@@ -114,16 +126,17 @@ def placed_eyeballs(
         triangles: of the mesh.
         landmarks: of the head.
         centres: the pivots ``eye_right`` and ``eye_left``, or one of them.
+        gazes: where they look (unit vectors, head frame), straight ahead where there is none.
     """
-    out, ahead = {}, np.array([0.0, 0.0, 1.0])
+    out = {}
     for name in centres:
         if not _is_open(mesh, triangles, landmarks, name.removeprefix("eye_")):
             continue
         points = _samples(mesh, triangles[_near(mesh, triangles, centres[name])])
-        back = 0.0
-        while back < BACK_MM and _depths(Eyeball(centres[name] - back * ahead, ahead), points).max(initial=0.0) > 0.0:
+        gaze, back = gazes.get(name, AHEAD), 0.0
+        while back < BACK_MM and _depths(Eyeball(centres[name] - back * AHEAD, gaze), points).max(initial=0.0) > 0.0:
             back += STEP_MM
-        out[name] = Eyeball(centres[name] - back * ahead, ahead)
+        out[name] = Eyeball(centres[name] - back * AHEAD, gaze)
     return out
 
 

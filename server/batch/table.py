@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from pipeline.evidence.gaze import PUPIL_DISTANCE
 from pipeline.evidence.measurements import DISTANCES
 from pipeline.head_model.landmarks import NAMES
 from rig.digest import document_sha256
@@ -64,13 +65,15 @@ ORIGIN = (
 
 
 def measurement_columns() -> tuple[Column, ...]:
-    """Returns two columns for each of Farkas's distances (*Anthropometry of the Head and Face*): the value and its
-    standard deviation (mm)."""
+    """Returns two columns for each of Farkas's distances (*Anthropometry of the Head and Face*) and for the pupil
+    distance: the value and its standard deviation (mm)."""
+    what = {name: f"distance from {first} to {second}" for name, (first, second) in DISTANCES.items()}
+    what[PUPIL_DISTANCE] = "far pupil distance; empty unless both irises are seen and look at one point"
     return tuple(
         column
-        for name, (first, second) in DISTANCES.items()
+        for name, meaning in what.items()
         for column in (
-            Column(f"{name}_mm", "number", "mm", f"distance from {first} to {second}"),
+            Column(f"{name}_mm", "number", "mm", meaning),
             Column(f"{name}_std_mm", "number", "mm", f"standard deviation of {name}_mm"),
         )
     )

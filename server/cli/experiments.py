@@ -40,8 +40,8 @@ def experiments(
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
             "exchanges, false-alarms, posterior, views, repeat, relief, pores, span, detail, hidden, expressions, "
-            "visible, people, planted, surfaces, texture, light, templates, shapes, eyeballs, inner-mouth, meshes, "
-            "wrap, hair-shell, scaling, growth, scale or real."
+            "visible, people, planted, surfaces, texture, light, templates, shapes, eyeballs, gazes, inner-mouth, "
+            "meshes, wrap, hair-shell, scaling, growth, scale or real."
         ),
     ],
     *,

@@ -28,6 +28,7 @@ from server.cli.answers import (
 if TYPE_CHECKING:
     from rig.studio.sensor.preset import Preset
 
+MAX_GAZE_DEG = 35.0  # of the studio's eyeballs: lids hide more
 app = typer.Typer(rich_markup_mode=None)
 
 
@@ -259,6 +260,10 @@ def simulate(
         list[str] | None,
         typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
     ] = None,
+    gaze: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Azimuth (to the subject's left) and elevation, degrees: eyeballs that look there."),
+    ] = None,
     fault: Annotated[
         list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
     ] = None,
@@ -274,8 +279,18 @@ def simulate(
 
     --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
     given) with which the rig commands and the service work as with a real rig."""
-    chosen = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus, "rolling_ms": rolling_ms}
-    preset = _studio_preset(realism, hair, has_hair=not no_hair, polarised=polarised, **chosen)
+    chosen: dict[str, Any] = {
+        "noise": noise,
+        "light_drift": light_drift,
+        "defocus_px": defocus,
+        "rolling_ms": rolling_ms,
+        "hair": not no_hair,
+        "hairstyle": tuple(hair.split(",")) if hair else (),
+        "polarised": polarised,
+    }
+    preset = _studio_preset(realism, **chosen)
+    if gaze is not None and (serve or not max(map(abs, gaze)) <= MAX_GAZE_DEG):
+        raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees, and not with --serve", param_hint="--gaze")
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
                       faults=fault or [], expression=expression or [])  # fmt: skip
@@ -290,11 +305,11 @@ def simulate(
     with progress_bar() as report, Renderer.create() as renderer:
         report("simulate", 0.0)
         truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer,
-                                expression=expression or [])  # fmt: skip
+                                expression=expression or [], gaze_deg=gaze)  # fmt: skip
     answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
 
 
-def _studio_preset(realism: str | None, hairstyles: str | None, *, has_hair: bool, **chosen: Any) -> "Preset":
+def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
     """Returns the studio's preset with the chosen values. Raises typer.BadParameter for an unknown name in
     ``realism``."""
     from dataclasses import replace
@@ -302,15 +317,9 @@ def _studio_preset(realism: str | None, hairstyles: str | None, *, has_hair: boo
     from rig.studio.sensor.preset import PRESET
     from rig.studio.sensor.realism import made_real, realism_names
 
-    styles = tuple(hairstyles.split(",")) if hairstyles else ()
     with wrong_usage("--realism"):
         return made_real(
-            replace(
-                PRESET,
-                hair=has_hair,
-                hairstyle=styles,
-                **{key: value for key, value in chosen.items() if value is not None},
-            ),
+            replace(PRESET, **{key: value for key, value in chosen.items() if value is not None}),
             realism_names(realism),
         )
 

@@ -17,7 +17,7 @@ from rig.render.renderer import Renderer
 from rig.studio.devices.folder import simulate_to_folder
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import simulate
-from rig.studio.scene.subject import Subject
+from rig.studio.scene.subject import Subject, with_gaze
 from rig.studio.sensor.faults import fault_from_text
 from rig.studio.sensor.preset import Preset
 
@@ -61,12 +61,14 @@ def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression
 
 def simulate_folder(
     out: Path, *, subject: str, seed: int, preset: Preset, faults: list[str], renderer: Renderer,
-    expression: Sequence[str] = (),
+    expression: Sequence[str] = (), gaze_deg: tuple[float, float] | None = None,
 ) -> Path:  # fmt: skip
-    """Simulates a capture and writes it to the folder ``out``, as ``eigenhead simulate`` does. Returns the folder of
-    the true head."""
+    """Simulates a capture and writes it to the folder ``out``, as ``eigenhead simulate`` does. ``gaze_deg``: azimuth
+    and elevation of eyeballs, which replace painted eyes. Returns the folder of the true head."""
     rng = np.random.default_rng(seed)
     chosen = subject_of(subject, load_model(), rng, expression)
+    if gaze_deg is not None:
+        chosen = with_gaze(chosen, *gaze_deg, np.random.default_rng((seed, 1)))
     planted = tuple(fault_from_text(text) for text in faults)
     taken = simulate(chosen, default_layout(), preset, rng, renderer=renderer, faults=planted)
     return simulate_to_folder(out, taken, seed=seed)

@@ -15,6 +15,7 @@ from rig.colour_space import linear_from_srgb
 from rig.formats.meshes.glb import FLOAT, INDICES, UINT, USHORT, VERTICES
 from rig.formats.meshes.glb_document import appended_view, closed_glb, opened_glb
 from rig.formats.meshes.morph_glb import append_targets
+from rig.geometry import vector_from_rotation
 from rig.mesh import Mesh
 
 NECK = "neck"
@@ -32,6 +33,7 @@ class MovingPart:
 
 
 NONE: Mapping[str, MovingPart] = {}
+UNTURNED: Mapping[str, Float[np.ndarray, "3 3"]] = {}
 
 
 def with_pivots(
@@ -40,6 +42,7 @@ def with_pivots(
     parts: Mapping[str, Mesh],
     rows: Mapping[str, Any],
     moving: Mapping[str, MovingPart] = NONE,
+    turns: Mapping[str, Float[np.ndarray, "3 3"]] = UNTURNED,
 ) -> bytes:
     """Returns a GLB of this project, of one mesh, with nodes at pivots and with parts.
 
@@ -49,6 +52,7 @@ def with_pivots(
         parts: the meshes (mm, in that frame) of some pivots, with colours.
         rows: what ``extras.rows`` of a node says: which vertices of a file its mesh has.
         moving: parts by name that become nodes of their own.
+        turns: rotations of pivots, which turn what is under them; ``parts`` are as they are without.
     """
     document, payload = opened_glb(glb)
     neck = pivots_mm[NECK] / 1000.0
@@ -58,6 +62,8 @@ def with_pivots(
         if name == NECK:
             continue
         node: dict[str, Any] = {"name": name, "translation": (pivot / 1000.0 - neck).tolist()}
+        if name in turns:
+            node["rotation"] = quaternion(turns[name]).tolist()
         if name in parts:
             part = parts[name]
             about = Mesh(part.vertices - pivot, part.faces, part.colours)
@@ -78,6 +84,13 @@ def with_pivots(
     document["nodes"].append({"name": NECK, "translation": neck.tolist(), "children": children})
     document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
     return closed_glb(document, payload)
+
+
+def quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
+    """Returns a rotation as a unit quaternion x, y, z, w."""
+    vector = vector_from_rotation(rotation)
+    angle = float(np.linalg.norm(vector))
+    return np.append(vector * (0.5 * np.sinc(angle / (2.0 * np.pi))), np.cos(0.5 * angle))
 
 
 def _append_moving(

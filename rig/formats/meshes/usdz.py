@@ -60,10 +60,10 @@ def usdz_bytes(
     with tempfile.TemporaryDirectory() as scratch:
         layer = Path(scratch) / "head.usdc"
         _write_layer(layer, mesh, normals, uv, faces_uv, texture)
-        return _package({"head.usdc": layer.read_bytes(), texture: image})
+        return package({"head.usdc": layer.read_bytes(), texture: image})
 
 
-def _module(name: str) -> Any:
+def openusd_module(name: str) -> Any:
     """Imports a module of OpenUSD as Any, because its type stubs are incomplete."""
     return importlib.import_module(f"pxr.{name}")
 
@@ -71,7 +71,7 @@ def _module(name: str) -> Any:
 def _write_layer(
     path: Path, mesh: Mesh, normals: np.ndarray, uv: np.ndarray, faces_uv: np.ndarray, texture: str
 ) -> None:
-    Gf, Sdf, Usd, UsdGeom, UsdShade, Vt = map(_module, ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "Vt"))
+    Gf, Sdf, Usd, UsdGeom, UsdShade, Vt = map(openusd_module, ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "Vt"))
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -119,7 +119,7 @@ def _write_layer(
     stage.GetRootLayer().Save()
 
 
-def _package(files: dict[str, bytes]) -> bytes:
+def package(files: dict[str, bytes]) -> bytes:
     """Returns a zip without compression and times, whose files begin at multiples of 64 bytes; the USD layer comes
     first."""
     data = BytesIO()

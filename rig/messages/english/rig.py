@@ -145,6 +145,7 @@ TEMPLATES = {
     "rig-cameras": "its cameras are {cameras}",
     "rig-empty": "it has no cameras at all",
     "beard-without-landmarks": "a beard is laid out from landmarks, which this head does not have",
+    "eyes-without-landmarks": "eyeballs are laid out from landmarks, which this head does not have",
     "glasses-without-landmarks": "glasses are laid out from landmarks, which this head does not have",
     "fault-amount": "{text}: {amount} is no number; wanted kind[:camera][=amount]",
     "stream-frame": "a frame of {bytes} bytes",

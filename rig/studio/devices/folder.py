@@ -13,6 +13,7 @@ from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.meshes.ply import write_ply
 from rig.formats.pictures.images import write_image
+from rig.studio.scene.eyes import LIMBUS_MM
 from rig.studio.scene.simulate import SimulatedCapture
 from rig.studio.sensor.realism import REALISM, made_real
 
@@ -91,5 +92,14 @@ def _meta(simulated: SimulatedCapture, face_vertices: int, seed: int | None) -> 
             "translation": (pose.translation / pose.scale).tolist(),  # x_world = s (R x_head + t)
         },
         "landmarks_world": {name: point.tolist() for name, point in scene.landmarks_world.items()},
+        "eyes_world": {
+            side: {
+                "centre": eye.centre.tolist(),
+                "gaze": eye.gaze.tolist(),
+                "iris_centre": eye.iris_centre.tolist(),
+                "iris_radius_mm": LIMBUS_MM,
+            }
+            for side, eye in scene.eyes_world.items()
+        },
         "faults": [{"kind": f.kind, "camera": f.camera, "amount": f.strength} for f in simulated.faults],
     }

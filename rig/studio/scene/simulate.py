@@ -6,7 +6,7 @@ that takes pictures one by one keeps the scene and calls ``view_light`` and ``se
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ from rig.messages.message import compose
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.backdrop import backdrop, chair
+from rig.studio.scene.eyes import Eye
 from rig.studio.scene.hairstyles import restyled
 from rig.studio.scene.lights import LAMPS, Lamp
 from rig.studio.scene.polarised import matt_light
@@ -72,6 +73,7 @@ class Scene:
     parts: Mapping[str, UInt8[np.ndarray, "h w"]]  # 0 background, 1 skin, 2 hair, 3 clothes
     preset: Preset
     name: str
+    eyes_world: Mapping[str, Eye] = field(default_factory=dict)  # by side, where the subject has eyeballs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,6 +161,7 @@ def build_scene(
         parts=part_masks(true_rig, dressed.surfaces, masks, renderer=renderer),
         preset=preset,
         name=subject.name,
+        eyes_world={side: eye.placed(pose) for side, eye in subject.eyes.items()},
     )
 
 

@@ -1,9 +1,10 @@
 """Computes skin colour at each vertex: an even tone, blotches, and features that are placed by landmarks."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from rig.studio.scene.anatomy import Anatomy, Landmarks
 
@@ -20,9 +21,11 @@ def skin_paint(
     rng: np.random.Generator,
     *,
     closed: Mapping[str, float] | None = None,
+    eyeballs: bool = False,
 ) -> Float[np.ndarray, "v 4"]:
     """Computes the linear albedo of the skin at each vertex (head frame, mm) and, as a fourth number, the strength of
-    its fine structure. ``closed`` says how far the lids of each side are closed, 0 to 1."""
+    its fine structure. ``closed`` says how far the lids of each side are closed, 0 to 1; no eyes are painted
+    for a subject that has ``eyeballs``."""
     paint = np.ones((len(vertices), 4))
     paint[:, :3] = np.array(tone) * (1 + _blotches(vertices, rng) * (0.5, 1.0, 1.0))
     if body.landmarks:
@@ -30,7 +33,7 @@ def skin_paint(
         _beard(paint, vertices, body.landmarks, stubble)
         _mouth(paint, vertices, body.landmarks)
         for side in ("right", "left"):
-            _eye(paint, vertices, body.landmarks, side, (closed or {}).get(side, 0.0))
+            _eye(paint, vertices, body.landmarks, side, (closed or {}).get(side, 0.0), eyeballs=eyeballs)
     paint[:, :3] = np.maximum(paint[:, :3], 0.004)
     return paint
 
@@ -104,9 +107,15 @@ def _mouth(paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], 
 
 
 def _eye(
-    paint: Float[np.ndarray, "v 4"], vertices: Float[np.ndarray, "v 3"], marks: Landmarks, side: str, closed: float
+    paint: Float[np.ndarray, "v 4"],
+    vertices: Float[np.ndarray, "v 3"],
+    marks: Landmarks,
+    side: str,
+    closed: float,
+    *,
+    eyeballs: bool,
 ) -> None:
-    """Brow and eye."""
+    """Brow, and eye or lashes."""
     x, y, z = vertices.T
     outer, inner = marks[f"exocanthion_{side}"], marks[f"endocanthion_{side}"]
     span = outer[0] - inner[0]
@@ -120,7 +129,35 @@ def _eye(
     brow = there * _smoothstep(1.0, 0.4, np.abs(y - arch) / width)
     _mix(paint, 0.85 * brow, BROW)
     paint[:, 3] += 3.0 * brow
-    _open_eye(paint, vertices, inner, outer, closed)
+    if eyeballs:
+        _lashes(paint, eye_gap(vertices, inner, outer, closed))
+    else:
+        _open_eye(paint, vertices, inner, outer, closed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EyeGap:
+    """Holds where vertices lie about the gap between two lids: along it (0 at the inner corner, 1 at the outer one),
+    off its middle line (mm), its half height there (mm), how much its lids bend there, and which it may reach."""
+
+    along: Float[np.ndarray, " v"]
+    off: Float[np.ndarray, " v"]
+    height: Float[np.ndarray, " v"]
+    bow: Float[np.ndarray, " v"]
+    here: Bool[np.ndarray, " v"]
+
+
+def eye_gap(
+    vertices: Float[np.ndarray, "v 3"], inner: Float[np.ndarray, " 3"], outer: Float[np.ndarray, " 3"], closed: float
+) -> EyeGap:
+    """Returns the gap between the lids of an eye that is ``closed`` so far, 0 to 1; the upper lid comes down to the
+    lower one."""
+    x, y, z = vertices.T
+    along = np.clip((x - inner[0]) / (outer[0] - inner[0]), 0, 1)
+    bow = 4 * along * (1 - along)
+    off = y - (inner[1] + along * (outer[1] - inner[1]) + 1.4 * bow) + 4.0 * bow * closed
+    here = (along > 0.02) & (along < 0.98) & (z > outer[2] - 14)
+    return EyeGap(along, off, 4.0 * bow * (1.0 - closed), bow, here)
 
 
 def _open_eye(
@@ -130,24 +167,24 @@ def _open_eye(
     outer: Float[np.ndarray, " 3"],
     closed: float,
 ) -> None:
-    """White, iris and pupil between the lids, and the upper lashes; the upper lid comes down to the lower one."""
-    x, y, z = vertices.T
-    t = np.clip((x - inner[0]) / (outer[0] - inner[0]), 0, 1)
-    bow = 4 * t * (1 - t)
-    height = 4.0 * bow * (1.0 - closed)
-    off = y - (inner[1] + t * (outer[1] - inner[1]) + 1.4 * bow) + 4.0 * bow * closed
-    here = (t > 0.02) & (t < 0.98) & (z > outer[2] - 14)
-    opening = here * _smoothstep(0.6, -0.6, np.abs(off) - height) * (closed < 1.0)
+    """White, iris and pupil between the lids, and the upper lashes."""
+    x, y, _ = vertices.T
+    gap = eye_gap(vertices, inner, outer, closed)
+    opening = gap.here * _smoothstep(0.6, -0.6, np.abs(gap.off) - gap.height) * (closed < 1.0)
     _mix(paint, opening, np.array([0.44, 0.40, 0.38]))
     paint[:, 3] *= 1 - 0.8 * opening
     middle = (inner + outer) / 2 + (0, 1.8, 0)
     radius = np.hypot(x - middle[0], y - middle[1])
     _mix(paint, opening * _smoothstep(6.0, 5.0, radius), np.array([0.09, 0.06, 0.035]))
     _mix(paint, opening * _smoothstep(2.6, 1.8, radius), np.array([0.008, 0.008, 0.008]))
+    _lashes(paint, gap)
+
+
+def _lashes(paint: Float[np.ndarray, "v 4"], gap: EyeGap) -> None:
     lash = (
-        here
-        * _smoothstep(1.5, 0.5, np.abs(off - height - 0.2 * bow))
-        * _smoothstep(0.0, 0.15, t)
-        * _smoothstep(1.0, 0.9, t)
+        gap.here
+        * _smoothstep(1.5, 0.5, np.abs(gap.off - gap.height - 0.2 * gap.bow))
+        * _smoothstep(0.0, 0.15, gap.along)
+        * _smoothstep(1.0, 0.9, gap.along)
     )
     paint[:, :3] *= 1 - 0.75 * lash[:, None]

@@ -6,13 +6,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from rig.errors import InputError
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh, vertex_normals
+from rig.messages.message import compose
 from rig.render.photograph import NOISE_CELLS, Gallery, Grain, Part
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import Anatomy, Landmarks, anatomy
 from rig.studio.scene.beard import grow_beard
 from rig.studio.scene.clothes import shirt
+from rig.studio.scene.eyes import IRIS_TONES, Eye, EyeSurface, eye_centres, look_at_point, opened, surface
 from rig.studio.scene.hair import STRAND_POINTS, Hair, HairStyle, grow
 from rig.studio.scene.headwear import cap, glasses
 from rig.studio.scene.lights import LAMPS, Lamp, irradiance, lamp_directions
@@ -49,6 +52,7 @@ CLOTH_TONES: tuple[Colour, ...] = (
 SKIN = Grain((3.6, 3.6, 3.6), (0.08, 0.03, 0.0, 0.0), (1.1, 1.1, 1.1), (0.10, 0.0, 0.0, 0.0), gloss=0.035)
 HAIR = Grain((5.0, 30.0, 5.0), (0.30, 0.0, 0.0, 0.0), (0.9, 14.0, 5.0), (0.0, 0.45, 0.0, 0.0), gloss=0.015)
 CLOTH = Grain((9.0, 9.0, 9.0), (0.0, 0.12, 0.0, 0.0), (1.3, 1.3, 1.3), (0.0, 0.0, 0.12, 0.0))
+GAZE_MM = 1200.0  # how far away the point is that eyes look at
 FRAME_TONE: Colour = (0.025, 0.018, 0.014)
 FRAME = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), gloss=0.15)
 NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0))
@@ -57,7 +61,8 @@ NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
     """Holds a head (head frame, mm). Without landmarks, its skin has neither brows nor lips. ``closed`` says how far
-    the lids of each side are closed, 0 to 1. ``relief`` is what its skin shows close up and its mesh does not."""
+    the lids of each side are closed, 0 to 1. ``relief`` is what its skin shows close up and its mesh does not.
+    ``eyes`` are eyeballs by side (head frame); without them eyes are painted on the skin."""
 
     mesh: Mesh
     landmarks: Landmarks = field(default_factory=dict)
@@ -65,6 +70,7 @@ class Subject:
     name: str = "subject"
     closed: Mapping[str, float] = field(default_factory=dict)  # eyes by side, 0 open to 1
     relief: SkinRelief | None = None
+    eyes: Mapping[str, Eye] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +122,20 @@ class Dressed:
     surfaces: Mapping[str, Mesh]
 
 
+def with_gaze(subject: Subject, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator) -> Subject:
+    """Gives a subject eyeballs of a drawn colour that look at a point ``GAZE_MM`` away, in a direction from straight
+    ahead: azimuth to the subject's left, elevation upwards. Raises InputError for a head without landmarks."""
+    marks = anatomy(subject.mesh.vertices, subject.landmarks).landmarks
+    if not marks:
+        raise InputError("gaze", [compose("eyes-without-landmarks")])
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    across, up, ahead = np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)
+    gaze = np.array([across, up, ahead])
+    centres = eye_centres(subject.mesh, marks, gaze)
+    target = 0.5 * (centres["right"] + centres["left"]) + GAZE_MM * gaze
+    return replace(subject, eyes=look_at_point(centres, target, IRIS_TONES[rng.integers(len(IRIS_TONES))]))
+
+
 def random_look(rng: np.random.Generator) -> Look:
     """Draws a skin tone, a hair tone and a cloth tone from the lists of this module, and a hair style."""
     tone = HAIR_TONES[rng.integers(len(HAIR_TONES))]
@@ -153,20 +173,22 @@ def dress(
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Dressed:
     """Gives a head hair, clothes, paint and light. Returns it in the world frame (mm)."""
-    hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng = rng.spawn(5)
+    hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng, eye_rng = rng.spawn(6)
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
     worn = shirt(head, body, cloth_rng) if clothes else None
     hairs = _hairs(head, body, look, worn, hair_rng)
-    pieces = [_skin(subject, body, look, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
+    seen = replace(subject, mesh=opened(head, body.landmarks)) if subject.eyes else subject
+    pieces = [_skin(seen, body, look, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
     pieces += [_hair_piece(hair, style) for hair, style in hairs]
     if worn:
         grain = CLOTH if look.texture else NO_GRAIN
         pieces.append(Piece("clothes", *worn, worn[0], _even(worn[0], look.cloth), grain, False))
     pieces += _headwear(head, body, look, hairs[0][0] if look.hair else None)
+    pieces += [_eye_piece(surface(eye, eye_rng)) for eye in subject.eyes.values()]
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
     normals = [vertex_normals(*piece) for piece in placed]
     solid = _joined(placed)
-    close_up = None if subject.relief is None else _relieved(pieces[0], head, subject.relief, world_from_head)
+    close_up = None if subject.relief is None else _relieved(pieces[0], seen.mesh, subject.relief, world_from_head)
     lit = [(v, n) for (v, _), n in zip(placed, normals, strict=True)]
     lit += [] if close_up is None else [(close_up.vertices, close_up.normals)]
     light = irradiance(renderer, lit, solid, lamps)
@@ -192,7 +214,24 @@ def dress(
         name: Mesh(*_joined([mesh for mesh, one in zip(placed, shown, strict=True) if one == name]))
         for name in dict.fromkeys(("head", *shown))
     }
-    return Dressed(parts[0], skin, tuple(parts[1:] + strands), gallery, solid, surfaces)
+    bare = parts[0] if seen is subject else _uncut(parts[0], head)
+    return Dressed(bare, skin, tuple(parts[1:] + strands), gallery, solid, surfaces)
+
+
+def _uncut(skin: Part, head: Mesh) -> Part:
+    """The head's own vertices and triangles of skin that is cut between the lids, which begins with them."""
+    rows = slice(len(head.vertices))
+    vertices = skin.vertices[rows]
+    return replace(
+        skin,
+        vertices=vertices,
+        faces=head.faces,
+        normals=vertex_normals(vertices, head.faces),
+        places=skin.places[rows],
+        paint=skin.paint[rows],
+        irradiance=skin.irradiance[rows],
+        oil=None if skin.oil is None else skin.oil[rows],
+    )
 
 
 def _skin(subject: Subject, body: Anatomy, look: Look, one_sided: bool, rng: np.random.Generator) -> Piece:
@@ -201,7 +240,9 @@ def _skin(subject: Subject, body: Anatomy, look: Look, one_sided: bool, rng: np.
         return Piece(
             "head", head.vertices, head.faces, head.vertices, _even(head.vertices, look.skin), NO_GRAIN, one_sided
         )
-    paint = skin_paint(head.vertices, body, look.skin, look.stubble, rng, closed=subject.closed)
+    paint = skin_paint(
+        head.vertices, body, look.skin, look.stubble, rng, closed=subject.closed, eyeballs=bool(subject.eyes)
+    )
     paint[:, 3] = np.maximum(paint[:, 3] - (1.0 - look.pores), 0.0)  # brows and stubble keep what they add
     grain = replace(SKIN, freckles=look.pores * look.freckles)
     oil = look.oil * oily_zones(head.vertices, body) if look.oil > 0.0 else None
@@ -245,6 +286,10 @@ def _hairs(
     if look.beard:
         found.append((grow_beard(head, body, look.beard, rng), look.beard))
     return found
+
+
+def _eye_piece(eye: EyeSurface) -> Piece:
+    return Piece("head", eye.vertices, eye.faces, eye.vertices, eye.paint, NO_GRAIN, True, eye.oil)
 
 
 def _hair_piece(hair: Hair, style: HairStyle) -> Piece:

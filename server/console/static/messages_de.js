@@ -1058,6 +1058,7 @@ export default {
   "rig-cameras": "seine Kameras sind {cameras}",
   "rig-empty": "es hat gar keine Kameras",
   "beard-without-landmarks": "ein Bart wird nach Landmarken gelegt, die dieser Kopf nicht hat",
+  "eyes-without-landmarks": "Augäpfel werden nach Landmarken gelegt, die dieser Kopf nicht hat",
   "glasses-without-landmarks": "eine Brille wird nach Landmarken gelegt, die dieser Kopf nicht hat",
   "fault-amount": "{text}: {amount} ist keine Zahl; verlangt ist Art[:Kamera][=Stärke]",
   "a-picture": "Bild",

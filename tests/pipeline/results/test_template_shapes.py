@@ -9,11 +9,13 @@ import pytest
 
 from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.expression import BlendshapeRig, build_blendshape_rig
+from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.head_model.model import load_model
 from pipeline.head_model.visemes import VISEMES
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.faces import Faces
 from rig.capture import Capture
 from rig.formats.meshes.glb_document import opened_glb
 from rig.geometry import Similarity, rotation_from_vector
@@ -21,6 +23,7 @@ from rig.mesh import Mesh
 from tests.support.made_up_results import made_up_result
 from tests.support.ready_templates import EYE_CENTRE, ready_template
 
+GAZE = np.array([0.6, 0.0, 0.8])  # of the left eye, head frame
 NAMES = ("jawOpen", "browInnerUp")
 PLACE = Similarity(1.1, rotation_from_vector(np.array([0.1, -0.3, 0.05])), np.array([12.0, -7.0, 30.0]))
 
@@ -34,11 +37,13 @@ def result() -> Reconstruction:
     morphs = {name: whole.morphs[name] for name in NAMES}
     shapes = BlendshapeRig(world, morphs, {"jawOpen": 0.25, "browInnerUp": 0.0}, whole.missing)
     made = made_up_result(world, Fit("contour", np.zeros(1), PLACE, 42, "the cost no longer falls"))
-    return replace(made, evidence=replace(made.evidence, blendshape_rig=shapes))
+    iris = Iris(np.zeros(3), PLACE.rotation @ GAZE, 5.85, np.eye(7), ("cam00", "cam01"), 0.2)
+    eyes = {"left": iris, "right": UnseenEye("closed")}
+    return replace(made, evidence=replace(made.evidence, blendshape_rig=shapes), faces=Faces(None, {}, eyes))
 
 
 def written(result: Reconstruction, folder: Path, *, morphs: bool, lips_part: bool = False) -> set[str]:
-    outputs = OutputSettings(surface="head", formats=("ply",), template="low", morphs=morphs, neutral=not morphs)
+    outputs = OutputSettings(surface="head", formats=("ply", "obj"), template="low", morphs=morphs, neutral=not morphs)
     chosen = replace(result, settings=Settings(outputs=outputs))
     write_result(folder, chosen, Capture({}), ready_template(load_model(), lips_part=lips_part))
     return {path.name for path in folder.iterdir()}
@@ -47,7 +52,7 @@ def written(result: Reconstruction, folder: Path, *, morphs: bool, lips_part: bo
 def test_shapes_are_written_where_morphs_are_asked_for(result: Reconstruction, tmp_path: Path) -> None:
     (tmp_path / "morphs").mkdir()
     (tmp_path / "none").mkdir()
-    ours = {"head-low.glb", "head-low-shapes.npz"}
+    ours = {"head-low.glb", "head-low-shapes.npz", "head-low-parts.obj"}
     assert ours < written(result, tmp_path / "morphs", morphs=True)
     assert not ours & written(result, tmp_path / "none", morphs=False)
     with np.load(tmp_path / "morphs" / "head-low-shapes.npz") as file:
@@ -73,6 +78,12 @@ def test_shapes_are_written_where_morphs_are_asked_for(result: Reconstruction, t
     assert set(nodes) == {"head", "jaw", "eye_left", "eye_right", "neck"}
     assert nodes["eye_left"]["extras"]["rows"] == list(range(level.count, len(neutral)))
     assert nodes["head"]["extras"]["rows"] == list(range(level.count))
+    np.testing.assert_allclose(meta["gazes"]["eye_left"], GAZE, atol=1e-9)
+    half = 0.5 * np.arctan2(0.6, 0.8)
+    np.testing.assert_allclose(nodes["eye_left"]["rotation"], (0.0, np.sin(half), 0.0, np.cos(half)), atol=1e-9)
+    assert "rotation" not in nodes["eye_right"]
+    parts = (tmp_path / "morphs" / "head-low-parts.obj").read_text().splitlines()
+    assert [line for line in parts if line.startswith("o ")] == ["o head", "o eye_left"]
 
 
 def test_teeth_and_tongue_are_written_where_lips_part(result: Reconstruction, tmp_path: Path) -> None:

@@ -1,15 +1,19 @@
 """Eyeballs that are added to a mesh with open eyes."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
+from trimesh.util import wrap_as_stream
 
 from pipeline.fusion.crossings import crossing_faces
-from pipeline.results.write_template_shapes import animated_glb
+from pipeline.results.write_template_shapes import animated_glb, animated_parts
 from pipeline.templates.animated import AnimatedMesh
-from pipeline.templates.eyeballs import Eyeball, lifted, placed_eyeballs
+from pipeline.templates.eyeballs import Eyeball, lifted, placed_eyeballs, turn_to
 from rig.formats.meshes.glb_document import opened_glb
-from rig.geometry import rotation_from_vector
+from rig.formats.meshes.parts_files import PlacedPart, parts_obj_bytes, parts_usdz_bytes
+from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import boundary_edges, vertex_normals
 
 AHEAD = np.array([0.0, 0.0, 1.0])
@@ -101,3 +105,51 @@ def test_added_eyeballs_are_named_parts_that_turn_about_their_centres() -> None:
     assert "extras" not in node
     position = document["accessors"][document["meshes"][1]["primitives"][0]["attributes"]["POSITION"]]
     np.testing.assert_allclose(position["max"][2], 0.01315, atol=1e-5)  # relative to the node
+
+
+def test_an_added_eyeball_turns_to_where_the_eye_looks() -> None:
+    vertices, faces, down, marks = lids(slit=True)
+    gaze = np.array([0.25, -0.1, 0.96]) / np.linalg.norm([0.25, -0.1, 0.96])
+    eyes = placed_eyeballs(vertices, faces, marks, CENTRES, {"eye_left": gaze})
+    assert crossing(vertices, faces, eyes["eye_left"]) == 0
+    points = {name: eyeball.centre for name, eyeball in eyes.items()} | {"neck": np.zeros(3)}
+    animated = AnimatedMesh(vertices, {"eyeBlinkLeft": down}, points, {}, eyes, gazes={"eye_left": gaze})
+    colours, triangles = np.full(vertices.shape, 200, np.uint8), faces.astype(np.int32)
+    glb = animated_glb(animated, triangles, colours, {"eyeBlinkLeft": 0.0}, {})
+    scene = trimesh.load_scene(wrap_as_stream(glb), file_type="glb")
+    place, geometry = scene.graph["eye_left"]
+    there = 1000.0 * trimesh.transform_points(scene.geometry[geometry].vertices, place) - eyes["eye_left"].centre
+    np.testing.assert_allclose(there[np.linalg.norm(there, axis=1).argmax()], 13.15 * gaze, atol=0.02)
+    document, _ = opened_glb(glb)
+    turned = next(node for node in document["nodes"] if node["name"] == "eye_left")
+    _, _, z, w = turned["rotation"]
+    assert 2.0 * np.arccos(w) == pytest.approx(np.arccos(gaze[2]), abs=1e-6)
+    assert z == pytest.approx(0.0, abs=1e-9)  # no roll
+    # The same by name in OBJ and USD.
+    parts = animated_parts(animated, triangles, colours)
+    assert list(parts) == ["head", "eye_left"]
+    text = parts_obj_bytes(parts).decode().splitlines()
+    assert [line for line in text if line.startswith("o ")] == ["o head", "o eye_left"]
+    points_mm = np.array([line.split()[1:4] for line in text if line.startswith("v ")], float)
+    ball = points_mm[len(vertices) :] - eyes["eye_left"].centre
+    np.testing.assert_allclose(ball[np.linalg.norm(ball, axis=1).argmax()], 13.15 * gaze, atol=0.02)
+    corners = np.array([line.split()[1:] for line in text if line.startswith("f ")], int)
+    assert corners.min() == 1
+    assert corners.max() == len(points_mm)
+
+
+def test_parts_of_a_usdz_have_names_and_turn(tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd")
+    geom = pytest.importorskip("pxr.UsdGeom")
+    eyeball = Eyeball(np.zeros(3), AHEAD)
+    gaze = np.array([0.6, 0.0, 0.8])
+    part = PlacedPart(eyeball.mesh(), RigidTransform(turn_to(gaze), CENTRES["eye_left"]))
+    path = tmp_path / "head-parts.usdz"
+    path.write_bytes(parts_usdz_bytes({"eye_left": part}))
+    assert path.read_bytes() == parts_usdz_bytes({"eye_left": part})
+    stage = usd.Stage.Open(str(path))
+    prim = stage.GetPrimAtPath("/person/eye_left")
+    points = np.array(geom.Mesh(prim).GetPointsAttr().Get(), float)
+    matrix = np.array(geom.XformCache().GetLocalToWorldTransform(prim))  # rows: points are rows, too
+    there = 1000.0 * (points @ matrix[:3, :3] + matrix[3, :3]) - CENTRES["eye_left"]
+    np.testing.assert_allclose(there[np.linalg.norm(there, axis=1).argmax()], 13.15 * gaze, atol=0.02)
