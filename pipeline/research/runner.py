@@ -29,6 +29,7 @@ from pipeline.research.people.people import people
 from pipeline.research.speed.farm import scale
 from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
+from pipeline.research.surface.capped import capped
 from pipeline.research.surface.eyeballs import eyeballs
 from pipeline.research.surface.hair_shells import hair_shells
 from pipeline.research.surface.hidden import hidden
@@ -211,16 +212,22 @@ def _hidden(task: Task) -> Outcome:
         )
 
 
-def _visible(task: Task) -> Outcome:
-    count = {"subjects": task.subjects} if task.subjects else {}
+def _capped(task: Task) -> Outcome:
+    count, others = {"subjects": task.subjects} if task.subjects else {}, _facekit(task.shared)
     with Renderer.create() as renderer:
-        return visible(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
+        return capped(task.head, renderer=renderer, report=task.report, others=others, folder=task.folder, **count)
 
 
-def _texture(task: Task) -> Outcome:
-    count = {"subjects": task.subjects} if task.subjects else {}
-    with Renderer.create() as renderer:
-        return texture(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder, **count)
+def _of_captures(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
+    """An experiment on heads of the studio and, where they are asked for, on the shared captures."""
+
+    def run(task: Task) -> Outcome:
+        count = {"subjects": task.subjects} if task.subjects else {}
+        with Renderer.create() as renderer:
+            return experiment(task.head, _captures(task), renderer=renderer, report=task.report, folder=task.folder,
+                              **count)  # fmt: skip
+
+    return run
 
 
 def _surfaces(task: Task) -> Outcome:
@@ -253,14 +260,9 @@ def _people(task: Task) -> Outcome:
 
 def _relief(task: Task) -> Outcome:
     folders = list(task.options.folders) or [path.with_suffix("") for path in _truths(task.shared).values()]
+    named = {path.name: path for path in folders}
     with Renderer.create() as renderer:
-        return relief(
-            task.head,
-            {path.name: path for path in folders},
-            renderer=renderer,
-            report=task.report,
-            folder=task.folder,
-        )
+        return relief(task.head, named, renderer=renderer, report=task.report, folder=task.folder)
 
 
 def _scaling(task: Task) -> Outcome:
@@ -357,12 +359,13 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "span": _span,
     "detail": _detail,
     "hidden": _hidden,
+    "capped": _capped,
     "expressions": _expressions,
     "people": _people,
     "planted": _drawn(planted),
-    "visible": _visible,
+    "visible": _of_captures(visible),
     "surfaces": _surfaces,
-    "texture": _texture,
+    "texture": _of_captures(texture),
     "light": _drawn(light),
     "templates": _templates,
     "shapes": _shapes,

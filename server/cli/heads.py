@@ -105,6 +105,18 @@ TemplateName = Annotated[
 ]
 
 
+CapColour = Annotated[
+    str | None, typer.Option(help="Of a worn swim or wig cap, about: #rrggbb, or a name as blue.", metavar="COLOUR")
+]
+HairNames = Annotated[
+    str | None,
+    typer.Option(
+        help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, swim-cap, wig-cap, glasses."
+    ),
+]
+CapThickness = Annotated[float | None, number("How thick the cap is, mm; 1 by default.", min=0, max=10)]
+
+
 @app.command(epilog="Example: eigenhead reconstruct shots/anna.tar.gz --out heads/anna --method contour")
 def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
@@ -124,6 +136,8 @@ def reconstruct(
     delight: Annotated[
         bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
     ] = False,
+    cap: CapColour = None,
+    cap_thickness: CapThickness = None,
     chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in clean plates.")] = False,
     obj: Annotated[
         bool, typer.Option("--obj", hidden=True)
@@ -159,6 +173,8 @@ def reconstruct(
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
     outputs |= {name: word for name, word in words.items() if word}
     options = {"outputs": outputs or None, "texture": {"chart": True} if chart else None}
+    worn = {"colour": cap, "thickness_mm": cap_thickness}
+    options["cap"] = {name: value for name, value in worn.items() if value is not None} or None
     document = settings_document(settings, method=method, front=front, detail=detail, device=device, **options)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
@@ -245,10 +261,7 @@ def simulate(
     light_drift: Annotated[float | None, number("From plate to shot, share.", min=0, max=1)] = None,
     defocus: Annotated[float | None, number("Blur, pixels.", min=0)] = None,
     rolling_ms: Annotated[float | None, number("Readout of a rolling shutter.", min=0, max=200)] = None,
-    hair: Annotated[
-        str | None,
-        typer.Option(help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, glasses."),
-    ] = None,
+    hair: HairNames = None,
     realism: Annotated[
         str | None,
         typer.Option(help="NAME[,NAME] of what real photographs have: smooth, oily, scattering, mosaic, jpeg; or all."),
