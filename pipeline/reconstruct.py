@@ -9,7 +9,7 @@ from pipeline.stages.depth import measure_depth
 from pipeline.stages.evidence import judge_head
 from pipeline.stages.faces import find_faces
 from pipeline.stages.head_fit import HeadFit, fit_head, fit_outlines
-from pipeline.stages.part_labels import PartLabels, label_parts
+from pipeline.stages.part_labels import PartLabels, find_worn_cap, label_parts
 from pipeline.stages.pose_check import check_pose
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.refined_head import refine_head
@@ -23,8 +23,9 @@ def fit_shape(
 ) -> tuple[PartLabels, HeadFit]:
     """Fits the head to the outlines, labels the pixels as skin, hair or clothes, and then fits the head to the
     photographs."""
-    outlines = run(fit_outlines, context, views, alignment)
-    labels = run(label_parts, context, views, outlines.model, outlines.mesh_world)
+    cap = run(find_worn_cap, context, views, alignment)
+    outlines = run(fit_outlines, context, views, alignment, cap)
+    labels = run(label_parts, context, views, outlines.model, outlines.mesh_world, cap)
     return labels, run(fit_head, context, views, outlines, labels)
 
 

@@ -1,20 +1,16 @@
 """Defines every setting of the pipeline, with its source. Values are frozen; unknown keys of a document are refused."""
 
 import dataclasses
-import math
 import re
-import types
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
+from pipeline.typed_tables import read_fields
 from pipeline.warnings import WARNING_CODES
+from rig.colour_space import COLOUR_NAMES, srgb_from_text
 from rig.errors import InputError
 from rig.messages.message import Message, compose
-from rig.text import is_encodable, suggest
-
-T = TypeVar("T")
 
 CLICK_NOISE_PX = 1.5  # a person's click; measured on captures rendered by another program
 LANDMARK_NOISE_MM = 2.0  # a landmark's place against the same landmark of another head
@@ -100,6 +96,17 @@ class PartSettings:
     strength: float = 0.7  # of what a cell looks like: colour and structure of neighbours are not independent
     smooth_mm: float = 9.0  # over which neighbours agree
     edge: float = 0.05  # contrast (0 to 1, as displayed) that ends such a neighbourhood
+
+
+THICKNESS_RANGE_MM = (0.0, 10.0)  # thicker is hair under a cap, not known to the millimetre
+
+
+@dataclass(frozen=True, slots=True)
+class CapSettings:
+    """Sets the swim or wig cap that the subject wears, under which the skull lies its thickness deep."""
+
+    colour: str | None = None  # about its colour, #rrggbb or a name: blue, black, white ...; None: no cap
+    thickness_mm: float = 1.0  # 0 to 10: latex and silicone 0.4 to 1, cloth 1 to 1.5; flattened hair adds to it
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,6 +276,7 @@ class Settings:
     alignment: AlignmentSettings = field(default_factory=AlignmentSettings)
     fitting: FittingSettings = field(default_factory=FittingSettings)
     parts: PartSettings = field(default_factory=PartSettings)
+    cap: CapSettings = field(default_factory=CapSettings)
     photo: PhotoSettings = field(default_factory=PhotoSettings)
     fine: FineSettings = field(default_factory=FineSettings)
     dense: DenseSettings = field(default_factory=DenseSettings)
@@ -280,7 +288,7 @@ class Settings:
 def settings_from_document(document: Mapping[str, Any], subject: str = "settings") -> Settings:
     """Returns the settings in decoded JSON or TOML. Raises InputError that names every unknown key and wrong value."""
     faults: list[Message] = []
-    settings = _read(Settings, document, "", faults)
+    settings = read_fields(Settings, document, "", faults)
     unknown = [code for code in settings.fail_on if code not in WARNING_CODES]
     faults += [compose("setting-code-unknown", code=f"{code!r:.80}", known=WARNING_CODES) for code in unknown]
     least, most = SPACING_RANGE_MM
@@ -294,106 +302,16 @@ def settings_from_document(document: Mapping[str, Any], subject: str = "settings
     template = settings.outputs.template
     if template is not None and not TEMPLATE_NAME.fullmatch(template):
         faults.append(compose("setting-template-wrong", template=f"{template!r:.60}"))
+    if settings.cap.colour is not None and srgb_from_text(settings.cap.colour) is None:
+        faults.append(compose("setting-colour-wrong", colour=f"{settings.cap.colour!r:.60}", known=COLOUR_NAMES))
+    least, most = THICKNESS_RANGE_MM
+    if not least <= settings.cap.thickness_mm <= most:
+        faults.append(compose("setting-thickness-wrong", value=settings.cap.thickness_mm, least=least, most=most))
     if faults:
         raise InputError(subject, faults)
     return settings
 
 
-def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
-    """Returns a table of settings (the dataclass ``kind``) from decoded JSON or TOML. Raises InputError likewise."""
-    faults: list[Message] = []
-    found = _read(kind, document, "", faults)
-    if faults:
-        raise InputError(subject, faults)
-    return found
-
-
 def document_from_settings(settings: Settings) -> dict[str, object]:
     """Returns settings as nested dictionaries, the form that ``settings_from_document`` reads."""
     return dataclasses.asdict(settings)
-
-
-def _read(kind: type[T], document: Any, where: str, faults: list[Message]) -> T:
-    if not isinstance(document, Mapping):
-        faults.append(compose("setting-no-object", where=where or "settings"))
-        return kind()
-    hints = typing.get_type_hints(kind)
-    for key in document:
-        if key not in hints:
-            near = suggest(str(key), hints)
-            shown = f"{where + str(key)!r:.80}"
-            faults.append(
-                compose("setting-unknown-near", key=shown, near=f"{near[0]!r}")
-                if near
-                else compose("setting-unknown", key=shown)
-            )
-    values = {key: _value(hints[key], document[key], where + key, faults) for key in hints if key in document}
-    return kind(**{key: value for key, value in values.items() if value is not ...})
-
-
-def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return _read(typing.cast(type, hint), value, where + ".", faults)
-    options = (
-        typing.get_args(hint)
-        if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
-        else (hint,)
-    )
-    for option in options:
-        if option is type(None) and value is None:
-            return None
-        if typing.get_origin(option) is Literal and isinstance(value, str) and value in typing.get_args(option):
-            return value
-        if option is float and (number := _number(value)) is not None:
-            return number
-        if typing.get_origin(option) is tuple and _are_texts(value):
-            return tuple(typing.cast(list, value))
-        if option in (int, bool) and type(value) is option:
-            return value
-        if option is str and _is_text(value):
-            return value
-    faults.append(compose("setting-wrong", setting=where, value=_shown(value), wanted=_wanted(options)))
-    return ...
-
-
-def _number(value: Any) -> float | None:
-    """None for what is no finite number; a whole number of JSON may be larger than any float."""
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return None
-    try:
-        number = float(value)
-    except OverflowError:
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and is_encodable(value)
-
-
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(map(_is_text, value))
-
-
-def _shown(value: Any) -> Message | str:
-    """A wrong value in a fault. Python writes down no number of thousands of digits, and nothing nested deeply."""
-    try:
-        return f"{value!r:.80}"
-    except (ValueError, RecursionError):
-        return compose("value-too-large")
-
-
-def _wanted(options: tuple[Any, ...]) -> str:
-    words = []
-    for option in options:
-        if typing.get_origin(option) is Literal:
-            words += [repr(word) for word in typing.get_args(option)]
-        elif typing.get_origin(option) is tuple:
-            words.append("a list of texts")
-        else:
-            words.append(
-                {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text"}.get(
-                    option, "null"
-                )
-            )
-    return " or ".join(words)

@@ -12,6 +12,7 @@ WARNING_CODES = (
     "cameras-exchanged",
     "cameras-scaled",
     "cameras-uneven",
+    "cap-not-found",
     "contour-implausible",
     "eyes-closed",
     "face-elsewhere",

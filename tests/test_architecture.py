@@ -97,7 +97,7 @@ MANY_FOR_A_REASON = {
     "server.cli.batch.batch": "each is an option of a command",
     "server.cli.experiments.experiments": "each is an option of a command",
     "server.http.routes.jobs.list_jobs": "each is a parameter of the query",
-    "server.cli.heads.simulate": "each is an option of a command",
+    "server.cli.simulate.simulate": "each is an option of a command",
     "pipeline.stereo.window_bias_kernels.windowed_heights": "a compiled loop over a thread's share of plain arrays",
     "pipeline.research.peers.soft_rasteriser.loss": "JAX compiles a function of plain arrays",
 }

@@ -30,34 +30,50 @@ MISSED_PX = 1.0  # a crown whose outline is farther off is fitted once more
 
 
 def with_bare_outline(solved: ContourSolution, skin: Mapping[str, Float32[np.ndarray, "h w"]]) -> ContourSolution:
-    """Fits the head once more if its crown turns out to be hairless, with the outline of the crown counted in full.
+    """Marks the outline of the crown if it turns out to be hairless, and fits the head once more with it counted in
+    full.
 
     Args:
         solved: the solution of the contour solver.
         skin: for each camera, the probability that a pixel shows skin.
 
     Returns:
-        The new solution; ``solved`` if the outline of the whole head counts already or the crown is not bare. Where the
-        crown already fits its outline within ``MISSED_PX``, only the marks of the bare outline are added.
+        The new solution; ``solved`` if the crown is not bare.
     """
-    if solved.stage.whole_head or not skin:
+    if not skin:
         return solved
+    bare = find_bare(solved.problem, solved.state, skin)
+    crown, shown = _shown_crown(solved, bare)
+    return with_counted_crown(solved, bare) if shown.any() and shown.sum() >= BARE_SHARE * crown.sum() else solved
+
+
+def with_counted_crown(solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]) -> ContourSolution:
+    """Fits the head once more with the outline of the crown counted in full in the marked cells of each view.
+
+    Where the outline of the whole head counts already, or the crown fits its outline within ``MISSED_PX``, only the
+    marks are added.
+    """
     problem, scale = solved.problem, solved.problem.settings.robust_px
-    bare = find_bare(problem, solved.state, skin)
-    evidence = replace(solved.evidence, noise=replace(solved.evidence.noise, bare=bare))
-    rim = observed_rim(problem, evidence, solved.state, solved.stage)
-    crown = is_crown(problem, rim, solved.stage.level)
-    shown = crown & within(bare, rim)
-    if not shown.any() or shown.sum() < BARE_SHARE * crown.sum():
-        return solved
-    if np.sqrt(np.mean(rim.residual[shown] ** 2)) < MISSED_PX:
-        return replace(solved, evidence=evidence)
+    evidence = replace(solved.evidence, noise=replace(solved.evidence.noise, bare=cells))
+    marked = replace(solved, evidence=evidence)
+    residual = observed_rim(problem, evidence, solved.state, solved.stage).residual[_shown_crown(solved, cells)[1]]
+    if solved.stage.whole_head or not len(residual) or np.sqrt(np.mean(residual**2)) < MISSED_PX:
+        return marked
     coarse = replace(solved.stage, level="p95", scales_px=(20.0, 10.0, 5.0, 2.0 * scale), steps=4)
     state, spent, _ = run_stage(problem, evidence, solved.state, coarse, lambda fraction: None)
     state, more, reason = run_stage(problem, evidence, state, solved.stage, lambda fraction: None)
     evidence = with_misfit(problem, evidence, state, solved.stage)
     evaluations = solved.evaluations + spent + more
     return replace(solved, evidence=evidence, state=state, evaluations=evaluations, termination_reason=reason)
+
+
+def _shown_crown(
+    solved: ContourSolution, cells: tuple[Bool[np.ndarray, "_ _"], ...]
+) -> tuple[Bool[np.ndarray, " s"], Bool[np.ndarray, " s"]]:
+    """Returns which rim samples lie on the crown, and which of these in the marked cells."""
+    rim = observed_rim(solved.problem, solved.evidence, solved.state, solved.stage)
+    crown = is_crown(solved.problem, rim, solved.stage.level)
+    return crown, crown & within(cells, rim)
 
 
 def find_bare(
@@ -87,23 +103,37 @@ def bare_cells(
         skin: probability that a pixel shows skin.
         px_per_mm: pixels for each millimetre at the head.
     """
-    height, width = distance.shape
-    cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), bool)
-    outlines = cv2.findContours((distance < 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-    if not outlines:
-        return cells
-    outline = max(outlines, key=len)[:, 0].astype(float)
+    outline = largest_outline(distance)
+    if outline is None:
+        return cells_along(np.zeros((0, 2)), np.zeros(0, bool), distance.shape, 0.0)
     from scipy.ndimage import gaussian_filter1d  # 0.05 s
 
     smooth = gaussian_filter1d(outline, SMOOTH_MM * px_per_mm, axis=0, mode="wrap")
     rough = roughness(distance, smooth, px_per_mm) / px_per_mm
-    shown = _pooled(_inside(distance, skin, smooth, px_per_mm), px_per_mm)
-    bare = (rough < ROUGH_MM) & (shown > MIN_SKIN)
+    shown = _pooled(share_inside(distance, skin, smooth, px_per_mm), px_per_mm)
+    return cells_along(outline, (rough < ROUGH_MM) & (shown > MIN_SKIN), distance.shape, REACH_MM * px_per_mm)
+
+
+def largest_outline(distance: Float32[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"] | None:
+    """Returns the pixels (column, row) along the longest outline of a signed distance; None without a subject."""
+    outlines = cv2.findContours((distance < 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    return max(outlines, key=len)[:, 0].astype(float) if outlines else None
+
+
+def cells_along(
+    outline: Float[np.ndarray, "n 2"], chosen: Bool[np.ndarray, " n"], shape: tuple[int, int], reach_px: float
+) -> Bool[np.ndarray, "_ _"]:
+    """Marks the square cells (``CELL_PX`` pixels wide) of a picture of ``shape`` (rows, columns) within ``reach_px`` of
+    an outline, whose nearest point of the outline is ``chosen``."""
+    height, width = shape
+    cells = np.zeros((height // CELL_PX + 1, width // CELL_PX + 1), bool)
+    if not chosen.any():
+        return cells
     row, column = np.indices(cells.shape)
     middle = CELL_PX * (np.stack([column, row], axis=-1).reshape(-1, 2) + 0.5)
-    away, row = nearest(PointTree.of(outline), middle, within=REACH_MM * px_per_mm)
+    away, row = nearest(PointTree.of(outline), middle, within=reach_px)
     near = np.isfinite(away)
-    cells.ravel()[near] = bare[row[near]]
+    cells.ravel()[near] = chosen[row[near]]
     return cells
 
 
@@ -127,13 +157,14 @@ def _pooled(values: Float[np.ndarray, " n"], px_per_mm: float) -> Float[np.ndarr
     return gaussian_filter1d(values, STRETCH_MM * px_per_mm, mode="wrap")
 
 
-def _inside(
+def share_inside(
     distance: Float32[np.ndarray, "h w"],
     skin: Float32[np.ndarray, "h w"],
     outline: Float[np.ndarray, "n 2"],
     px_per_mm: float,
 ) -> Float[np.ndarray, " n"]:
-    """Returns the probability of skin ``DEPTH_MM`` inside each point of an outline, its mean across it."""
+    """Returns the probability of skin, or of what else is given for it, ``DEPTH_MM`` inside each point of an outline,
+    its mean across it."""
     reach = max(1, round(DEPTH_MM * px_per_mm))
     within = (distance < 0).astype(np.float32)
     size = (2 * reach + 1, 2 * reach + 1)

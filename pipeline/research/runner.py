@@ -6,10 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.head_model.data_folder import models_folder
-from pipeline.head_model.model import HeadModel, assemble, load_model
-from pipeline.head_model.model_names import model_path
-from pipeline.model_building.sources.imports import import_model
+from pipeline.head_model.model import HeadModel, load_model
 from pipeline.research import markdown
 from pipeline.research.faults.drift import drift
 from pipeline.research.faults.exchanges import exchanges, false_alarms
@@ -27,9 +24,11 @@ from pipeline.research.paper.views import views
 from pipeline.research.people.expressions import expressions
 from pipeline.research.people.gazes import gazes
 from pipeline.research.people.people import people
+from pipeline.research.shared_data import facekit, truths
 from pipeline.research.speed.farm import scale
 from pipeline.research.speed.growth import growth, sizes
 from pipeline.research.speed.scaling import JobCommand, scaling
+from pipeline.research.surface.capped import capped
 from pipeline.research.surface.eyeballs import eyeballs
 from pipeline.research.surface.hair_shells import hair_shells
 from pipeline.research.surface.hidden import hidden
@@ -169,15 +168,15 @@ def _limit(task: Task) -> Outcome:
 
 
 def _span(task: Task) -> Outcome:
-    other = _facekit(task.shared)
-    truths = [span.read_truth(path) for path in _truths(task.shared).values()]
+    other = facekit(task.shared)
+    truths = [span.read_truth(path) for path in truths(task.shared).values()]
     truths += span.random_draws(other, task.subjects or 20)
     return span.run({"default": task.head, "ict": other}, truths, report=task.report)
 
 
 def _detail(task: Task) -> Outcome:
-    other = _facekit(task.shared)
-    captures = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
+    other = facekit(task.shared)
+    captures = {name: path.with_suffix("") for name, path in truths(task.shared).items()}
     with Renderer.create() as renderer:
         return detail.run(
             {"default": task.head, "ict": other},
@@ -192,7 +191,7 @@ def _detail(task: Task) -> Outcome:
 
 
 def _expressions(task: Task) -> Outcome:
-    models = {"default": task.head, "ict": _facekit(task.shared)}
+    models = {"default": task.head, "ict": facekit(task.shared)}
     for name, model in models.items():
         if not len(model.expressions):
             raise InputError(name, ["has no expressions: import it again, or name --shared"])
@@ -208,11 +207,17 @@ def _hidden(task: Task) -> Outcome:
             _captures(task),
             renderer=renderer,
             report=task.report,
-            others=_facekit(task.shared),
+            others=facekit(task.shared),
             subjects=task.subjects or 4,
             realism=task.options.realism,
             folder=task.folder,
         )
+
+
+def _capped(task: Task) -> Outcome:
+    count, others = {"subjects": task.subjects} if task.subjects else {}, facekit(task.shared)
+    with Renderer.create() as renderer:
+        return capped(task.head, renderer=renderer, report=task.report, others=others, folder=task.folder, **count)
 
 
 def _visible(task: Task) -> Outcome:
@@ -231,7 +236,7 @@ def _texture(task: Task) -> Outcome:
 
 
 def _surfaces(task: Task) -> Outcome:
-    found = {name: path.with_suffix("") for name, path in _truths(task.shared).items()}
+    found = {name: path.with_suffix("") for name, path in truths(task.shared).items()}
     with Renderer.create() as renderer:
         return surfaces(
             task.head, found, renderer=renderer, report=task.report, openmvs=task.options.openmvs, folder=task.folder
@@ -241,7 +246,7 @@ def _surfaces(task: Task) -> Outcome:
 def _people(task: Task) -> Outcome:
     shared = sorted((task.shared / "captures").glob("*.truth"))  # the studio has heads where there are none
     try:
-        others = _facekit(task.shared)
+        others = facekit(task.shared)
     except InputError:
         others = None
     with Renderer.create() as renderer:
@@ -259,15 +264,10 @@ def _people(task: Task) -> Outcome:
 
 
 def _relief(task: Task) -> Outcome:
-    folders = list(task.options.folders) or [path.with_suffix("") for path in _truths(task.shared).values()]
+    folders = list(task.options.folders) or [path.with_suffix("") for path in truths(task.shared).values()]
+    named = {path.name: path for path in folders}
     with Renderer.create() as renderer:
-        return relief(
-            task.head,
-            {path.name: path for path in folders},
-            renderer=renderer,
-            report=task.report,
-            folder=task.folder,
-        )
+        return relief(task.head, named, renderer=renderer, report=task.report, folder=task.folder)
 
 
 def _scaling(task: Task) -> Outcome:
@@ -300,49 +300,48 @@ def _scale(task: Task) -> Outcome:
 
 def _templates(task: Task) -> Outcome:
     count = {"draws": task.subjects} if task.subjects else {}
-    facekit = _facekit(task.shared)
-    return templates({"default": task.head}, facekit, report=task.report, folder=task.folder, **count)
+    return templates({"default": task.head}, facekit(task.shared), report=task.report, folder=task.folder, **count)
 
 
 def _shapes(task: Task) -> Outcome:
-    return shapes(task.head, _facekit(task.shared), report=task.report, folder=task.folder)
+    return shapes(task.head, facekit(task.shared), report=task.report, folder=task.folder)
 
 
 def _of_facekit(experiment: Callable[..., Outcome]) -> Callable[[Task], Outcome]:
-    return lambda task: experiment(_facekit(task.shared), report=task.report, folder=task.folder)
+    return lambda task: experiment(facekit(task.shared), report=task.report, folder=task.folder)
 
 
 def _gazes(task: Task) -> Outcome:
     count = {"subjects": task.subjects} if task.subjects else {}
-    models = {"default": task.head, "ict": _facekit(task.shared)}
+    models = {"default": task.head, "ict": facekit(task.shared)}
     with Renderer.create() as renderer:
         return gazes(models, renderer=renderer, report=task.report, folder=task.folder, **count)
 
 
 def _wrap(task: Task) -> Outcome:
     only = task.options.only
-    scans = {name: path for name, path in _truths(task.shared).items() if not only or name in only}
-    return wrapping(_facekit(task.shared), scans, report=task.report, folder=task.folder)
+    scans = {name: path for name, path in truths(task.shared).items() if not only or name in only}
+    return wrapping(facekit(task.shared), scans, report=task.report, folder=task.folder)
 
 
 def _hair_shell(task: Task) -> Outcome:
     chosen = task.options.only or SHORT_HAIR
-    found = {name: path.with_suffix("") for name, path in _truths(task.shared).items() if name in chosen}
+    found = {name: path.with_suffix("") for name, path in truths(task.shared).items() if name in chosen}
     with Renderer.create() as renderer:
         return hair_shells(
-            task.head, _facekit(task.shared), found, renderer=renderer, report=task.report, folder=task.folder
+            task.head, facekit(task.shared), found, renderer=renderer, report=task.report, folder=task.folder
         )
 
 
 def _meshes(task: Task) -> Outcome:
-    models = {"default": task.head, "ict": _facekit(task.shared)}
+    models = {"default": task.head, "ict": facekit(task.shared)}
     count = {"subjects": task.subjects} if task.subjects else {}
     return meshes(models, task.options.folders, report=task.report, folder=task.folder, **count)
 
 
 def _captures(task: Task) -> dict[str, Path]:
     """The shared captures that have a truth, where they are asked for."""
-    return {name: path.with_suffix("") for name, path in _truths(task.shared).items()} if task.options.captures else {}
+    return {name: path.with_suffix("") for name, path in truths(task.shared).items()} if task.options.captures else {}
 
 
 EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
@@ -367,6 +366,7 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "span": _span,
     "detail": _detail,
     "hidden": _hidden,
+    "capped": _capped,
     "expressions": _expressions,
     "people": _people,
     "planted": _drawn(planted),
@@ -386,20 +386,3 @@ EXPERIMENTS: dict[str, Callable[[Task], Outcome]] = {
     "growth": _growth,
     "scale": _scale,
 }
-
-
-def _truths(shared: Path) -> dict[str, Path]:
-    found = {path.stem: path for path in sorted((shared / "captures").glob("*.truth"))}
-    if not found:
-        raise InputError(str(shared), ["holds no captures/<name>.truth; name the folder that does with --shared"])
-    return found
-
-
-def _facekit(shared: Path) -> HeadModel:
-    """ICT-FaceKit: the user's own import, or the compact copy in the shared folder."""
-    if (models_folder() / "ict-facekit.npz").is_file():
-        return load_model(model_path("ict-facekit"))
-    source = shared / "ict-facekit" / "ict_facekit_light.npz"
-    if not source.exists():
-        raise InputError("ict-facekit", ["is not at hand: run `eigenhead model fetch ict-facekit`, or name --shared"])
-    return assemble(import_model(source), "imported")

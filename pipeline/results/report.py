@@ -70,6 +70,7 @@ def report_document(
             "reason": refined.detail.reason.text,
             "reason_message": refined.detail.reason.document(),
         },
+        "cranium": head.cranium,
         "front": result.alignment.front,
         "pose": _pose(result.pose),
         "faces": {} if result.faces.subject is None else _faces(result.faces.subject, evidence.cameras),

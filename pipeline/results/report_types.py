@@ -229,6 +229,7 @@ class Report(TypedDict):
     model: NamedModel
     method: str
     detail: DetailReport
+    cranium: NotRequired[str | None]  # what makes its outline: hair, cap or bald; not in files of earlier versions
     front: str
     pose: PoseReport
     faces: dict[str, FaceReport]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
+from pipeline.detail.cap_points import skin_under_cap
 from pipeline.detail.dense_points import dense_points
 from pipeline.detail.depth_bias import OnFace, measure_bias, points_on_face
 from pipeline.detail.surface_points import SurfacePoints
@@ -54,5 +55,7 @@ def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, l
         )
     votes = vote_parts(maps, labels.maps, context.rig)
     points = dense_points(maps, votes, mesh, settings.fine)
+    if labels.cap is not None:
+        points = skin_under_cap(points, maps, labels.cap, context.rig)
     on_face = points_on_face(points, mesh, head.model.levels["full"].face_region)
     return Staged(Depth(maps, images, votes, points, on_face, measure_bias(on_face)))

@@ -4,8 +4,10 @@ These are two stages, ``fit_outlines`` and ``fit_head``, since the parts that pi
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
-from pipeline.contour_fit.bare_outline import with_bare_outline
+from pipeline.contour_fit.bare_outline import with_bare_outline, with_counted_crown
+from pipeline.contour_fit.cap_outline import CapOutline, cells_of_views, without_cap
 from pipeline.contour_fit.contour import ContourSolution, finish, solve_contour
 from pipeline.contour_fit.expression_evidence import with_expression_evidence
 from pipeline.contour_fit.fit import Fit
@@ -14,6 +16,7 @@ from pipeline.contour_fit.span_misfit import with_span_misfit
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.model_basis import basis_of, model_basis
 from pipeline.imaging.highlights import without_highlights
+from pipeline.part_labels.cap import Cap
 from pipeline.photometric_fit.refine import refine_with_photographs
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.simplex.hierarchy import fit_simplex
@@ -25,6 +28,8 @@ from pipeline.stages.views import Views
 from pipeline.warnings import Detail
 from rig.mesh import Mesh
 from rig.messages.message import compose
+
+Cranium = Literal["hair", "cap", "bald"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,11 +44,16 @@ class OutlineFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadFit:
-    """Holds a fit with its covariance, the model whose modes it uses, and the level of detail that it reached."""
+    """Holds a fit with its covariance, the model whose modes it uses, and the level of detail that it reached.
+
+    ``cranium`` says what makes the cranium's outline: hair, which hides it; a cap of known thickness, or skin; None
+    where nothing tells.
+    """
 
     fit: Fit
     model: HeadModel
     detail: Detail
+    cranium: Cranium | None = None
 
     @property
     def mesh_world(self) -> Mesh:
@@ -57,15 +67,20 @@ def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
 
 
 @stage("fit")
-def fit_outlines(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[OutlineFit]:
+def fit_outlines(
+    context: ReconstructionContext, views: Views, alignment: Alignment, cap: Cap | None
+) -> Staged[OutlineFit]:
     """Fits shape and pose to the silhouettes with the contour solver. If the settings name the simplex method, that
-    then fits the shape anew at the same pose."""
+    then fits the shape anew at the same pose. Along the ``cap``, outlines count as the skull's, by its thickness."""
     settings, rig = context.settings, context.rig
+    bare = CapOutline(views.silhouettes, {})
+    if cap is not None:
+        bare = without_cap(views.silhouettes, cap, rig, alignment.world_from_head.translation)
     model, features = model_basis(context.model, settings), views.capture.features
     solved = solve_contour(
         model,
         alignment.world_from_head,
-        views.silhouettes,
+        bare.silhouettes,
         rig,
         settings.fitting,
         features=features,
@@ -77,13 +92,15 @@ def fit_outlines(context: ReconstructionContext, views: Views, alignment: Alignm
         fit = fit_simplex(
             model,
             solved.state.world_from_head,
-            views.silhouettes,
+            bare.silhouettes,
             rig,
             settings.fitting,
             renderer=context.renderer,
             report=context.progress,
         )
         return Staged(OutlineFit(fit, model, fitted_mesh(model, fit)))
+    if cap is not None:
+        solved = with_counted_crown(solved, cells_of_views(bare.cells, solved.problem.views))
     state, model = solved.state, solved.problem.model
     vertices_world = state.world_from_head.apply(model.vertices(state.coefficients))
     return Staged(OutlineFit(solved, model, Mesh(vertices_world, model.levels["full"].faces)))
@@ -96,9 +113,13 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
     settings, model, solved = context.settings, outlines.model, outlines.solution
     if isinstance(solved, Fit):
         return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))
+    cranium: Cranium | None = None if labels.cap is None else "cap"
     detail = Detail("span" if settings.detail == "span" else "kernel", compose("level-asked"))
     if settings.detail in PHOTO_LEVELS:
-        hair, solved = labels.hair_probability(), with_bare_outline(solved, labels.skin_probability())
+        hair = labels.hiding_probability()
+        if labels.cap is None:
+            solved = with_bare_outline(solved, labels.skin_probability())
+            cranium = "hair" if solved.evidence.noise.bare is None else "bald"
         images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
         solved, detail = refine_with_photographs(solved, images, settings.photo, hair=hair)
     eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
@@ -107,8 +128,8 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
         solved = with_expression_evidence(solved, eigenheads)
     if detail.level == "span":
         wider = basis_of(model, eigenheads, kernel=True)
-        return Staged(HeadFit(with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail))
+        return Staged(HeadFit(with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail, cranium))
     if detail.level == "kernel":
         relief_mm *= RELIEF_OF_OUTLINES
     fit = with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
-    return Staged(HeadFit(fit, model, detail))
+    return Staged(HeadFit(fit, model, detail, cranium))

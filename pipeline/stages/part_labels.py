@@ -1,31 +1,38 @@
-"""Labels what the pixels show: skin, hair or clothes."""
+"""Labels what the pixels show: a cap of stated colour, and skin, hair or clothes."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from jaxtyping import Float32
+import numpy as np
+from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from pipeline.head_model.model import HeadModel
-from pipeline.part_labels.codes import Part
+from pipeline.head_model.model_basis import model_basis
+from pipeline.part_labels.cap import Cap, find_cap
+from pipeline.part_labels.codes import CHANNELS, Part
 from pipeline.part_labels.labelling import PartMap, classify_parts
 from pipeline.settings import PHOTO_LEVELS
+from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.views import Views
+from rig.colour_space import linear_from_srgb, srgb_from_text
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLabels:
     """Holds the part map of each camera, the probabilities of skin, hair and clothes at every pixel; empty if no stage
-    needs them."""
+    needs them. A ``cap`` counts as clothes."""
 
     maps: Mapping[str, PartMap]
+    cap: Cap | None = None
 
-    def hair_probability(self) -> "OnePart":
-        """Returns, for each camera, the probability of hair at every pixel."""
-        return OnePart(self.maps, Part.HAIR)
+    def hiding_probability(self) -> "OnePart":
+        """Returns, for each camera, the probability at every pixel that hair, or the cap, hides the skin."""
+        return OnePart(self.maps, Part.HAIR, {} if self.cap is None else self.cap.masks)
 
     def skin_probability(self) -> "OnePart":
         """Returns, for each camera, the probability of skin at every pixel."""
@@ -34,14 +41,18 @@ class PartLabels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
-    """Gives the probability of one part at every pixel, by camera. Each map is computed when it is read: all of them
-    would take four times the memory of what they follow from."""
+    """Gives the probability of one part at every pixel, by camera; it is 1 where one of the ``masks`` is true. Each map
+    is computed when it is read: all of them would take four times the memory of what they follow from."""
 
     maps: Mapping[str, PartMap]
     part: Part
+    masks: Mapping[str, Bool[ndarray, "_ _"]] = field(default_factory=dict)
 
     def __getitem__(self, camera: str) -> Float32[ndarray, "_ _"]:
-        return self.maps[camera].probability_of(self.part)
+        probability = self.maps[camera].probability_of(self.part)
+        if camera in self.masks:
+            probability[self.masks[camera]] = 1.0
+        return probability
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.maps)
@@ -51,12 +62,38 @@ class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
 
 
 @stage("parts")
-def label_parts(context: ReconstructionContext, views: Views, model: HeadModel, head_world: Mesh) -> Staged[PartLabels]:
+def find_worn_cap(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[Cap | None]:
+    """Finds the cap that the settings name by its colour in the photographs, on the mean head at its pose. Returns None
+    if they name none, and with the warning ``cap-not-found`` where the photographs do not show it."""
+    settings = context.settings.cap
+    if settings.colour is None:
+        return Staged(None)
+    model = model_basis(context.model, context.settings)
+    full, head = model.levels["full"], alignment.world_from_head.apply(model.vertices(np.zeros(0)))
+    cap = find_cap(
+        views.capture.images,
+        {name: each.mask for name, each in views.silhouettes.items() if each.quality.usable},
+        context.rig,
+        Mesh(head, full.faces),
+        full.face_region,
+        {name: head[vertex] for name, vertex in model.landmarks.items()},
+        colour=linear_from_srgb(np.array(srgb_from_text(settings.colour))),
+        thickness_mm=settings.thickness_mm,
+    )
+    if cap.is_found:
+        return Staged(cap)
+    return Staged(None, [compose("cap-not-found", colour=settings.colour, share=cap.share)])
+
+
+@stage("parts")
+def label_parts(
+    context: ReconstructionContext, views: Views, model: HeadModel, head_world: Mesh, cap: Cap | None
+) -> Staged[PartLabels]:
     """Labels the pixels of every photograph as skin, hair or clothes, starting from a fitted head: ``head_world`` (mm),
-    whose vertices are those of ``model``."""
+    whose vertices are those of ``model``. Pixels of the ``cap`` are clothes."""
     settings = context.settings
     if settings.detail not in PHOTO_LEVELS and settings.outputs.surface == "head":
-        return Staged(PartLabels({}))
+        return Staged(PartLabels({}, cap))
     landmarks_world = {name: head_world.vertices[vertex] for name, vertex in model.landmarks.items()}
     maps = classify_parts(
         views.capture.images,
@@ -68,4 +105,11 @@ def label_parts(context: ReconstructionContext, views: Views, model: HeadModel, 
         settings=settings.parts,
         report=context.progress,
     )
-    return Staged(PartLabels(maps))
+    return Staged(PartLabels({name: _with_cap(part, cap) for name, part in maps.items()}, cap))
+
+
+def _with_cap(part: PartMap, cap: Cap | None) -> PartMap:
+    if cap is None or part.camera not in cap.masks:
+        return part
+    worn = 255 * np.eye(len(CHANNELS), dtype=np.uint8)[Part.CLOTHES.channel]
+    return PartMap(part.camera, np.where(cap.masks[part.camera][..., None], worn, part.of_255))

@@ -53,7 +53,7 @@ def refine_head(
     distances = {name: views.silhouettes[name].distance for name, used in fit.used.items() if used}
     cameras, face = [context.rig[name] for name in distances], np.flatnonzero(model.levels["full"].face_region)
     factor = head_depth_factor(mesh, face, cameras, settings.photo.views_most)
-    hair = labels.hair_probability()
+    hair = labels.hiding_probability()
     displaced = refine_to_surface(
         fit,
         model,

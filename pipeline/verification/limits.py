@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from pipeline.settings import read_table
+from pipeline.typed_tables import read_table
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,9 +39,9 @@ def experiments(
         str,
         typer.Argument(
             help="table1, table2, table3, cost, levels, peers, limit, robustness, convergence, alignment, drift, "
-            "exchanges, false-alarms, posterior, views, repeat, relief, pores, span, detail, hidden, expressions, "
-            "visible, people, planted, surfaces, texture, light, templates, shapes, eyeballs, gazes, inner-mouth, "
-            "meshes, wrap, hair-shell, scaling, growth, scale or real."
+            "exchanges, false-alarms, posterior, views, repeat, relief, pores, span, detail, hidden, capped, "
+            "expressions, visible, people, planted, surfaces, texture, light, templates, shapes, eyeballs, gazes, "
+            "inner-mouth, meshes, wrap, hair-shell, scaling, growth, scale or real."
         ),
     ],
     *,

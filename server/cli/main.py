@@ -19,6 +19,7 @@ from server.cli import (
     models,
     rig,
     service,
+    simulate,
     templates,
     wrap,
 )
@@ -31,7 +32,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # importing rich's markdown alone takes half a second
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for room in (service, heads, batch, export, clinic, measure, wrap, experiments, cameras):
+for room in (service, heads, simulate, batch, export, clinic, measure, wrap, experiments, cameras):
     app.add_typer(room.app)
 groups = {"keys": service.keys_app, "rig": rig.rig_app, "model": models.model_app, "template": templates.template_app}
 for name, group in groups.items():

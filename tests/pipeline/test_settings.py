@@ -26,6 +26,8 @@ def nested(depth: int) -> list[Any]:
         ({"bust": {"spacing_mm": 10**400}}, "bust.spacing_mm is 1000"),
         ({"bust": {"spacing_mm": 10**5000}}, "bust.spacing_mm is too large a value"),
         ({"bust": {"spacing_mm": True}}, "bust.spacing_mm is True"),
+        ({"cap": {"colour": "nude"}}, "cap.colour: 'nude' is neither #rrggbb nor one of black"),
+        ({"cap": {"thickness_mm": 12}}, "cap.thickness_mm is 12, wanted 0 to 10"),
         ({"bust": {"spacing_mm": float("nan")}}, "bust.spacing_mm is nan"),
         ({"front": nested(100_000)}, "front is too large a value"),
     ],

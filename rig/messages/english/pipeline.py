@@ -3,6 +3,7 @@
 TEMPLATES = {
     "no-bust": "{reason}",
     "hair-beyond-head": "the head's vertices reach {share:.0%} of the hair to 2 mm; the rest hangs or stands beyond them: bust.ply shows it whole",
+    "cap-not-found": "the photographs show no cap of the colour {colour}: {share:.0%} of the head well above the brows could be one, and the job went on as without; give its colour as a photograph shows it, #rrggbb, of none that hair or skin has too",
     "features": "{remark}",
     "view": "{remark}",
     "view-left-out": "{remark}",
@@ -161,6 +162,8 @@ TEMPLATES = {
     "template-not-finite": "it holds values that are not finite",
     "setting-code-unknown": "fail_on: {code} is none of {known}",
     "setting-spacing-wrong": "bust.spacing_mm is {value:g}, wanted {least:g} to {most:g}",
+    "setting-colour-wrong": "cap.colour: {colour} is neither #rrggbb nor one of {known}",
+    "setting-thickness-wrong": "cap.thickness_mm is {value:g}, wanted {least:g} to {most:g}",
     "setting-format-unknown": "outputs.formats: {format} is none of {known}",
     "setting-template-wrong": "outputs.template: {template} is no name: letters, digits, - and _, 40 at most",
     "setting-wrong": "{setting} is {value}, wanted {wanted}",

@@ -9,8 +9,12 @@ from rig.errors import InputError
 from rig.messages.message import compose
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.subject import Colour, Look
+from rig.studio.scene.tight_cap import TightCap
 
 CAP_TONE: Colour = (0.035, 0.06, 0.14)  # navy
+
+SWIM_CAP = TightCap((0.02, 0.10, 0.42))  # blue silicone
+WIG_CAP = TightCap((0.018, 0.018, 0.02), folds_mm=2.0, creases=0.5, glossy=False)  # black cloth, badly put on
 
 Change = Callable[[Look], Look]
 
@@ -32,6 +36,10 @@ def _cap(look: Look) -> Look:
     return replace(look, hair=under, cap=CAP_TONE)
 
 
+def _tight(cap: TightCap) -> Change:
+    return lambda look: replace(look, hair=None, cap=None, tight_cap=cap)
+
+
 HAIRSTYLES: Mapping[str, Change] = MappingProxyType({
     "short": _hair(thickness_mm=12.0, over_ears=False, fringe_mm=0.0),
     "over-ears": _hair(thickness_mm=20.0, over_ears=True, fringe_mm=0.0),
@@ -42,9 +50,11 @@ HAIRSTYLES: Mapping[str, Change] = MappingProxyType({
     "beard": _beard,
     "bald": lambda look: replace(look, hair=None),
     "cap": _cap,
+    "swim-cap": _tight(SWIM_CAP),
+    "wig-cap": _tight(WIG_CAP),
     "glasses": lambda look: replace(look, glasses=True),
 })  # fmt: skip
-"""What each name changes of a look. Cap and glasses count as clothes in the truth, a beard as hair. Glasses are rims
+"""What each name changes of a look. Caps and glasses count as clothes in the truth, a beard as hair. Glasses are rims
 without panes: the pipeline asks studios for that."""
 
 

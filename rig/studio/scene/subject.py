@@ -23,6 +23,7 @@ from rig.studio.scene.long_hair import hang, knot
 from rig.studio.scene.scattering import scattered
 from rig.studio.scene.skin_relief import SkinRelief, relieved
 from rig.studio.scene.skin_texture import oily_zones, skin_paint
+from rig.studio.scene.tight_cap import TightCap, lay_cap
 from rig.studio.sensor.noise import volume
 
 Colour = tuple[float, float, float]
@@ -53,6 +54,7 @@ SKIN = Grain((3.6, 3.6, 3.6), (0.08, 0.03, 0.0, 0.0), (1.1, 1.1, 1.1), (0.10, 0.
 HAIR = Grain((5.0, 30.0, 5.0), (0.30, 0.0, 0.0, 0.0), (0.9, 14.0, 5.0), (0.0, 0.45, 0.0, 0.0), gloss=0.015)
 CLOTH = Grain((9.0, 9.0, 9.0), (0.0, 0.12, 0.0, 0.0), (1.3, 1.3, 1.3), (0.0, 0.0, 0.12, 0.0))
 GAZE_MM = 1200.0  # how far away the point is that eyes look at
+RUBBER = Grain((9.0, 9.0, 9.0), (0.0, 0.03, 0.0, 0.0), (1.3, 1.3, 1.3), (0.0, 0.0, 0.03, 0.0), gloss=0.06)
 FRAME_TONE: Colour = (0.025, 0.018, 0.014)
 FRAME = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), gloss=0.15)
 NO_GRAIN = Grain((9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0), (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 0.0))
@@ -85,6 +87,7 @@ class Look:
     texture: bool = True
     beard: HairStyle | None = None
     cap: Colour | None = None
+    tight_cap: TightCap | None = None
     glasses: bool = False
     pores: float = 1.0  # contrast, by the painted one
     oil: float = 0.0
@@ -173,7 +176,7 @@ def dress(
     lamps: Sequence[Lamp] = LAMPS,
 ) -> Dressed:
     """Gives a head hair, clothes, paint and light. Returns it in the world frame (mm)."""
-    hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng, eye_rng = rng.spawn(6)
+    hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng, eye_rng, cap_rng = rng.spawn(7)
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
     worn = shirt(head, body, cloth_rng) if clothes else None
     hairs = _hairs(head, body, look, worn, hair_rng)
@@ -185,6 +188,8 @@ def dress(
         pieces.append(Piece("clothes", *worn, worn[0], _even(worn[0], look.cloth), grain, False))
     pieces += _headwear(head, body, look, hairs[0][0] if look.hair else None)
     pieces += [_eye_piece(surface(eye, eye_rng)) for eye in subject.eyes.values()]
+    if look.tight_cap:
+        pieces.append(_tight_cap(head, body, look.tight_cap, cap_rng))
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
     normals = [vertex_normals(*piece) for piece in placed]
     solid = _joined(placed)
@@ -308,6 +313,12 @@ def _headwear(head: Mesh, body: Anatomy, look: Look, scalp: Hair | None) -> list
         surface = glasses(head.vertices, body)
         found.append(Piece("clothes", *surface, surface[0], _even(surface[0], FRAME_TONE), FRAME, False))
     return found
+
+
+def _tight_cap(head: Mesh, body: Anatomy, worn: TightCap, rng: np.random.Generator) -> Piece:
+    vertices, faces, albedo = lay_cap(head, body, worn, rng)
+    paint = np.column_stack([albedo, np.ones(len(albedo))])
+    return Piece("clothes", vertices, faces, vertices, paint, RUBBER if worn.glossy else CLOTH, False)
 
 
 def _even(vertices: Float[np.ndarray, "v 3"], tone: Colour) -> Float[np.ndarray, "v 4"]:

@@ -57,6 +57,20 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
     assert requested == [{"formats": ["glb", "usdz"]}, {"delight": True}]
 
 
+def test_a_cap_reaches_the_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    requested: list[Any] = []
+
+    def reconstructed(*positional: Any, settings: dict[str, Any], **named: Any) -> dict[str, Any]:
+        requested.append(settings["cap"])
+        return {"warnings": []}
+
+    monkeypatch.setattr(reconstruct_local, "reconstruct_locally", reconstructed)
+    arguments = ["reconstruct", str(small_capture(tmp_path / "capture")), "--out", str(tmp_path / "out"), "--cap"]
+    assert CliRunner().invoke(app, [*arguments, "blue"]).exit_code == 0
+    assert CliRunner().invoke(app, [*arguments, "#2458ac", "--cap-thickness", "0.6"]).exit_code == 0
+    assert requested == [{"colour": "blue"}, {"colour": "#2458ac", "thickness_mm": 0.6}]
+
+
 @pytest.mark.parametrize("option", ["--noise", "--light-drift", "--defocus", "--rolling-ms", "--fps"])
 @pytest.mark.parametrize("value", ["nan", "inf"])
 def test_what_is_no_finite_number_is_wrong_usage(option: str, value: str, tmp_path: Path) -> None:

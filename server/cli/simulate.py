@@ -1,0 +1,158 @@
+"""Implements ``eigenhead simulate``: captures of the simulated studio, and the studio as cameras and a trigger box."""
+
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.studio.sensor.faults import KINDS
+from server.cli.answers import Json, Overwrite, Overwrites, answer, number, prepare_file, progress_bar, wrong_usage
+
+if TYPE_CHECKING:
+    from rig.studio.sensor.preset import Preset
+
+MAX_GAZE_DEG = 35.0  # of the studio's eyeballs: lids hide more
+app = typer.Typer(rich_markup_mode=None)
+
+HairNames = Annotated[
+    str | None,
+    typer.Option(
+        help="NAME[,NAME]: short, over-ears, long, curly, fringe, bun, beard, bald, cap, swim-cap, wig-cap, glasses."
+    ),
+]
+
+
+@app.command(
+    epilog="Example: eigenhead simulate shots/anna --seed 7 --fault bumped:cam03=0.5   "
+    "eigenhead simulate studio --serve --port 8700"
+)
+def simulate(
+    out: Annotated[
+        Path | None,
+        typer.Argument(help="The capture folder to write (--serve: the rig's); the truth goes to OUT.truth."),
+    ] = None,
+    *,
+    subject: Annotated[str, typer.Option(help="random, mean, or a mesh file (head frame, mm).")] = "random",
+    seed: Annotated[int, typer.Option(help="Of subject, looks, pose and noise.", min=0)] = 0,
+    noise: Annotated[float | None, number("Sensor noise, share of full scale.", min=0, max=1)] = None,
+    light_drift: Annotated[float | None, number("From plate to shot, share.", min=0, max=1)] = None,
+    defocus: Annotated[float | None, number("Blur, pixels.", min=0)] = None,
+    rolling_ms: Annotated[float | None, number("Readout of a rolling shutter.", min=0, max=200)] = None,
+    hair: HairNames = None,
+    realism: Annotated[
+        str | None,
+        typer.Option(help="NAME[,NAME] of what real photographs have: smooth, oily, scattering, mosaic, jpeg; or all."),
+    ] = None,
+    no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
+    polarised: Annotated[bool, typer.Option("--polarised", help="Also the texture sets cross and parallel.")] = False,
+    expression: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
+    ] = None,
+    gaze: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Azimuth (to the subject's left) and elevation, degrees: eyeballs that look there."),
+    ] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
+    ] = None,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
+    ] = False,
+    port: Annotated[int, typer.Option(help="--serve: of the cameras; 0 takes a free one.", min=0, max=65535)] = 0,
+    fps: Annotated[float, number("--serve: of the live views.", min=0.5, max=30)] = 4.0,
+    overwrite: Overwrite = False,
+    json_out: Json = False,
+) -> None:
+    """Take a capture with the simulated studio; the truth is written beside it.
+
+    --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
+    given) with which the rig commands and the service work as with a real rig."""
+    chosen: dict[str, Any] = {
+        "noise": noise,
+        "light_drift": light_drift,
+        "defocus_px": defocus,
+        "rolling_ms": rolling_ms,
+        "hair": not no_hair,
+        "hairstyle": tuple(hair.split(",")) if hair else (),
+        "polarised": polarised,
+    }
+    preset = _studio_preset(realism, **chosen)
+    if gaze is not None and (serve or not max(map(abs, gaze)) <= MAX_GAZE_DEG):
+        raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees, and not with --serve", param_hint="--gaze")
+    if serve:
+        _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
+                      faults=fault or [], expression=expression or [])  # fmt: skip
+        return
+    if out is None:
+        raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")
+    _check_planted(fault or [], expression or [])
+    _make_way(out, overwrite)
+    from rig.render.renderer import Renderer
+    from server.tasks.subjects import simulate_folder
+
+    with progress_bar() as report, Renderer.create() as renderer:
+        report("simulate", 0.0)
+        truth = simulate_folder(out, subject=subject, seed=seed, preset=preset, faults=fault or [], renderer=renderer,
+                                expression=expression or [], gaze_deg=gaze)  # fmt: skip
+    answer({"capture": str(out), "truth": str(truth)}, json_out, [str(out), str(truth)])
+
+
+def _studio_preset(realism: str | None, **chosen: Any) -> "Preset":
+    """Returns the studio's preset with the chosen values. Raises typer.BadParameter for an unknown name in
+    ``realism``."""
+    from dataclasses import replace
+
+    from rig.studio.sensor.preset import PRESET
+    from rig.studio.sensor.realism import made_real, realism_names
+
+    with wrong_usage("--realism"):
+        return made_real(
+            replace(PRESET, **{key: value for key, value in chosen.items() if value is not None}),
+            realism_names(realism),
+        )
+
+
+def _check_planted(faults: list[str], expression: list[str]) -> None:
+    """Raises typer.BadParameter for faults or expressions that are unknown."""
+    from rig.studio.sensor.faults import fault_from_text
+
+    with wrong_usage("--fault"):
+        for text in faults:
+            fault_from_text(text)
+    if expression:
+        from pipeline.head_model.expressions import weights_from_text
+        from pipeline.head_model.model import load_model
+
+        with wrong_usage("--expression"):
+            weights_from_text(expression, load_model().expressions.names)
+
+
+def _make_way(out: Path, overwrite: bool) -> None:
+    """Removes an earlier simulated capture if ``overwrite`` is true. Raises Overwrites and CannotWrite."""
+    there = out.exists() and (not out.is_dir() or any(out.iterdir()))
+    if there and not (overwrite and (out / "cameras.json").is_file()):
+        raise Overwrites(out)
+    prepare_file(out)
+    if there:
+        shutil.rmtree(out)
+        shutil.rmtree(out.with_name(out.name + ".truth"), ignore_errors=True)
+
+
+def _serve_studio(folder: Path, json_out: bool, **options: Any) -> None:
+    """Serves the simulated studio until Ctrl-C, which ends it with status 0."""
+    from contextlib import ExitStack, suppress
+
+    from server.cli.studio import OpenStudio, serve_studio
+
+    with ExitStack() as bar, suppress(KeyboardInterrupt):
+        report = bar.enter_context(progress_bar())
+
+        def ready(studio: OpenStudio) -> None:
+            bar.close()
+            answer(studio.document(), json_out, studio.lines())
+            sys.stdout.flush()
+
+        serve_studio(folder, ready=ready, report=report, **options)
