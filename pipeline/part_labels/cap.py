@@ -153,8 +153,8 @@ def _piece(view: Cells, like: Bool[np.ndarray, "r c"], brows_mm: float) -> Bool[
     """Returns the largest connected piece of the cells that lies mostly above the brows, its holes filled."""
     wide = max(3, 2 * round(0.5 * CLOSED_MM / CELL_MM) + 1)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
-    closed = np.asarray(cv2.morphologyEx(like.astype(np.uint8), cv2.MORPH_CLOSE, disc))
-    closed &= (view.inside > 0.5).astype(np.uint8)
+    closed = np.asarray(cv2.morphologyEx(like.astype(np.uint8), cv2.MORPH_CLOSE, disc), np.uint8)
+    closed[view.inside <= 0.5] = 0
     count, labels = cv2.connectedComponents(closed, connectivity=4)
     above = view.above_chin_mm > brows_mm
     sizes, high = (np.bincount(labels.ravel(), of.ravel(), count) for of in (np.ones_like(above), above))
