@@ -14,7 +14,6 @@ from pipeline.evidence.measurements import Measurement
 from pipeline.faces.irises import Iris, UnseenEye
 
 PUPIL_DISTANCE = "pupil_distance"
-MAX_BETWEEN_DEG = 12.0  # of two gazes: a point 0.3 m away. More is a squint or, more often, an error of one
 
 
 def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:
@@ -24,11 +23,9 @@ def pupils(eyes: Mapping[str, Iris | UnseenEye]) -> dict[str, Measurement]:
 
 
 def pupil_distance(eyes: Mapping[str, Iris | UnseenEye]) -> Measurement | None:
-    """Returns the far pupil distance (mm), None unless both irises were found and look at one point."""
+    """Returns the far pupil distance (mm), None unless both irises were found."""
     right, left = eyes.get("right"), eyes.get("left")
     if not isinstance(right, Iris) or not isinstance(left, Iris):
-        return None
-    if right.gaze @ left.gaze < np.cos(np.radians(MAX_BETWEEN_DEG)):
         return None
     apart = left.eyeball - right.eyeball
     value = float(np.linalg.norm(apart))

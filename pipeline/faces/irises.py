@@ -51,6 +51,8 @@ MAX_NETWORK_OFF = 0.6  # between a view's network and the circle's centre, by th
 MAX_RMS = 0.09  # of the edges, by the iris' radius
 MAX_RADIUS_OFF_MM = 0.75
 MAX_GAZE_STD_DEG = 6.0
+MAX_BETWEEN_DEG = 12.0  # of two gazes: a point 0.3 m away. More is a squint or, more often, an error of one
+MAX_ALONE_DEG = 20.0  # off ahead, of an eye that the other does not confirm: whoever looks farther turns the head
 Cause = Literal["closed", "few-views", "coarse", "unclear"]
 IRISES = {"right": 0, "left": 5}  # rows of ``FaceDetection.irises_px``: the centre
 
@@ -116,7 +118,17 @@ def find_irises(
     right, left = out["right"], out["left"]
     if isinstance(right, Iris) and isinstance(left, Iris):
         out["right"], out["left"] = looking_together(right, left, axes)
-    return out
+    return believed(out, axes[:, 2])
+
+
+def believed(eyes: Mapping[str, Iris | UnseenEye], ahead: Float[np.ndarray, " 3"]) -> dict[str, Iris | UnseenEye]:
+    """Returns the eyes without gazes that nobody has: two that differ by more than ``MAX_BETWEEN_DEG``, and one alone
+    that is farther than ``MAX_ALONE_DEG`` from ``ahead``, where the face looks (a unit vector)."""
+    gazes = [eye.gaze for eye in eyes.values() if isinstance(eye, Iris)]
+    beside, limit_deg = (gazes[1], MAX_BETWEEN_DEG) if len(gazes) == len(eyes) else (ahead, MAX_ALONE_DEG)
+    if not gazes or gazes[0] @ beside >= np.cos(np.radians(limit_deg)):
+        return dict(eyes)
+    return {side: UnseenEye("unclear") if isinstance(eye, Iris) else eye for side, eye in eyes.items()}
 
 
 def looking_together(right: Iris, left: Iris, face_axes: Float[np.ndarray, "3 3"]) -> tuple[Iris, Iris]:

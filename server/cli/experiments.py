@@ -27,10 +27,7 @@ Only = Annotated[
         "or eyes. growth: views or pixels alone. wrap, hair-shell: this capture alone. May be repeated."
     ),
 ]
-Realism = Annotated[
-    str | None,
-    typer.Option(help="hidden, visible: the studio's heads once more with these names of simulate --realism."),
-]
+Realism = Annotated[str | None, typer.Option(help="hidden, visible: simulate's --realism, beside none.")]
 
 
 @app.command(epilog="Example: eigenhead experiments limit --subjects 3 --json")
@@ -55,9 +52,7 @@ def experiments(
     ] = None,
     model: Annotated[str, typer.Option(help="A model's name or file.")] = "default",
     subjects: Annotated[int | None, typer.Option(help="How many, instead of the experiment's own.", min=1)] = None,
-    simplex: Annotated[
-        int | None, typer.Option(help="table1 to table3: how many of them the simplex fits too (a minute each).", min=0)
-    ] = None,
+    simplex: Annotated[int | None, typer.Option(help="table1 to table3: how many the simplex fits too.", min=0)] = None,
     captures: Annotated[bool, typer.Option(help="hidden, visible, texture: the captures of --shared, too.")] = False,
     openmvs: Annotated[Path | None, typer.Option(help="surfaces: the folder of that peer's programs.")] = None,
     only: Only = None,
@@ -82,9 +77,7 @@ def experiments(
     skin = _realism_names(realism)
     from pipeline.research.runner import Options, run_experiment
 
-    options = Options(
-        simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail, skin, job=_job_command()
-    )
+    options = Options(simplex, captures, openmvs, tuple(folders or ()), tuple(only or ()), detail, skin, _job_command())
     with progress_bar() as report:
         found = run_experiment(
             name, model=model, subjects=subjects, shared=shared, folder=out, report=report, options=options

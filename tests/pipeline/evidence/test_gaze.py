@@ -46,12 +46,6 @@ def test_no_pupil_distance_where_an_eye_is_not_seen() -> None:
     assert pupils({}) == {}
 
 
-def test_no_pupil_distance_of_eyes_that_look_past_each_other() -> None:
-    ahead, aside = looking_at((0.0, 0.0, 1e9)), looking_at((0.0, 0.0, 140.0))
-    assert pupil_distance(aside) is None
-    assert pupil_distance(ahead | {"left": aside["left"]}) is None
-
-
 def test_angles_are_to_the_left_and_up() -> None:
     assert angles_deg(np.array([0.0, 0.0, 1.0])) == pytest.approx((0.0, 0.0))
     assert angles_deg(np.array([np.sin(0.2), 0.0, np.cos(0.2)])) == pytest.approx((np.degrees(0.2), 0.0))

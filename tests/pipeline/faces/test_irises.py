@@ -8,7 +8,7 @@ import pytest
 from jaxtyping import Float
 
 from pipeline.faces.detection import FaceDetection
-from pipeline.faces.irises import BEHIND_MM, EYEBALL_MM, Iris, UnseenEye, find_irises, looking_together
+from pipeline.faces.irises import BEHIND_MM, EYEBALL_MM, Iris, UnseenEye, believed, find_irises, looking_together
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS
 from rig.camera import Camera, Intrinsics
@@ -123,14 +123,28 @@ def test_an_eye_that_is_not_seen_says_why() -> None:
     assert find_irises(*scene(rig, irises=False), rig, frozenset())["right"] == UnseenEye("unclear")
 
 
-def test_eyes_help_each_other_unless_they_squint() -> None:
+def iris(azimuth_deg: float, elevation_deg: float) -> Iris:
+    """An iris that looks so, known to 2 degrees."""
     covariance = np.diag([0.1] * 3 + [np.radians(2.0)] * 3 + [0.1]) ** 2
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    gaze = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
+    return Iris(np.zeros(3), gaze, 5.85, covariance, ("cam0", "cam1"), 0.2)
 
-    def iris(azimuth_deg: float, elevation_deg: float) -> Iris:
-        azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
-        gaze = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-        return Iris(np.zeros(3), gaze, 5.85, covariance, ("cam0", "cam1"), 0.2)
 
+def test_gazes_that_nobody_has_are_not_told() -> None:
+    ahead, none = np.array([0.0, 0.0, 1.0]), UnseenEye("unclear")
+    told = {"right": iris(5.0, 0.0), "left": iris(-5.0, 0.0)}
+    assert believed(told, ahead) == told
+    assert believed({"right": iris(7.0, 0.0), "left": iris(-7.0, 0.0)}, ahead) == {"right": none, "left": none}
+    alone = {"right": UnseenEye("closed"), "left": iris(0.0, 18.0)}
+    assert believed(alone, ahead) == alone
+    assert believed({"right": UnseenEye("closed"), "left": iris(0.0, 25.0)}, ahead) == alone | {"left": none}
+    both_up = {"right": iris(0.0, 25.0), "left": iris(0.0, 25.0)}  # the one confirms the other
+    assert believed(both_up, ahead) == both_up
+    assert believed({"right": none, "left": none}, ahead) == {"right": none, "left": none}
+
+
+def test_eyes_help_each_other_unless_they_squint() -> None:
     right, left = looking_together(iris(1.5, 2.0), iris(-1.5, -2.0), np.eye(3))
     elevations = np.degrees(np.arcsin([right.gaze[1], left.gaze[1]]))
     np.testing.assert_allclose(elevations, (0.22, -0.22), atol=0.02)  # 2 degrees each beside 1 between them
