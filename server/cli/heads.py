@@ -94,8 +94,13 @@ TemplateName = Annotated[
         autocompletion=completing(_templates),
     ),
 ]
-
-
+Morphs = Annotated[
+    bool,
+    typer.Option(
+        "--morphs", help="Write posed.glb too, with morph targets by Apple's names; of a template head-NAME.glb."
+    ),
+]
+Slicer = Annotated[bool, typer.Option("--slicer", help="Write landmarks.mrk.json too, a point list for 3D Slicer.")]
 CapColour = Annotated[
     str | None, typer.Option(help="Of a worn swim or wig cap, about: #rrggbb, or a name as blue.", metavar="COLOUR")
 ]
@@ -132,15 +137,8 @@ def reconstruct(
         bool, typer.Option("--normal-map", help="head.glb of few triangles, with a normal map of what they leave out.")
     ] = False,
     neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
-    morphs: Annotated[
-        bool,
-        typer.Option(
-            "--morphs", help="Write posed.glb too, with morph targets by Apple's names; of a template head-NAME.glb."
-        ),
-    ] = False,
-    slicer: Annotated[
-        bool, typer.Option("--slicer", help="Write landmarks.mrk.json too, a point list for 3D Slicer.")
-    ] = False,
+    morphs: Morphs = False,
+    slicer: Slicer = False,
     template: TemplateName = None,
     device: Device = None,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,

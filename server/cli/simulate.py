@@ -23,6 +23,18 @@ HairNames = Annotated[
     ),
 ]
 
+Expressions = Annotated[
+    list[str] | None,
+    typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
+]
+Gaze = Annotated[
+    tuple[float, float] | None,
+    typer.Option(help="Azimuth (to the subject's left) and elevation, degrees: eyeballs that look there."),
+]
+Faults = Annotated[
+    list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
+]
+
 
 @app.command(
     epilog="Example: eigenhead simulate shots/anna --seed 7 --fault bumped:cam03=0.5   "
@@ -47,17 +59,9 @@ def simulate(
     ] = None,
     no_hair: Annotated[bool, typer.Option("--no-hair", help="Neither hair nor beard.")] = False,
     polarised: Annotated[bool, typer.Option("--polarised", help="Also the texture sets cross and parallel.")] = False,
-    expression: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
-    ] = None,
-    gaze: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="Azimuth (to the subject's left) and elevation, degrees: eyeballs that look there."),
-    ] = None,
-    fault: Annotated[
-        list[str] | None, typer.Option(help=f"KIND[:CAMERA][=AMOUNT]; may be repeated. Kinds: {', '.join(KINDS)}.")
-    ] = None,
+    expression: Expressions = None,
+    gaze: Gaze = None,
+    fault: Faults = None,
     serve: Annotated[
         bool, typer.Option("--serve", help="Keep the studio running as cameras and a trigger box, until Ctrl-C.")
     ] = False,
@@ -70,15 +74,9 @@ def simulate(
 
     --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
     given) with which the rig commands and the service work as with a real rig."""
-    chosen: dict[str, Any] = {
-        "noise": noise,
-        "light_drift": light_drift,
-        "defocus_px": defocus,
-        "rolling_ms": rolling_ms,
-        "hair": not no_hair,
-        "hairstyle": tuple(hair.split(",")) if hair else (),
-        "polarised": polarised,
-    }
+    chosen: dict[str, Any] = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus}
+    chosen |= {"rolling_ms": rolling_ms, "hair": not no_hair, "polarised": polarised}
+    chosen["hairstyle"] = tuple(hair.split(",")) if hair else ()
     preset = _studio_preset(realism, **chosen)
     if gaze is not None and (serve or not max(map(abs, gaze)) <= MAX_GAZE_DEG):
         raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees, and not with --serve", param_hint="--gaze")

@@ -133,8 +133,8 @@ def iris(azimuth_deg: float, elevation_deg: float) -> Iris:
 
 def test_gazes_that_nobody_has_are_not_told() -> None:
     ahead, none = np.array([0.0, 0.0, 1.0]), UnseenEye("unclear")
-    told = {"right": iris(5.0, 0.0), "left": iris(-5.0, 0.0)}
-    assert believed(told, ahead) == told
+    pair = {"right": iris(5.0, 0.0), "left": iris(-5.0, 0.0)}
+    assert believed(pair, ahead) == pair
     assert believed({"right": iris(7.0, 0.0), "left": iris(-7.0, 0.0)}, ahead) == {"right": none, "left": none}
     alone = {"right": UnseenEye("closed"), "left": iris(0.0, 18.0)}
     assert believed(alone, ahead) == alone
