@@ -169,9 +169,9 @@ def _limit(task: Task) -> Outcome:
 
 def _span(task: Task) -> Outcome:
     other = facekit(task.shared)
-    truths = [span.read_truth(path) for path in truths(task.shared).values()]
-    truths += span.random_draws(other, task.subjects or 20)
-    return span.run({"default": task.head, "ict": other}, truths, report=task.report)
+    heads = [span.read_truth(path) for path in truths(task.shared).values()]
+    heads += span.random_draws(other, task.subjects or 20)
+    return span.run({"default": task.head, "ict": other}, heads, report=task.report)
 
 
 def _detail(task: Task) -> Outcome:

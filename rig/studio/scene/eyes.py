@@ -181,11 +181,12 @@ def eye_centres(mesh: Mesh, landmarks: Landmarks, gaze: Float[np.ndarray, " 3"])
         lids, _ = _cut(mesh, landmarks, side)
         near = np.linalg.norm(lids.vertices - centre, axis=1) < PATCH_MM
         points = lids.vertices[np.intersect1d(np.flatnonzero(near), np.unique(lids.faces))]
-        for back in np.arange(0.0, BACK_MM, STEP_MM):
-            eye = Eye(centre - (0.0, 0.0, back), gaze, WHITE)
-            away = points - eye.centre
-            distance = np.linalg.norm(away, axis=1)
-            if (distance > eye.reach(away / distance[:, None]) + GAP_MM).all():
-                break
-        out[side] = eye.centre
+        places = [centre - (0.0, 0.0, back) for back in np.arange(0.0, BACK_MM, STEP_MM)]
+        out[side] = next((place for place in places if _has_room(Eye(place, gaze, WHITE), points)), places[-1])
     return out
+
+
+def _has_room(eye: Eye, lids: Float[np.ndarray, "n 3"]) -> bool:
+    away = lids - eye.centre
+    distance = np.linalg.norm(away, axis=1)
+    return bool((distance > eye.reach(away / distance[:, None]) + GAP_MM).all())
