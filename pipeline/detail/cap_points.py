@@ -26,12 +26,15 @@ def skin_under_cap(points: SurfacePoints, depth_maps: Sequence[DepthMap], cap: C
         cap: the pixels that show it.
         rig: the cameras as calibrated.
     """
-    worn = {name: PartMap(name, np.repeat(shown[..., None].astype(np.float32), 3, axis=2))
-            for name, shown in cap.masks.items()}  # fmt: skip
+    worn = {
+        name: PartMap(name, np.zeros((*shown.shape, 3), np.uint8)).with_clothes(shown)
+        for name, shown in cap.masks.items()
+    }
     votes = vote_parts(depth_maps, worn, rig)
     if votes is None or not len(points.points):
         return points
-    on_cap = (points.part == Part.CLOTHES) & (part_shares(votes, points.points)[:, 0] > MOSTLY)
+    share = part_shares(votes, points.points)[:, Part.CLOTHES.channel]
+    on_cap = (points.part == Part.CLOTHES) & (share > MOSTLY)
     moved = points.points - np.where(on_cap, cap.thickness_mm, 0.0)[:, None] * points.normals
     return replace(
         points,

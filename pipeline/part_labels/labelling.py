@@ -62,6 +62,12 @@ class PartMap:
         """Returns the probability of one part at every pixel."""
         return self.of_255[..., part.channel] * np.float32(1 / 255)
 
+    def with_clothes(self, mask: Bool[np.ndarray, "h w"]) -> "PartMap":
+        """Returns the map with clothes for certain where ``mask`` is true."""
+        clothes = np.zeros(3, np.uint8)
+        clothes[CLOTHES_CHANNEL] = 255
+        return PartMap(self.camera, np.where(mask[..., None], clothes, self.of_255))
+
 
 def classify_parts(
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],

@@ -10,7 +10,7 @@ from numpy import ndarray
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.model_basis import model_basis
 from pipeline.part_labels.cap import Cap, find_cap
-from pipeline.part_labels.codes import CHANNELS, Part
+from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap, classify_parts
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.stages.alignment import Alignment
@@ -109,7 +109,4 @@ def label_parts(
 
 
 def _with_cap(part: PartMap, cap: Cap | None) -> PartMap:
-    if cap is None or part.camera not in cap.masks:
-        return part
-    worn = 255 * np.eye(len(CHANNELS), dtype=np.uint8)[Part.CLOTHES.channel]
-    return PartMap(part.camera, np.where(cap.masks[part.camera][..., None], worn, part.of_255))
+    return part if cap is None or part.camera not in cap.masks else part.with_clothes(cap.masks[part.camera])

@@ -70,10 +70,10 @@ def simulate(
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Take a capture with the simulated studio; the truth is written beside it.
+    """Take a capture with the simulated studio.
 
-    --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml (OUT is "studio" where none is
-    given) with which the rig commands and the service work as with a real rig."""
+    The truth is written beside it. --serve opens eleven motion-JPEG cameras and a trigger box, and writes OUT/rig.toml
+    (OUT is "studio" where none is given) with which the rig commands and the service work as with a real rig."""
     chosen: dict[str, Any] = {"noise": noise, "light_drift": light_drift, "defocus_px": defocus}
     chosen |= {"rolling_ms": rolling_ms, "hair": not no_hair, "polarised": polarised}
     chosen["hairstyle"] = tuple(hair.split(",")) if hair else ()

@@ -71,4 +71,5 @@ def test_a_splat_faces_the_way_of_its_point() -> None:
 
 
 def test_every_hairstyle_of_the_studio_has_its_turn() -> None:
-    assert {name for style in STYLES for name in style.split(",")} == set(HAIRSTYLES)
+    tight = {"swim-cap", "wig-cap"}  # nothing of the hair is seen below them; ``capped`` measures those
+    assert {name for style in STYLES for name in style.split(",")} == HAIRSTYLES.keys() - tight
