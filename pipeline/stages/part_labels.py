@@ -61,7 +61,7 @@ class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
         return len(self.maps)
 
 
-@stage("parts")
+@stage("alignment")
 def find_worn_cap(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[Cap | None]:
     """Finds the cap that the settings name by its colour in the photographs, on the mean head at its pose. Returns None
     if they name none, and with the warning ``cap-not-found`` where the photographs do not show it."""
