@@ -76,8 +76,8 @@ def decide(
     background = estimate_background(image, coarse, empty_plates(plates), settings)
     chi2, variance = _against_plate(coarse, background, image.shape[1] / size[0], settings)
     odds = np.clip(0.5 * chi2 - settings.evidence, -MAX_ODDS, MAX_ODDS)
-    left, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds, settings)
-    chi2, odds = np.where(shadow, left, chi2), np.where(shadow, -MAX_ODDS / 2, odds).astype(np.float32)
+    chi2, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds, settings)
+    odds = np.where(shadow, -MAX_ODDS / 2, odds).astype(np.float32)
     probability = smooth_odds(odds, coarse, background, settings)
     raw = probability > 0.5
     away, mixture = find_mixtures(image, coarse, background)

@@ -4,8 +4,9 @@ python -m tests.benchmarks.plate_masks
 python -m tests.benchmarks.plate_masks --captures scan-a-skin --sizes 1 0.75 0.5 0.25 --views
 python -m tests.benchmarks.plate_masks --sizes 0.5 --noise 3 --exposure 0.9 --jpeg 85
 
-Pictures and plates are made smaller by the mean over each new pixel's area, the rig with them. Whatever the size, contours
-are compared in pixels of the whole one: from every point of the true contour to the mask's, so that sizes compare.
+Pictures and plates are made smaller by the mean over each new pixel's area, the rig with them. Whatever the size,
+contours are compared in pixels of the whole one, from every point of the true contour to the mask's: sizes compare.
+What a mask has too much is in the overlap.
 """
 
 import argparse
@@ -43,11 +44,16 @@ class Row:
     def far(self) -> float:
         return float((self.off_px > FAR_PX).mean())
 
+    @property
+    def weak(self) -> float:
+        """What the program says of the contour: the share that hardly differs from the background."""
+        return float(np.asarray(self.silhouette.quality.figures.get("weak_share", 1.0)))
+
     def line(self) -> str:
         quality = self.silhouette.quality
         return (
             f"{self.overlap:.4f} {np.median(self.off_px):.2f} {np.sqrt((self.off_px**2).mean()):.2f} "
-            f"{np.quantile(self.off_px, 0.95):.2f} {self.far:.3f} weak {quality.figures.get('weak_share', 0):.3f} "
+            f"{np.quantile(self.off_px, 0.95):.2f} {self.far:.3f} weak {self.weak:.3f} "
             f"{'' if quality.usable else 'left out '}{'; '.join(map(str, quality.warnings))}"
         )
 
@@ -107,10 +113,12 @@ def _each(capture: Capture, change: Callable[[np.ndarray], np.ndarray]) -> Captu
 
 def compare(name: str, capture: Capture, rig: Rig) -> list[Row]:
     silhouettes = segment(capture, rig, SegmentationSettings(), report=lambda *_: None)
-    return [_row(view, silhouettes[view], true_mask(view, name)) for view in rig.names]
+    return [compare_view(name, view, silhouettes[view]) for view in rig.names]
 
 
-def _row(view: str, silhouette: Silhouette, truth: np.ndarray) -> Row:
+def compare_view(name: str, view: str, silhouette: Silhouette) -> Row:
+    """Compares one silhouette, of any size, with the true mask of the whole size."""
+    truth = true_mask(view, name)
     size = silhouette.mask.shape[1] / truth.shape[1]
     at = (contour_points(truth) + 0.5) * size - 0.5
     x, y = (np.ascontiguousarray(at[:, k], np.float32)[None] for k in (0, 1))
