@@ -38,6 +38,7 @@ HAIR_DEPTH = 6  # coarse pixels (24 px)
 
 NOISE_HOLE_COARSE_PX = 3  # coarse pixels: a hole of this size is noise wherever it is
 MIXED = 0.1  # of the difference to the plate: standard deviation within a coarse pixel from which it is a mixture
+MIXED_SINGLE = 0.2  # the same where a quarter of the coarse pixel is one pixel, whose noise nothing averages
 STRAND_SHADES = 0.75, 1.0, 1.33  # of the subject's colour nearby, in which strands before the plate may be
 MAX_FAINT_CHI2 = 100.0  # chi-squared of a mean over nine pixels
 UNEXPLAINED, UNEXPLAINED_SHARE = 8.0, 0.15  # chi-squared that a mixture must leave, and that by the whole
@@ -75,8 +76,8 @@ def decide(
     background = estimate_background(image, coarse, empty_plates(plates), settings)
     chi2, variance = _against_plate(coarse, background, image.shape[1] / size[0], settings)
     odds = np.clip(0.5 * chi2 - settings.evidence, -MAX_ODDS, MAX_ODDS)
-    left, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds, settings)
-    chi2, odds = np.where(shadow, left, chi2), np.where(shadow, -MAX_ODDS / 2, odds).astype(np.float32)
+    chi2, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds, settings)
+    odds = np.where(shadow, -MAX_ODDS / 2, odds).astype(np.float32)
     probability = smooth_odds(odds, coarse, background, settings)
     raw = probability > 0.5
     away, mixture = find_mixtures(image, coarse, background)
@@ -144,16 +145,25 @@ def find_mixtures(
     image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], background: Background
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Returns the squared difference of each coarse pixel from the plate (mean over the channels), and a measure of how
-    much the pixel mixes subject and plate, as at strands of hair: the variance inside it relative to that
-    difference."""
-    half = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA).astype(
-        np.float32
-    )
-    square = cv2.resize(half * half, (coarse.shape[1], coarse.shape[0]), interpolation=cv2.INTER_AREA)
+    much the pixel mixes subject and plate, as at strands of hair: the variance of its quarters relative to that
+    difference. Quarters they are in pictures of any size, so that the measure does not depend on it."""
+    size = coarse.shape[1::-1]
+    averaged = 2 * size[0] < image.shape[1]
+    quarters = _quarters(image, (2 * size[0], 2 * size[1]))
+    square = cv2.resize(quarters * quarters, size, interpolation=cv2.INTER_AREA)
     third = CHANNEL_SUM / 3
-    within = np.maximum((square - coarse**2) @ third - (background.noise @ third / 2) ** 2, 0.0)
+    sigma = background.noise @ third * min(2 * size[0] / image.shape[1], 1.0)
+    within = np.maximum((square - coarse**2) @ third - sigma**2, 0.0)
     away = ((coarse - background.coarse) ** 2) @ third
-    return away, within / (MIXED**2 * away + 1e-6)
+    least = MIXED if averaged else MIXED_SINGLE
+    return away, within / (least**2 * away + 1e-6)
+
+
+def _quarters(image: UInt8[np.ndarray, "_ _ 3"], size: tuple[int, int]) -> Float32[np.ndarray, "_ _ 3"]:
+    """Returns the quarters of coarse pixels, an image of ``size`` (width, height): means over areas or, if the image is
+    smaller than that, interpolated."""
+    method = cv2.INTER_AREA if size[0] <= image.shape[1] else cv2.INTER_LINEAR
+    return cv2.resize(image, size, interpolation=method).astype(np.float32)
 
 
 def _against_plate(

@@ -25,6 +25,7 @@ from pipeline.segmentation.matting_kernels import MAX_ALPHA_INFORMATION, solve_a
 from pipeline.settings import SegmentationSettings
 from rig.colour_space import linear_from_srgb
 
+FULL_REDUCTION = 3  # pixels to a coarse one, for which the distances in pixels below were chosen
 INSIDE_PX = 3  # the subject's colour is taken this far inside the first contour: beyond the blur of an edge (3 sigma)
 
 
@@ -51,7 +52,8 @@ class Matte:
 
     alpha: Float32[np.ndarray, "hb wb"]
     box: tuple[slice, slice]  # rows and columns of the image; a margin without subject but at the image's own border
-    contrast: Float32[np.ndarray, " c"]  # |F - B| in standard deviations, at every pixel of the contour; 0 where the
+    contrast: Float32[np.ndarray, " c"]  # |F - B| in standard deviations, at every pixel of the contour; 0 where
+    # alpha was not solved beside it either
 
 
 def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings: SegmentationSettings) -> Matte:
@@ -63,7 +65,7 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     """
     background, mask, clear = decision.background, decision.mask, decision.clear
     probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))
-    band = int(np.ceil(settings.band_px / decision.reduction))
+    band = int(np.ceil(settings.band_px / max(decision.reduction, FULL_REDUCTION)))
     undecided = dilated(mask, 2) & ~eroded(mask, 2)
     undecided |= dilated(decision.mixed, 1) & dilated(mask, band) & ~eroded(mask, DEPTH * band)
     undecided &= clear | (dilated(mask, 1) & ~eroded(mask, 1))
@@ -78,11 +80,10 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     widths = (COARSE_ALPHA_SIGMA, SHADE)
     alpha, _, _ = solve_alpha(LINEAR, cropped, plates, light, sigma, zones, guess, paint, widths, True)
     alpha = cv2.GaussianBlur(alpha, (0, 0), settings.alpha_blur_px)
-    better = _subject_inside(cropped, alpha, paint)
+    better = _subject_inside(cropped, alpha, paint, decision.reduction)
     alpha, contrast, trust = solve_alpha(LINEAR, cropped, plates, light, sigma, zones, guess, better, widths, False)
     alpha = _smooth(alpha, trust, settings.alpha_blur_px)
-    unasked = dilated(contrast < 0, 1)
-    return Matte(alpha, box, np.where(unasked, np.float32(0), contrast)[np.abs(alpha - 0.5) < 0.25])
+    return Matte(alpha, box, _along_contour(contrast, alpha))
 
 
 def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int, ...]) -> tuple[slice, slice]:
@@ -119,14 +120,31 @@ def _light_outside(
 
 
 def _subject_inside(
-    image: UInt8[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"], coarse: Float32[np.ndarray, "hc wc 3"]
+    image: UInt8[np.ndarray, "h w 3"],
+    alpha: Float32[np.ndarray, "h w"],
+    coarse: Float32[np.ndarray, "hc wc 3"],
+    reduction: float,
 ) -> Float32[np.ndarray, "h2 w2 3"]:
-    """Returns the subject's colour near its contour, at half resolution, spread from solid pixels inside."""
-    half = (image.shape[1] // 2, image.shape[0] // 2)
-    inner = eroded(alpha > 0.5, INSIDE_PX) & (alpha > SOLID)
-    sure = cv2.resize(255 * inner.view(np.uint8), half, interpolation=cv2.INTER_AREA) == 255
-    colours = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
+    """Returns the subject's colour near its contour, at half resolution, spread from solid pixels inside. Of a picture
+    with less than ``FULL_REDUCTION`` pixels to a coarse one all distances shrink as the head does, and no pixel is
+    left out."""
+    share = min(reduction / FULL_REDUCTION, 1.0)
+    step = 2 if share == 1 else 1
+    size = (image.shape[1] // step, image.shape[0] // step)
+    inner = eroded(alpha > 0.5, max(2, int(np.ceil(INSIDE_PX * share)))) & (alpha > SOLID)
+    sure = cv2.resize(255 * inner.view(np.uint8), size, interpolation=cv2.INTER_AREA) == 255
+    colours = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     known = cv2.copyTo(cv2.cvtColor(colours, cv2.COLOR_RGB2RGBA), sure.view(np.uint8))  # 255 in the fourth channel
-    total = cv2.GaussianBlur(known.astype(np.float32), (0, 0), WINDOW_PX / 2)
-    found = cv2.cvtColor(total, cv2.COLOR_RGBA2RGB) + 0.02 * cv2.resize(coarse, half, interpolation=cv2.INTER_LINEAR)
+    total = cv2.GaussianBlur(known.astype(np.float32), (0, 0), WINDOW_PX * share / step)
+    found = cv2.cvtColor(total, cv2.COLOR_RGBA2RGB) + 0.02 * cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
     return found / cv2.cvtColor(total[:, :, 3] / 255 + np.float32(0.02), cv2.COLOR_GRAY2RGB)
+
+
+def _along_contour(
+    contrast: Float32[np.ndarray, "h w"], alpha: Float32[np.ndarray, "h w"]
+) -> Float32[np.ndarray, " c"]:
+    """Returns the contrast at every pixel of the contour: the pixel's own or, beside the band, its neighbours'; 0 where
+    they were not solved either."""
+    mask = alpha > 0.5
+    nearby = np.where(contrast < 0, cv2.dilate(contrast, np.ones((3, 3), np.uint8)), contrast)
+    return np.maximum(nearby, np.float32(0))[mask & ~eroded(mask, 1)]

@@ -1,4 +1,5 @@
-"""Finds soft shadows on the backdrop at the coarse level, which do not belong to the subject."""
+"""Finds soft shadows on the backdrop at the coarse level, and light that the subject reflects onto it. Neither belongs
+to the subject."""
 
 import cv2
 import numpy as np
@@ -10,6 +11,8 @@ from pipeline.settings import SegmentationSettings
 
 SHADOW_CHI2 = 11.3  # three channels, 99 %: what still counts as a darker piece of the plate
 STEEP = 0.03  # change of a shadow's depth a coarse pixel; blurred by 7 of them, as in the tests, a shadow has 0.016
+BRIGHTEST = 0.12  # share of the sRGB code that reflected light adds; 0.09 on the wall above an oily bald head
+REFLECTED_CHROMA = 0.3  # how far its colour may be from the plate's: it is the subject's
 SOFT_ONSET = 0.15  # depth of a shadow 2 coarse pixels before it is noticed by that 2 behind; at a sharp edge 0 to 0.06
 
 
@@ -21,15 +24,21 @@ def find_shadows(
     odds: Float32[np.ndarray, "h w"],
     settings: SegmentationSettings,
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Returns the chi-squared of each pixel against the plate in its best shade, and which pixels are soft shadows:
-    they differ from the plate, a darker shade explains them, and they begin gradually."""
+    """Returns the chi-squared of each pixel against the plate in its best shade, and which pixels are soft shadows or
+    reflected light: they differ from the plate, a darker or brighter shade explains them, and they begin gradually."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
-    depth = 1 - np.clip(ratio, settings.darkest_shadow, 1.0)
-    shaded = (1 - depth)[:, :, None] * plate
-    slack = variance + (settings.shadow_chroma * depth[:, :, None] * plate) ** 2
-    left = (((image - shaded) ** 2 / slack) @ CHANNEL_SUM).astype(np.float32)
-    candidate = (left < SHADOW_CHI2) & (depth > 0) & (odds > 0)
-    return left, _soft_shadows(candidate, depth.astype(np.float32), np.sqrt(chi2 / (2 * settings.evidence)))
+    strength = np.sqrt(chi2 / (2 * settings.evidence))
+    best, soft = chi2, np.zeros(odds.shape, bool)
+    for sign, most, chroma in (
+        (-1.0, 1 - settings.darkest_shadow, settings.shadow_chroma),
+        (1.0, BRIGHTEST, REFLECTED_CHROMA),
+    ):
+        depth = np.clip(sign * (ratio - 1), 0.0, most).astype(np.float32)
+        slack = variance + (chroma * depth[:, :, None] * plate) ** 2
+        left = (((image - (1 + sign * depth)[:, :, None] * plate) ** 2 / slack) @ CHANNEL_SUM).astype(np.float32)
+        found = _soft_shadows((left < SHADOW_CHI2) & (depth > 0) & (odds > 0), depth, strength)
+        best, soft = np.where(found, left, best), soft | found
+    return best, soft
 
 
 def _soft_shadows(

@@ -50,6 +50,7 @@ def errors(silhouette: Silhouette, truth: np.ndarray) -> tuple[float, np.ndarray
         pytest.param(Scene(drift=0.06), id="lamps drift"),
         pytest.param(Scene(shadow=0.35), id="soft shadow"),
         pytest.param(Scene(shadow=0.2), id="faint shadow"),
+        pytest.param(Scene(shadow=-0.2), id="reflected light"),
         pytest.param(Scene(plates=5), id="five plates"),
         pytest.param(Scene(backdrop=(0.8, 0.8, 0.8), pattern=0.1), id="white backdrop"),
         pytest.param(Scene(backdrop=(0.0, 0.0, 0.0), pattern=0.0), id="black velvet"),
