@@ -4,9 +4,9 @@ it, from its own shape and from patches that have no window bias.
 Where the two lie as far apart as their errors, the vertex moves to their weighted mean. Where they lie farther apart,
 the surroundings decide. If most of them agree with the head, the vertex is in a crater or on a speck (a chance match,
 the rest of a highlight), and moves to the head. If not, one of the two shows something else (hair, a fold that the head
-lacks, a wrong head), and the vertex stays. Where silhouettes hold the head, their word is enough: on an oily tip of the
-nose all windows err alike, and outlines show it in profile. What no view sees is skin, too, where seen skin encloses
-it: gaps of a few vertices would stand as pits.
+lacks, a wrong head), and the vertex stays. Where silhouettes hold the head, the two count as agreed, however far apart
+they lie: on an oily tip of the nose all windows err alike, and outlines show it in profile. What no view sees is skin,
+too, where seen skin encloses it: gaps of a few vertices would stand as pits.
 
 What the two differ by over whole neighbourhoods is no noise of the surface: the head has the wrong shape there. Where
 that is much of the skin, by what the head states about itself, the model cannot make this subject (a statue, say), its
@@ -92,10 +92,10 @@ def drawn_to_skin(
     agreement, shown = np.zeros(len(vertices)), np.zeros(len(vertices))
     agreement[candidates] = same * np.exp(-((hit.distances / same_mm[candidates]) ** 2))
     shown[candidates] = skin[candidates]
+    held = same * (head.outlined[head.mesh_world.faces[hit.triangles]] * hit.weights).sum(axis=1)
+    near, agreement[candidates] = agreement[candidates], np.maximum(agreement[candidates], held)
     around = mean_around(beside, agreement, shown)[candidates]
-    held = (head.outlined[head.mesh_world.faces[hit.triangles]] * hit.weights).sum(axis=1)
     consent = np.maximum(_ramp(around, CONSENT), held)
-    near = agreement[candidates]
     share = drawn[candidates] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
     apart_mm, compared = np.zeros(len(vertices)), np.zeros(len(vertices))
     apart_mm[candidates] = ((hit.points - vertices[candidates]) * hit.normals).sum(axis=1)
