@@ -7,7 +7,7 @@ tenths of a millimetre where they match. Elsewhere the dense points are used.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.rim import Views, pack_views
+from pipeline.detail.outline_points import corrected
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.depth_search import DEPTH_LEVEL, Round, find_places, pixels_per_mm, visibility_of
 from pipeline.photometric_fit.hair_mask import HairProbability, under_hair
@@ -24,7 +25,6 @@ from pipeline.photometric_fit.patches import Patches, arrays_of, make_patches
 from pipeline.photometric_fit.refine import RADIUS_WINDOWS
 from pipeline.settings import PhotoSettings
 from rig.camera import Camera
-from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh, vertex_normals
 from rig.rig import Rig
 
@@ -95,13 +95,8 @@ def patch_search(
         settings: thresholds.
     """
     views = pack_views(rig, dict(distances))
-    cameras = tuple(_moved(rig[name], fit.camera_shift.get(name, np.zeros(6))) for name in views.names)
+    cameras = tuple(corrected(rig[name], fit) for name in views.names)
     return PatchSearch(model, _patches(model), load_photographs(images, views), views, cameras, hair, settings)
-
-
-def _moved(camera: Camera, shift: Float[np.ndarray, " 6"]) -> Camera:
-    motion = RigidTransform(rotation_from_vector(shift[:3]), shift[3:])
-    return replace(camera, camera_from_world=motion @ camera.camera_from_world)
 
 
 @lru_cache(maxsize=1)  # studios work with one model

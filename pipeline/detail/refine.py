@@ -24,6 +24,7 @@ from pipeline.detail.ears import with_ears_in_place
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
 from pipeline.detail.folds import unfolded
 from pipeline.detail.nodes import NodeMesh, Nodes, solving_nodes
+from pipeline.detail.outline_points import Outlines, OutlineSearch
 from pipeline.detail.patch_points import PatchPlaces, PatchSearch
 from pipeline.detail.smooth_field import SmoothField, smooth_field
 from pipeline.detail.solve import (
@@ -84,6 +85,7 @@ class DeformedSurface:
     observed: Bool[np.ndarray, " v"]  # at a triangle that a point of skin showed
     closed_eyes: frozenset[str] = frozenset()  # of ``right`` and ``left``
     lids: Mapping[str, float] = field(default_factory=dict)  # how far each eye is closed, where the model blinks
+    outlined: Float[np.ndarray, " v"] | None = None  # how far silhouettes hold each vertex, 0 to 1; None: not compared
 
 
 @traced
@@ -97,6 +99,7 @@ def refine_to_surface(
     deviation_mm: Float[np.ndarray, " v"],
     eyes: Mapping[str, EyeEvidence] | None = None,
     patches: PatchSearch | None = None,
+    outlines: OutlineSearch | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
     """Deforms the fitted head to the measured surface.
@@ -112,6 +115,7 @@ def refine_to_surface(
         eyes: what photographs show between the lids (``measure_eye_appearance``); None keeps the lids as the model has
             them.
         patches: measures the deformed head once more with the photographs; None leaves that out.
+        outlines: compares the deformed head with the silhouettes; None leaves that out.
         report: called with the share that is done.
 
     Returns:
@@ -138,11 +142,13 @@ def refine_to_surface(
         settings,
         loose=regions["ears"] | regions["neck"],
         look=patches and patches.places,
+        outlines=outlines and outlines.observed,
         report=report,
     )
     clean, clean_deviation_mm = untangled_head(model, head.vertices, head.deviation_mm)
     observed = head.observed & (clean_deviation_mm < 2.0 * head.deviation_mm)  # what was moved farther is not as seen
-    return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids)
+    outlined = None if outlines is None else outlines.support(clean.vertices)
+    return DeformedSurface(clean.vertices, clean_deviation_mm, observed, closed | unexplained, lids, outlined)
 
 
 def deform_to_points(
@@ -155,6 +161,7 @@ def deform_to_points(
     *,
     loose: Bool[np.ndarray, " v"],
     look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
+    outlines: Outlines | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
     """Deforms a surface to measured points, where there are points near it.
@@ -168,6 +175,7 @@ def deform_to_points(
         settings: lengths and lower limits.
         loose: vertices that may be farther off than the others.
         look: measures the surface once more with the photographs; None leaves that out.
+        outlines: compares the surface with silhouettes; None leaves that out.
         report: called with the share that is done.
 
     Returns:
@@ -185,26 +193,38 @@ def deform_to_points(
         shown = observe(
             vertices, now, faces, few, loose, each=each, settings=settings, floor_mm=settings.coarse_floor_mm
         )
-        now = vertices + directions.moved(solve_field(field, directions, shown.observed).mean)
+        both = with_outlines(shown.observed, outlines, vertices, now, each.robust_mm)
+        now = vertices + directions.moved(solve_field(field, directions, both).mean)
     base = now = unfolded(vertices, now, faces)
     normals = vertex_normals(base, faces)
     field = _laid_out(nodes.fine, base, settings.length_mm)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
     report("fine", len(COARSE) / (len(COARSE) + 1))
     shown = observe(base, now, faces, many, loose, each=FINE, settings=settings, floor_mm=settings.floor_mm)
-    posterior = solve_field(field, directions, shown.observed)
+    posterior = solve_field(field, directions, with_outlines(shown.observed, outlines, base, now, FINE.robust_mm))
     now = base + directions.moved(posterior.mean)
     for robust_mm in LOOKS_MM:
         if look is None:
             break
         both = with_patches(shown.observed, look(now), base, now, faces, robust_mm)
-        posterior = solve_field(field, directions, both)
+        posterior = solve_field(field, directions, with_outlines(both, outlines, base, now, robust_mm))
         now = base + directions.moved(posterior.mean)
     seen = np.zeros(len(vertices), bool)
     seen[shown.corner] = True
     common_mm = np.hypot(settings.common_mm, settings.shared_error * typical_deviation(shown, faces, len(vertices)))
     deviation = field_deviation(posterior, base, normals, amplitude, seen, settings, common_mm=common_mm)
     return DeformedSurface(unfolded(base, now, faces), deviation, seen)
+
+
+def with_outlines(
+    observed: Observed,
+    outlines: Outlines | None,
+    base: Float[np.ndarray, "v 3"],
+    now: Float[np.ndarray, "v 3"],
+    robust_mm: float,
+) -> Observed:
+    """Returns the observations and those of the outlines, if there are any."""
+    return observed if outlines is None else observed.joined(outlines(base, now, robust_mm))
 
 
 def _laid_out(mesh: NodeMesh, vertices: Float[np.ndarray, "v 3"], length_mm: float) -> SmoothField:
@@ -279,13 +299,7 @@ def with_patches(
     at = interpolated(base[observed.corner], observed.blend)
     alone = nearest(PointTree.of(base[vertex]), at, within=PATCH_REACH_MM)[0] > PATCH_REACH_MM
     corner, blend = np.repeat(vertex[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
-    return Observed(
-        np.concatenate([observed.corner[alone], corner]),
-        np.concatenate([observed.blend[alone], blend]),
-        np.concatenate([observed.normal[alone], normals]),
-        np.concatenate([observed.offset_mm[alone], offset]),
-        np.concatenate([observed.information[alone], information]),
-    )
+    return observed.chosen(alone).joined(Observed(corner, blend, normals, offset, information))
 
 
 def typical_deviation(shown: Shown, faces: Int[np.ndarray, "f 3"], count: int) -> Float[np.ndarray, " v"]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse.linalg import SuperLU
 
 from pipeline.compute.trace import traced
@@ -31,6 +31,22 @@ class Observed:
     normal: Float[np.ndarray, "n 3"]  # unit
     offset_mm: Float[np.ndarray, " n"]  # along the normal, from the undisplaced head
     information: Float[np.ndarray, " n"]  # mm^-2, robust weight included
+
+    def chosen(self, rows: Bool[np.ndarray, " n"]) -> "Observed":
+        """Returns the observations of the chosen rows."""
+        return Observed(
+            self.corner[rows], self.blend[rows], self.normal[rows], self.offset_mm[rows], self.information[rows]
+        )
+
+    def joined(self, other: "Observed") -> "Observed":
+        """Returns both observations."""
+        return Observed(
+            np.concatenate([self.corner, other.corner]),
+            np.concatenate([self.blend, other.blend]),
+            np.concatenate([self.normal, other.normal]),
+            np.concatenate([self.offset_mm, other.offset_mm]),
+            np.concatenate([self.information, other.information]),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,8 +4,9 @@ it, from its own shape and from patches that have no window bias.
 Where the two lie as far apart as their errors, the vertex moves to their weighted mean. Where they lie farther apart,
 the surroundings decide. If most of them agree with the head, the vertex is in a crater or on a speck (a chance match,
 the rest of a highlight), and moves to the head. If not, one of the two shows something else (hair, a fold that the head
-lacks, a wrong head), and the vertex stays. What no view sees is skin, too, where seen skin encloses it: gaps of a few
-vertices would stand as pits.
+lacks, a wrong head), and the vertex stays. Where silhouettes hold the head, the two count as agreed, however far apart
+they lie: on an oily tip of the nose all windows err alike, and outlines show it in profile. What no view sees is skin,
+too, where seen skin encloses it: gaps of a few vertices would stand as pits.
 
 What the two differ by over whole neighbourhoods is no noise of the surface: the head has the wrong shape there. Where
 that is much of the skin, by what the head states about itself, the model cannot make this subject (a statue, say), its
@@ -47,14 +48,20 @@ class HeadSkin:
 
     mesh_world: Mesh  # mm
     deviation_mm: Float[np.ndarray, " v"]  # standard deviation of each vertex
+    outlined: Float[np.ndarray, " v"]  # how far silhouettes hold each vertex, 0 to 1
 
 
 def measured_skin(
-    head_world: Mesh, deviation_mm: Float[np.ndarray, " v"], measured: Bool[np.ndarray, " v"]
+    head_world: Mesh,
+    deviation_mm: Float[np.ndarray, " v"],
+    measured: Bool[np.ndarray, " v"],
+    outlined: Float[np.ndarray, " v"] | None = None,
 ) -> HeadSkin:
-    """Returns the head's triangles whose corners are all ``measured``."""
+    """Returns the head's triangles whose corners are all ``measured``. If ``outlined`` is None, no outline speaks for
+    the head."""
     faces = head_world.faces[measured[head_world.faces].all(axis=1)]
-    return HeadSkin(Mesh(head_world.vertices, faces), deviation_mm)
+    held = np.zeros(len(deviation_mm)) if outlined is None else outlined
+    return HeadSkin(Mesh(head_world.vertices, faces), deviation_mm, held)
 
 
 @traced
@@ -85,9 +92,10 @@ def drawn_to_skin(
     agreement, shown = np.zeros(len(vertices)), np.zeros(len(vertices))
     agreement[candidates] = same * np.exp(-((hit.distances / same_mm[candidates]) ** 2))
     shown[candidates] = skin[candidates]
+    held = same * (head.outlined[head.mesh_world.faces[hit.triangles]] * hit.weights).sum(axis=1)
+    near, agreement[candidates] = agreement[candidates], np.maximum(agreement[candidates], held)
     around = mean_around(beside, agreement, shown)[candidates]
-    consent = _ramp(around, CONSENT)
-    near = agreement[candidates]
+    consent = np.maximum(_ramp(around, CONSENT), held)
     share = drawn[candidates] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
     apart_mm, compared = np.zeros(len(vertices)), np.zeros(len(vertices))
     apart_mm[candidates] = ((hit.points - vertices[candidates]) * hit.normals).sum(axis=1)

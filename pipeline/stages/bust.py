@@ -77,7 +77,9 @@ def shape_bust(
     if fused is None:
         return Staged(None)
     displaced = refined.displaced
-    skin = None if displaced is None else measured_skin(refined.mesh_world, refined.deviation_mm, displaced.observed)
+    skin = None
+    if displaced is not None:
+        skin = measured_skin(refined.mesh_world, refined.deviation_mm, displaced.observed, displaced.outlined)
     return Staged(finished(fused, depth.votes, skin))
 
 

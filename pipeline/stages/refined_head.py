@@ -8,6 +8,7 @@ from jaxtyping import Float
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.detail.depth_bias import without_window_bias
 from pipeline.detail.eyelids import measure_eye_appearance
+from pipeline.detail.outline_points import outline_search
 from pipeline.detail.patch_points import patch_search
 from pipeline.detail.refine import DeformedSurface, refine_to_surface
 from pipeline.detail.surface_points import with_scaled_deviation
@@ -63,6 +64,7 @@ def refine_head(
         deviation_mm=deviation_mm,
         eyes=measure_eye_appearance(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),
         patches=patch_search(model, fit, depth.images, distances, hair, context.rig, settings=settings.photo),
+        outlines=outline_search(model, fit, distances, hair, context.rig),
         report=context.progress,
     )
     share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), settings.fine.least_share

@@ -75,6 +75,20 @@ def test_a_crater_and_a_speck_go_to_the_head_that_their_surroundings_agree_with(
     assert left.max() < 0.6
 
 
+def test_a_crater_as_wide_as_its_surroundings_goes_to_a_head_that_silhouettes_hold() -> None:
+    """An oily tip of the nose: windows err alike all over it, so that no surroundings agree with the head."""
+    head = ellipsoid(5)
+    wide = np.linalg.norm(head.vertices - head.vertices[0], axis=1) < 25.0
+    surface = Mesh(head.vertices - 2.5 * wide[:, None] * head.normals(), head.faces)
+    count = len(head.vertices)
+    middle = np.linalg.norm(head.vertices - head.vertices[0], axis=1) < 8.0
+    for outlined, deepest in ((None, 2.6), (middle.astype(float), 0.3)):
+        stated = measured_skin(head, np.full(count, 4.0), np.ones(count, bool), outlined)
+        drawn = drawn_to_skin(surface, np.ones(count), stated, sure(head))
+        left = ((head.vertices - drawn.vertices) * head.normals()).sum(axis=1)
+        assert deepest - 0.3 < left[0] < deepest
+
+
 def test_a_gap_that_no_view_sees_goes_to_the_head_where_seen_skin_encloses_it() -> None:
     """A pit of a few vertices; the unseen back of the head is no gap, and stays but at its rim."""
     head = ellipsoid(5)
