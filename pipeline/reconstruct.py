@@ -46,7 +46,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     depth = run(measure_depth, context, views, head, labels)
     with run.beside(fuse_depth, context, views, head.mesh_world, depth) as fused:
         refined = run(refine_head, context, views, faces, head, labels, depth)
-    with run.beside(shape_bust, context, depth, refined, fused.product) as surface:
+    with run.beside(shape_bust, context, views, depth, refined, fused.product) as surface:
         texturing = run(texture_head, context, views, head, refined, labels)
         pose = run(check_pose, context, faces, alignment, head, refined)
         evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences, without_crossings
+from pipeline.fusion.hair_outline import STRAND_SHARE, grown_to_outlines
 from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
 from pipeline.fusion.refinement import Measured, refine_vertices
@@ -109,24 +110,38 @@ def fuse(
 
 
 @traced
-def finished(surface: DepthSurface, votes: PartVotes | None, head: HeadSkin | None) -> BustSurface:
-    """Makes the surface agree with the head, removes self-intersections, and determines what it shows.
+def finished(
+    surface: DepthSurface,
+    votes: PartVotes | None,
+    head: HeadSkin | None,
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+) -> BustSurface:
+    """Makes the surface agree with the head and with the outlines of hair, removes self-intersections, and determines
+    what it shows.
 
     Args:
         surface: from the depth maps.
         votes: which part each point shows; None counts all that is seen as skin.
         head: the part of the fitted head that photographs measured; None if there is none.
+        silhouettes: by camera.
+        rig: the cameras as calibrated, world frame.
     """
     mesh, measured = surface.mesh_world, surface.measured
     seen = measured.views > 0
+    shares = None if votes is None else part_shares(votes, mesh.vertices)
+    shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
     if head is not None:
-        skin = 1.0 if votes is None else part_shares(votes, mesh.vertices)[:, Part.SKIN.channel]
+        skin = 1.0 if shares is None else shares[:, Part.SKIN.channel]
         mesh = drawn_to_skin(mesh, seen * skin, head, seen_deviation_mm(measured))
+    moved_mm = np.zeros(len(seen))
+    if shares is not None:
+        mesh, moved_mm = grown_to_outlines(mesh, shares[:, Part.HAIR.channel], silhouettes, rig)
     mesh, _ = without_crossings(mesh, surface.safe_world)
     mesh = without_coincidences(mesh)
-    shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
-    return BustSurface(mesh, deviation_mm(mesh, measured), part, measured.views, surface.warnings)
+    deviation = np.hypot(deviation_mm(mesh, measured), STRAND_SHARE * moved_mm)
+    return BustSurface(mesh, deviation, part, measured.views, surface.warnings)
 
 
 def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -> Iterator[ReportWarning]:

@@ -70,17 +70,17 @@ def fuse_depth(
 
 @stage("bust")
 def shape_bust(
-    context: ReconstructionContext, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
+    context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
 ) -> Staged[BustSurface | None]:
-    """Moves the fused surface to the delivered head where both show the same skin, and removes self-intersections.
-    Returns None for None."""
+    """Moves the fused surface to the delivered head where both show the same skin, and hair to its outlines, and
+    removes self-intersections. Returns None for None."""
     if fused is None:
         return Staged(None)
     displaced = refined.displaced
     skin = None
     if displaced is not None:
         skin = measured_skin(refined.mesh_world, refined.deviation_mm, displaced.observed, displaced.outlined)
-    return Staged(finished(fused, depth.votes, skin))
+    return Staged(finished(fused, depth.votes, skin, views.silhouettes, context.rig))
 
 
 @stage("bust")

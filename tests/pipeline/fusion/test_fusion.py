@@ -26,7 +26,7 @@ def fused(made: Scene, head: Mesh | None = None, settings: BustSettings = SPACIN
     surface = fuse(
         made.maps, made.silhouettes, made.rig, head, bias=WindowBias(), settings=settings, report=discard_progress
     )
-    return finished(surface, None, None)
+    return finished(surface, None, None, made.silhouettes, made.rig)
 
 
 def seen_errors(surface: BustSurface, made: Scene) -> np.ndarray:

@@ -1,0 +1,119 @@
+"""Moves the hair of the fused surface out to the silhouettes.
+
+Strands are thinner than a pixel and let through what lies behind them, so that windows match the dense core of the
+hair, millimetres deeper than the strands that a photograph shows. Outlines show how much is missing: where the surface
+turns away from a camera, its outline lies as far inside the silhouette. Between these rims the missing thickness is
+interpolated. Hair that has a surface, as a helmet has, reaches its outlines and stays as it is.
+"""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.compute.threads import map_in_threads
+from pipeline.compute.trace import traced
+from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.skin import mean_around
+from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.normals import normals_of
+from pipeline.geometry.raster import depth_map
+from pipeline.imaging.silhouette import Silhouette
+from rig.camera import Camera
+from rig.mesh import Mesh
+from rig.rig import Rig
+
+# Median thickness that hair lacks at its rims, from which on it counts as strands, and counts whole: 0.14 and 0.15 mm
+# of two captures of solid hair, 3.4 and 5.3 of two of strands.
+STRANDS_MM = (1.0, 2.0)
+SURELY = 0.5  # probability from which on a vertex of a rim counts as hair
+EVERY = 4  # pixel of a rim is measured
+RIM_PX = 0.5  # by which the pixels of a rim lie inside the outline
+FRAME_PX = 3  # from the border of a photograph, where the outline is the photograph's
+FARTHEST_MM = 30.0  # beyond that the outline is something else's
+# Of the rim's places about one, this quantile counts: single hairs stand out, and outlines follow them. With the
+# median, 64 % of a beard's strands lie within 2 mm, with this 73 %, with 0.2 77 %; of all hair 59, 59 and 58 %.
+ABOUT, QUANTILE = 24, 0.35
+NEAREST, EVEN_MM = 8, 8.0  # of them count at a vertex, and the distance within which they count alike
+MIN_PLACES = 2 * ABOUT  # for a measurement
+ROUNDS, SHARE = 2, 0.7  # the rim of what has been moved is another one: what is still missing is measured again
+STRAND_SHARE = 0.5  # standard deviation of a moved vertex, by its way: strands lie between core and outline
+
+
+@traced
+def grown_to_outlines(
+    mesh_world: Mesh, hair: Float[np.ndarray, " v"], silhouettes: Mapping[str, Silhouette], rig: Rig
+) -> tuple[Mesh, Float[np.ndarray, " v"]]:
+    """Moves the vertices of hair outwards to where the silhouettes show the hair to end.
+
+    Args:
+        mesh_world: the fused surface, closed, mm.
+        hair: probability that a vertex shows hair.
+        silhouettes: by camera.
+        rig: the cameras as calibrated, world frame.
+
+    Returns:
+        The moved mesh, and how far (mm) each vertex was moved.
+    """
+    sure = hair > SURELY
+    if not sure.any():
+        return mesh_world, np.zeros(len(hair))
+    places, missing_mm = rims(mesh_world, sure, silhouettes, rig)
+    trust = strands_share(missing_mm)
+    if trust == 0.0:
+        return mesh_world, np.zeros(len(hair))
+    mesh, beside = mesh_world, neighbours(mesh_world.faces, len(hair))
+    for round_ in range(ROUNDS):
+        if round_ > 0:
+            places, missing_mm = rims(mesh, sure, silhouettes, rig)
+        outwards = np.zeros(len(hair))
+        outwards[hair > 0.0] = missing_thickness(mesh.vertices[hair > 0.0], places, missing_mm)
+        way = (SHARE * trust * hair * outwards)[:, None] * normals_of(mesh)
+        smooth = [mean_around(beside, way[:, axis], np.ones(len(way))) for axis in range(3)]
+        mesh = Mesh(mesh.vertices + np.stack(smooth, axis=1), mesh.faces)
+    return mesh, np.linalg.norm(mesh.vertices - mesh_world.vertices, axis=1)
+
+
+def strands_share(missing_mm: Float[np.ndarray, " n"]) -> float:
+    """Returns how far hair counts as strands, 0 to 1, from the thickness that it lacks at its rims."""
+    if len(missing_mm) < MIN_PLACES:
+        return 0.0
+    return float(np.clip((np.median(missing_mm) - STRANDS_MM[0]) / (STRANDS_MM[1] - STRANDS_MM[0]), 0.0, 1.0))
+
+
+def rims(
+    mesh_world: Mesh, counts: Bool[np.ndarray, " v"], silhouettes: Mapping[str, Silhouette], rig: Rig
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Returns places (world, mm) where the surface turns away from a camera, and how far (mm) its outline there lies
+    inside the camera's silhouette; only at vertices that ``counts``."""
+
+    def seen_by(camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+        depth, face = depth_map(camera, mesh_world.vertices, mesh_world.faces)
+        solid = face >= 0
+        inner = cv2.erode(solid.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        rim = solid & ~inner
+        rim[:FRAME_PX], rim[-FRAME_PX:], rim[:, :FRAME_PX], rim[:, -FRAME_PX:] = False, False, False, False
+        at = np.flatnonzero(rim)[::EVERY]
+        vertex = mesh_world.faces[face.flat[at], 0]
+        apart_px = -silhouettes[camera.name].distance.flat[at] - RIM_PX
+        apart_mm = apart_px * depth.flat[at] / camera.intrinsics.fx
+        used = counts[vertex] & (np.abs(apart_mm) < FARTHEST_MM)
+        return mesh_world.vertices[vertex[used]], apart_mm[used].astype(float)
+
+    cameras = [camera for camera in rig.cameras if camera.name in silhouettes]
+    found = map_in_threads(lambda k: seen_by(cameras[k]), len(cameras))
+    return np.concatenate([places for places, _ in found]), np.concatenate([apart for _, apart in found])
+
+
+def missing_thickness(
+    vertices: Float[np.ndarray, "v 3"], places: Float[np.ndarray, "n 3"], missing_mm: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " v"]:
+    """Returns the thickness (mm) that is missing at each vertex: the mean of the nearest places', weighted by distance,
+    each of which has the ``QUANTILE`` of those about it, and at least 0."""
+    tree = PointTree.of(places)
+    around = nearest(tree, places, count=ABOUT)[1]
+    even_mm = np.maximum(np.quantile(missing_mm[around], QUANTILE, axis=1), 0.0)
+    far, near = nearest(tree, vertices, count=NEAREST)
+    weight = 1.0 / (far * far + EVEN_MM**2) ** 2
+    return (weight * even_mm[near]).sum(axis=1) / weight.sum(axis=1)
