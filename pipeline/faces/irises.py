@@ -26,9 +26,9 @@ from pipeline.faces.limbus_fit import (
     CENTRE_STD_MM,
     MIN_VIEWS,
     RADIUS_MM,
-    Circle,
-    Fit,
-    Sight,
+    EyeSight,
+    LimbusCircle,
+    LimbusFit,
     fitted,
 )
 from pipeline.faces.matching import MatchedFaces
@@ -160,7 +160,7 @@ def _moved(iris: Iris, step: Float[np.ndarray, " 7"], covariance: Float[np.ndarr
 class _Eye:
     """Holds the views of an eye, where its eyeball may lie, and what is up in its face."""
 
-    seen: Sequence[Sight]
+    seen: Sequence[EyeSight]
     eyeball: Float[np.ndarray, " 3"]
     up: Float[np.ndarray, " 3"]
 
@@ -174,16 +174,16 @@ def _eye(face: MatchedFaces, images: Mapping[str, ImageRgb], rig: Rig, side: str
             continue
         view = eye_view(rig[name], images[name], seen.lids_px[LIDS[side]])
         if view is not None:
-            views.append(Sight(name, view, seen.irises_px[IRISES[side]]))
+            views.append(EyeSight(name, view, seen.irises_px[IRISES[side]]))
     return _Eye(views, eyeball, axes[:, 1])
 
 
-def _first_fit(eye: _Eye, ahead: Float[np.ndarray, " 3"]) -> Fit | UnseenEye:
+def _first_fit(eye: _Eye, ahead: Float[np.ndarray, " 3"]) -> LimbusFit | UnseenEye:
     """Returns the limbus that an eye's views agree on, or why there is none."""
     if len(eye.seen) < MIN_VIEWS:
         return UnseenEye("few-views")
     centre = _nearest_to_rays(eye.seen, eye.eyeball + BEHIND_MM * ahead)
-    start = Circle(centre, _towards(centre - eye.eyeball, ahead), eye.up)
+    start = LimbusCircle(centre, _towards(centre - eye.eyeball, ahead), eye.up)
     facing = [sight for sight in eye.seen if start.faces(sight)]
     if len(facing) < MIN_VIEWS:
         return UnseenEye("few-views")
@@ -194,23 +194,23 @@ def _first_fit(eye: _Eye, ahead: Float[np.ndarray, " 3"]) -> Fit | UnseenEye:
     return max(fits, key=lambda fit: fit.agreement, default=UnseenEye("unclear"))
 
 
-def _large(circle: Circle, seen: Sequence[Sight]) -> list[Sight]:
+def _large(circle: LimbusCircle, seen: Sequence[EyeSight]) -> list[EyeSight]:
     return [sight for sight in seen if circle.radius_px(sight.view) >= MIN_RADIUS_PX]
 
 
-def _together(fits: Mapping[str, Fit | UnseenEye], eyes: Mapping[str, _Eye]) -> dict[str, Fit | UnseenEye]:
+def _together(fits: Mapping[str, LimbusFit | UnseenEye], eyes: Mapping[str, _Eye]) -> dict[str, LimbusFit | UnseenEye]:
     """Returns the fits once each was tried from where the other eye looks, and from where both look, if they differ."""
     out = dict(fits)
     for side, fit in fits.items():
         beside = next(
-            (other.circle.gaze for name, other in fits.items() if name != side and isinstance(other, Fit)), None
+            (other.circle.gaze for name, other in fits.items() if name != side and isinstance(other, LimbusFit)), None
         )
         if isinstance(fit, UnseenEye) or beside is None or fit.circle.gaze @ beside > np.cos(np.radians(ALIKE_DEG)):
             continue
         best = fit
         for gaze, lift in product((beside, fit.circle.gaze + beside), LIFTS_MM):
             centre = fit.circle.centre + lift * eyes[side].up
-            start = Circle(centre, gaze / np.linalg.norm(gaze), eyes[side].up)
+            start = LimbusCircle(centre, gaze / np.linalg.norm(gaze), eyes[side].up)
             again = fitted(_large(start, eyes[side].seen), start, eyes[side].eyeball, REACHES_AGAIN)
             if again is not None and again.agreement > MORE_AGREED * best.agreement:
                 best = again
@@ -218,7 +218,7 @@ def _together(fits: Mapping[str, Fit | UnseenEye], eyes: Mapping[str, _Eye]) -> 
     return out
 
 
-def _iris(fit: Fit, seen: Sequence[Sight]) -> Iris | UnseenEye:
+def _iris(fit: LimbusFit, seen: Sequence[EyeSight]) -> Iris | UnseenEye:
     """Returns a fit's iris, or that it is no iris."""
     circle = fit.circle
     rms = float(1.4826 * np.median(np.abs(fit.offsets)))
@@ -238,7 +238,7 @@ def _towards(gaze: Float[np.ndarray, " 3"], ahead: Float[np.ndarray, " 3"]) -> F
     return mixed / np.linalg.norm(mixed)
 
 
-def _nearest_to_rays(seen: Sequence[Sight], start: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def _nearest_to_rays(seen: Sequence[EyeSight], start: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     """Returns the place nearest to the rays through the network's irises, those far off it left aside; ``start`` to
     ``CENTRE_STD_MM``."""
     rays = np.concatenate([each.view.camera.rays_world(each.network_px[None]) for each in seen])

@@ -38,7 +38,7 @@ MAX_NETWORK_OFF = 0.6  # between a view's network and the circle's centre, by th
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class EyeSight:
     """Holds one view of an eye, and where the network puts the iris in it."""
 
     name: str
@@ -47,7 +47,7 @@ class Sight:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Circle:
+class LimbusCircle:
     """Holds a limbus (world, mm), and how far before it the pupil lies. ``up`` is the face's, so that the result does
     not depend on the world's axes."""
 
@@ -63,12 +63,12 @@ class Circle:
         across /= np.linalg.norm(across)
         return np.stack([across, np.cross(self.gaze, across)])
 
-    def after(self, step: Float[np.ndarray, " 7"]) -> "Circle":
+    def after(self, step: Float[np.ndarray, " 7"]) -> "LimbusCircle":
         """Returns the circle after a step: of the centre, of the gaze about ``axes``, of the radius, and of the
         pupil."""
         turn = rotation_from_vector(step[3:5] @ self.axes())
         radius, ahead = self.radius + float(step[5]), self.ahead + float(step[6])
-        return Circle(self.centre + step[:3], turn @ self.gaze, self.up, radius, ahead)
+        return LimbusCircle(self.centre + step[:3], turn @ self.gaze, self.up, radius, ahead)
 
     def on_axis(self, ahead: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "3 7"]]:
         """Returns a point on the axis before the centre, and its derivative by a step (which keeps ``ahead``)."""
@@ -82,19 +82,19 @@ class Circle:
         _, slopes = view.camera.project_with_jacobian(self.centre[None])
         return RADIUS_MM * float(np.linalg.svd(slopes[0], compute_uv=False)[0])
 
-    def faces(self, seen: Sight) -> bool:
+    def faces(self, seen: EyeSight) -> bool:
         """Tells whether an eye looks towards a view."""
         towards = seen.view.camera.centre_world - self.centre
         return bool(towards @ self.gaze > MIN_FACING * np.linalg.norm(towards))
 
-    def agrees(self, seen: Sight) -> bool:
+    def agrees(self, seen: EyeSight) -> bool:
         """Tells whether the network sees the iris where the circle is."""
         pixel = seen.view.camera.project(self.centre[None])[0]
         return bool(np.linalg.norm(pixel - seen.network_px) < MAX_NETWORK_OFF * self.radius_px(seen.view))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Edges:
+class LimbusEdges:
     """Holds how far beyond the circle a view has its edges (px), the derivatives of the circle's image along these rays
     by a step, weights, their deviation (px), and how many lie towards the subject's left and right."""
 
@@ -106,12 +106,12 @@ class Edges:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class LimbusFit:
     """Holds a circle, the inverse of its covariance (of a step), and the edges it was fitted to, by view."""
 
-    circle: Circle
+    circle: LimbusCircle
     information: Float[np.ndarray, "7 7"]
-    edges: Mapping[str, Edges]
+    edges: Mapping[str, LimbusEdges]
 
     @property
     def offsets(self) -> Float[np.ndarray, " n"]:
@@ -130,8 +130,8 @@ class Fit:
 
 
 def fitted(
-    seen: Sequence[Sight], circle: Circle, eyeball: Float[np.ndarray, " 3"], reaches: Sequence[float]
-) -> Fit | None:
+    seen: Sequence[EyeSight], circle: LimbusCircle, eyeball: Float[np.ndarray, " 3"], reaches: Sequence[float]
+) -> LimbusFit | None:
     """Returns the circle that views agree on, None where too few do.
 
     Args:
@@ -150,11 +150,11 @@ def fitted(
             pupils = _pupils(circle, about)
         matrix, right = _normal_equations(circle, edges, pupils or [], eyeball)
         circle = circle.after(np.linalg.solve(matrix, right))
-        out = Fit(circle, matrix, edges)
+        out = LimbusFit(circle, matrix, edges)
     return out
 
 
-def _edges(circle: Circle, view: EyeView, reach: float) -> Edges | None:
+def _edges(circle: LimbusCircle, view: EyeView, reach: float) -> LimbusEdges | None:
     """Returns the edges of a limbus in a view, None where there are too few."""
     angles = np.arange(RAYS) * 2.0 * np.pi / RAYS
     axes = circle.axes()
@@ -178,7 +178,7 @@ def _edges(circle: Circle, view: EyeView, reach: float) -> Edges | None:
     columns += [np.einsum("ni,ni->n", by_point, spokes[there])[:, None], np.zeros((len(by_point), 1))]
     found = offsets[there]
     noise = max(1.4826 * float(np.median(np.abs(found))), MIN_NOISE_PX)
-    return Edges(found, np.concatenate(columns, axis=1), _end_weights(there)[there], noise, sides)
+    return LimbusEdges(found, np.concatenate(columns, axis=1), _end_weights(there)[there], noise, sides)
 
 
 def _end_weights(there: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -188,7 +188,7 @@ def _end_weights(there: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return np.where(innermost, 1.0, np.where(inner, ENDS[1], ENDS[0]))
 
 
-def _pupils(circle: Circle, seen: Sequence[Sight]) -> list[tuple[EyeView, Float[np.ndarray, " 2"]]]:
+def _pupils(circle: LimbusCircle, seen: Sequence[EyeSight]) -> list[tuple[EyeView, Float[np.ndarray, " 2"]]]:
     """Returns the views that show the pupil, and where."""
     centre, _ = circle.on_axis(AHEAD_MM)
     found = pupils_px([sight.view for sight in seen], centre, circle.axes())
@@ -196,8 +196,8 @@ def _pupils(circle: Circle, seen: Sequence[Sight]) -> list[tuple[EyeView, Float[
 
 
 def _normal_equations(
-    circle: Circle,
-    edges: Mapping[str, Edges],
+    circle: LimbusCircle,
+    edges: Mapping[str, LimbusEdges],
     pupils: Sequence[tuple[EyeView, Float[np.ndarray, " 2"]]],
     eyeball: Float[np.ndarray, " 3"],
 ) -> tuple[Float[np.ndarray, "7 7"], Float[np.ndarray, " 7"]]:
