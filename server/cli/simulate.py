@@ -78,11 +78,11 @@ def simulate(
     chosen |= {"rolling_ms": rolling_ms, "hair": not no_hair, "polarised": polarised}
     chosen["hairstyle"] = tuple(hair.split(",")) if hair else ()
     preset = _studio_preset(realism, **chosen)
-    if gaze is not None and (serve or not max(map(abs, gaze)) <= MAX_GAZE_DEG):
-        raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees, and not with --serve", param_hint="--gaze")
+    if gaze is not None and not max(map(abs, gaze)) <= MAX_GAZE_DEG:
+        raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees", param_hint="--gaze")
     if serve:
         _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
-                      faults=fault or [], expression=expression or [])  # fmt: skip
+                      faults=fault or [], expression=expression or [], gaze_deg=gaze)  # fmt: skip
         return
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")

@@ -59,6 +59,12 @@ def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression
     return Subject(read_mesh(path), {} if marks is None else read_landmarks(marks), name=path.name)
 
 
+def turn_eyes(subject: Subject, gaze_deg: tuple[float, float] | None, seed: int) -> Subject:
+    """Returns a subject with eyeballs that look along ``gaze_deg`` (azimuth and elevation), their colour drawn by
+    ``seed``; the subject as it is where that is None. Raises InputError for a head without landmarks."""
+    return subject if gaze_deg is None else with_gaze(subject, *gaze_deg, np.random.default_rng((seed, 1)))
+
+
 def simulate_folder(
     out: Path, *, subject: str, seed: int, preset: Preset, faults: list[str], renderer: Renderer,
     expression: Sequence[str] = (), gaze_deg: tuple[float, float] | None = None,
@@ -66,9 +72,7 @@ def simulate_folder(
     """Simulates a capture and writes it to the folder ``out``, as ``eigenhead simulate`` does. ``gaze_deg``: azimuth
     and elevation of eyeballs, which replace painted eyes. Returns the folder of the true head."""
     rng = np.random.default_rng(seed)
-    chosen = subject_of(subject, load_model(), rng, expression)
-    if gaze_deg is not None:
-        chosen = with_gaze(chosen, *gaze_deg, np.random.default_rng((seed, 1)))
+    chosen = turn_eyes(subject_of(subject, load_model(), rng, expression), gaze_deg, seed)
     planted = tuple(fault_from_text(text) for text in faults)
     taken = simulate(chosen, default_layout(), preset, rng, renderer=renderer, faults=planted)
     return simulate_to_folder(out, taken, seed=seed)

@@ -1,5 +1,6 @@
 """The rig's commands against the studio that ``eigenhead simulate --serve`` keeps running, as operators type them."""
 
+import json
 import socket
 import subprocess
 import urllib.request
@@ -20,7 +21,7 @@ NAMES = tuple(f"cam{i:02}" for i in range(11))
 @pytest.mark.timeout(300)
 def test_a_served_studio_is_checked_captured_and_closed(tmp_path: Path) -> None:
     folder = tmp_path / "studio"
-    with served_studio(folder, "--seed", "3") as studio:
+    with served_studio(folder, "--seed", "3", "--gaze", "12", "-5") as studio:
         assert tuple(studio["cameras"]) == NAMES
         box = Path(studio["trigger"]["port"])
         assert str(box.readlink()) == studio["trigger"]["terminal"]
@@ -51,6 +52,8 @@ def test_a_served_studio_is_checked_captured_and_closed(tmp_path: Path) -> None:
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((host, int(port)), timeout=2.0)
     assert (tmp_path / "studio.truth" / "head.ply").is_file()
+    eyes = json.loads((tmp_path / "studio.truth" / "meta.json").read_text())["eyes_world"]
+    assert set(eyes) == {"right", "left"}
 
 
 def test_a_folder_of_somebody_elses_is_not_overwritten(tmp_path: Path) -> None:

@@ -2,9 +2,11 @@
 
 The mesh is ICT-FaceKit's own head, whose eyes are open, with the model's true shapes, on heads of its population. An
 eyeball's triangles that cross a lid are counted at rest and for each of Apple's shapes at half and at full weight, as
-the shapes come and once lids are lifted.
+the shapes come and once lids are lifted; then of eyes that look aside, up and down.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,7 @@ from pipeline.research.records import Records, key_of
 from pipeline.results.clay import clay
 from pipeline.templates import eyeballs as tested
 from pipeline.templates import pivots as placing
-from pipeline.templates.eyeballs import Eyeball, lifted, placed_eyeballs
+from pipeline.templates.eyeballs import AHEAD, Eyeball, lifted, placed_eyeballs
 from pipeline.templates.pivots import pivots
 from rig.geometry import Similarity
 from rig.mesh import Mesh
@@ -30,51 +32,61 @@ HEADS = 5
 OPEN_TRIANGLES = 22288  # of ICT-FaceKit's face and head; what follows in the model closes eyes and mouth
 ABOUT_MM = 22.0  # of an eyeball's centre, in which lids are looked at
 FACE = (np.array([-75.0, -20.0, 40.0]), np.array([75.0, 70.0, 110.0]))  # head frame, mm
+TURNED_DEG = 15.0
+ASIDE: Mapping[str, tuple[float, float]] = {
+    "left": (1.0, 0.0),
+    "right": (-1.0, 0.0),
+    "up": (0.0, 1.0),
+    "down": (0.0, -1.0),
+}
+CROSSING = ("crossing_rest", "crossing_before", "crossing_after", "crossing_turned")
 SHOWN = ("eyeBlinkRight", "eyeBlinkLeft")
 
 
 def eyeballs(facekit: HeadModel, *, report: Progress, folder: Path | None = None) -> Outcome:
     """Returns ``crossing_rest``, ``crossing_before`` and ``crossing_after`` (triangles of eyeballs over all heads,
-    shapes and weights), and ``lift_worst_mm``."""
+    shapes and weights), ``crossing_turned`` (after, over all directions too, and at rest), and ``lift_worst_mm``."""
     records, rows = Records(folder, "eyeballs", key_of(facekit.sha256, tested, placing)), []
     for number in range(HEADS):
         report(f"head {number}", number / HEADS)
         rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
     report("done", 1.0)
-    figures = {
-        name: float(sum(float(row[name]) for row in rows))
-        for name in ("crossing_rest", "crossing_before", "crossing_after")
-    }
+    figures = {name: float(sum(float(row[name]) for row in rows)) for name in CROSSING}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
     pictures = {} if folder is None else {"eyes": _picture(facekit)}
     return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}
 
 
 def _row(model: HeadModel, number: int) -> Row:
-    vertices, faces, moves, eyes = _case(model, number)
-    counts, lift = np.zeros(3, int), 0.0
-    for move in moves.values():
-        free = lifted(vertices, faces, move, eyes)
-        lift = max(lift, float(np.linalg.norm(free - move, axis=1).max()))
-        for eyeball in eyes.values():
-            counts[1] += sum(_crossing(vertices + weight * move, faces, eyeball) for weight in (0.5, 1.0))
-            counts[2] += sum(_crossing(vertices + weight * free, faces, eyeball) for weight in (0.5, 1.0))
-    counts[0] = sum(_crossing(vertices, faces, eyeball) for eyeball in eyes.values())
+    head = open_head(model, number)
+    eyes = place(head)
+    before = sum(_crossings(head, eyes, move) for move in head.moves.values())
+    rest, after, lift = count_crossings(head, eyes)
+    turned = [count_crossings(head, place(head, gaze)) for gaze in map(turned_gaze, ASIDE)]
     return {
         "eyeballs": len(eyes),
-        "shapes": len(moves),
-        "crossing_rest": int(counts[0]),
-        "crossing_before": int(counts[1]),
-        "crossing_after": int(counts[2]),
-        "lift_mm": lift,
+        "shapes": len(head.moves),
+        "crossing_rest": rest,
+        "crossing_before": before,
+        "crossing_after": after,
+        "crossing_turned": sum(at_rest + moved for at_rest, moved, _ in turned),
+        "lift_mm": max(lift, *(most for _, _, most in turned)),
     }
 
 
-def _case(
-    model: HeadModel, number: int
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], dict[str, Float[np.ndarray, "v 3"]], dict[str, Eyeball]]:
-    """Returns a head of the model (the first is its mean) with open eyes, its shapes that move something, and its
-    eyeballs."""
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenHead:
+    """Holds a head with open eyes (head frame, mm): its shapes that move something, and the pivots of its eyes."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    moves: Mapping[str, Float[np.ndarray, "v 3"]]
+    landmarks: Mapping[str, Float[np.ndarray, " 3"]]
+    centres: Mapping[str, Float[np.ndarray, " 3"]]
+
+
+def open_head(model: HeadModel, number: int) -> OpenHead:
+    """Draws a head of the model; the first is its mean."""
     rng = np.random.default_rng((SEED, number))
     z = SPREAD * rng.standard_normal(len(model.modes)) if number else np.zeros(0)
     vertices, whole = model.vertices(z), model.levels["full"].faces
@@ -83,8 +95,38 @@ def _case(
     landmarks = {name: vertices[row] for name, row in model.landmarks.items()}
     found = pivots(landmarks, vertices, moves, [])
     centres = {name: found[name] for name in ("eye_right", "eye_left")}
-    faces = whole[:OPEN_TRIANGLES]
-    return vertices, faces, moves, placed_eyeballs(vertices, faces, landmarks, centres)
+    return OpenHead(vertices, whole[:OPEN_TRIANGLES], moves, landmarks, centres)
+
+
+def turned_gaze(direction: str) -> Float[np.ndarray, " 3"]:
+    """Returns where eyes look that are turned by ``TURNED_DEG``."""
+    across, up = np.sin(np.radians(TURNED_DEG)) * np.array(ASIDE[direction])
+    return np.array([across, up, np.cos(np.radians(TURNED_DEG))])
+
+
+def place(head: OpenHead, gaze: Float[np.ndarray, " 3"] = AHEAD) -> dict[str, Eyeball]:
+    """Returns the eyeballs of a head, both looking along ``gaze``."""
+    gazes = dict.fromkeys(head.centres, gaze)
+    return placed_eyeballs(head.vertices, head.faces, head.landmarks, head.centres, gazes)
+
+
+def count_crossings(head: OpenHead, eyes: Mapping[str, Eyeball]) -> tuple[int, int, float]:
+    """Returns how many triangles of eyeballs cross lids at rest, and over all shapes and weights once lids are lifted;
+    and the largest lift (mm)."""
+    crossing, lift = 0, 0.0
+    for move in head.moves.values():
+        free = lifted(head.vertices, head.faces, move, eyes)
+        lift = max(lift, float(np.linalg.norm(free - move, axis=1).max()))
+        crossing += _crossings(head, eyes, free)
+    return sum(_crossing(head.vertices, head.faces, eyeball) for eyeball in eyes.values()), crossing, lift
+
+
+def _crossings(head: OpenHead, eyes: Mapping[str, Eyeball], move: Float[np.ndarray, "v 3"]) -> int:
+    return sum(
+        _crossing(head.vertices + weight * move, head.faces, eyeball)
+        for eyeball in eyes.values()
+        for weight in (0.5, 1.0)
+    )
 
 
 def _crossing(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], eyeball: Eyeball) -> int:
@@ -99,13 +141,16 @@ def _picture(model: HeadModel) -> np.ndarray:
     """Draws the eyes of each head as clay: at rest, half and fully closed."""
     rows = []
     for number in range(HEADS):
-        vertices, faces, moves, eyes = _case(model, number)
-        blink = sum(lifted(vertices, faces, moves[name], eyes) for name in SHOWN)
-        rows.append(np.hstack([_drawn(vertices + weight * blink, faces, eyes) for weight in (0.0, 0.5, 1.0)]))
+        head = open_head(model, number)
+        eyes = place(head)
+        blink = sum(lifted(head.vertices, head.faces, head.moves[name], eyes) for name in SHOWN)
+        rows.append(np.hstack([_drawn(head.vertices + w * blink, head.faces, eyes) for w in (0.0, 0.5, 1.0)]))
     return np.vstack(rows)
 
 
-def _drawn(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], eyes: dict[str, Eyeball]) -> np.ndarray:
+def _drawn(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], eyes: Mapping[str, Eyeball]
+) -> np.ndarray:
     for ball in (eyeball.mesh() for eyeball in eyes.values()):
         faces = np.concatenate([faces, ball.faces + len(vertices)])
         vertices = np.concatenate([vertices, ball.vertices])
@@ -113,6 +158,6 @@ def _drawn(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], ey
 
 
 def _table(rows: list[Row]) -> str:
-    names = ("head", "eyeballs", "shapes", "crossing_rest", "crossing_before", "crossing_after")
+    names = ("head", "eyeballs", "shapes", *CROSSING)
     cells = [[*(row[name] for name in names), f"{row['lift_mm']:.2f}"] for row in rows]
     return markdown.table((*names, "largest lift, mm"), cells)

@@ -8,7 +8,8 @@ import pytest
 from jaxtyping import Float
 
 from pipeline.faces.detection import FaceDetection
-from pipeline.faces.irises import BEHIND_MM, EYEBALL_MM, Iris, UnseenEye, believed, find_irises, looking_together
+from pipeline.faces.irises import Iris, UnseenEye, believed, find_irises, looking_together
+from pipeline.faces.limbus_fit import BEHIND_MM, EYEBALL_MM
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS
 from rig.camera import Camera, Intrinsics
@@ -94,7 +95,9 @@ def angle_deg(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(one @ other, -1.0, 1.0))))
 
 
-@pytest.mark.parametrize("target", [(150.0, -60.0, 1100.0), (-300.0, 100.0, 900.0), (0.0, 0.0, 450.0)])
+@pytest.mark.parametrize(
+    "target", [(150.0, -60.0, 1100.0), (-300.0, 100.0, 900.0), (0.0, 0.0, 450.0), (650.0, -60.0, 1100.0)]
+)
 def test_irises_are_where_they_are_and_look_where_they_look(target: tuple[float, float, float]) -> None:
     rig = studio()
     face, images = scene(rig, target=np.array(target))

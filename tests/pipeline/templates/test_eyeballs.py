@@ -78,11 +78,13 @@ def test_a_ball_lies_right_behind_open_lids_and_where_an_eye_is_closed_there_is_
     assert placed_eyeballs(closed, whole, marks, CENTRES) == {}
 
 
-def test_a_lid_closes_over_the_ball_without_crossing_it() -> None:
+@pytest.mark.parametrize("gaze", [(0.0, 0.0), (0.26, 0.0), (-0.26, 0.0), (0.0, 0.26), (0.0, -0.26)])
+def test_a_lid_closes_over_the_ball_without_crossing_it(gaze: tuple[float, float]) -> None:
     vertices, faces, down, marks = lids(slit=True)
-    eyes = placed_eyeballs(vertices, faces, marks, CENTRES)
+    towards = np.array([*gaze, np.sqrt(1.0 - np.square(gaze).sum())])
+    eyes = placed_eyeballs(vertices, faces, marks, CENTRES, {"eye_left": towards})
     eyeball = eyes["eye_left"]
-    assert crossing(vertices + 0.5 * down, faces, eyeball) > 0
+    assert any(gaze) or crossing(vertices + 0.5 * down, faces, eyeball) > 0  # a cornea below the slit lies deeper
     free = lifted(vertices, faces, down, eyes)
     for weight in (0.0, 0.5, 1.0):
         assert crossing(vertices + weight * free, faces, eyeball) == 0

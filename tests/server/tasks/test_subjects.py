@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pipeline.model_building.correspondence.scans import write_landmarks
 from rig.formats.meshes.obj import obj_bytes
-from server.tasks.subjects import subject_of
+from rig.studio.scene.subject import Subject
+from server.tasks.subjects import subject_of, turn_eyes
 from tests.support.measured_heads import mannequin, marks, model
 
 
@@ -18,3 +20,12 @@ def test_landmarks_beside_a_mesh_come_with_it(tmp_path: Path) -> None:
     found = subject_of(str(path), model(), rng)
     np.testing.assert_allclose(found.landmarks["pronasale"], marks()["pronasale"], atol=1e-3)
     assert (found.name, len(found.landmarks)) == ("mannequin.obj", len(marks()))
+
+
+def test_eyes_look_where_they_are_asked_to_and_keep_their_colour() -> None:
+    head = Subject(mannequin(), marks())
+    assert turn_eyes(head, None, 5) is head
+    one, other = turn_eyes(head, (12.0, -5.0), 5).eyes, turn_eyes(head, (-8.0, 0.0), 5).eyes
+    towards = one["left"].gaze + one["right"].gaze
+    assert np.degrees(np.arctan2(towards[0], towards[2])) == pytest.approx(12.0, abs=0.1)
+    assert one["left"].iris == other["left"].iris
