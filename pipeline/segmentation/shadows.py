@@ -9,7 +9,7 @@ from pipeline.segmentation.background import CHANNEL_SUM
 from pipeline.settings import SegmentationSettings
 
 SHADOW_CHI2 = 11.3  # three channels, 99 %: what still counts as a darker piece of the plate
-BRIGHTEST_GLOW = 1.1  # of the plate: an oily crown threw 4 to 7 % on a wall 1 m behind it
+BRIGHTEST_GLOW = 1.1  # of the plate: oily skin threw 4 to 7 % on a wall
 STEEP = 0.03  # change of a shadow's depth a coarse pixel; blurred by 7 of them, as in the tests, a shadow has 0.016
 SOFT_ONSET = 0.15  # depth of a shadow 2 coarse pixels before it is noticed by that 2 behind; at a sharp edge 0 to 0.06
 
