@@ -102,7 +102,8 @@ def worse(capture: Capture, noise: float, exposure: float, jpeg: int | None) -> 
 
 
 def _packed(picture: np.ndarray, quality: int) -> np.ndarray:
-    return cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
+    data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.ascontiguousarray(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[:, :, ::-1])
 
 
 def _each(capture: Capture, change: Callable[[np.ndarray], np.ndarray]) -> Capture:
