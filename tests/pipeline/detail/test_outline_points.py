@@ -31,7 +31,7 @@ def search(hair: float = 0.0) -> OutlineSearch:
     outline_px = 2000.0 * TRUE_MM / np.sqrt(RANGE_MM**2 - TRUE_MM**2)
     distance = (np.hypot(column, row) - outline_px).astype(np.float32)
     vertices, faces, _ = subdivided_sphere()
-    views = pack_views(rig, dict.fromkeys(rig.names, distance))
+    views = pack_views(rig, {name: distance for name in rig.names})
     maps = {name: np.full((480, 640), hair, np.float32) for name in rig.names}
     return OutlineSearch(make_topology(faces, np.ones(len(vertices), bool)), views, maps)
 
