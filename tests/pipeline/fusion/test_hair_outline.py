@@ -14,7 +14,7 @@ OUTLINE_MM = 60.0
 
 @pytest.fixture(scope="module")
 def outlines() -> Scene:
-    return scene([Ellipsoid((0, 0, 0), (OUTLINE_MM,) * 3)], fan(400, 300))
+    return scene([Ellipsoid((0, 0, 0), (OUTLINE_MM, OUTLINE_MM, OUTLINE_MM))], fan(400, 300))
 
 
 def ball(radius_mm: float) -> Mesh:
