@@ -27,6 +27,7 @@ from rig.rig import Rig
 # Median thickness that hair lacks at its rims, from which on it counts as strands, and counts whole: 0.14 and 0.15 mm
 # of two captures of solid hair, 3.4 and 5.3 of two of strands.
 STRANDS_MM = (1.0, 2.0)
+FEW_VIEWS = 4  # tell solid hair, with which nothing else is to be done
 SURELY = 0.5  # probability from which on a vertex of a rim counts as hair
 EVERY = 4  # pixel of a rim is measured
 RIM_PX = 0.5  # by which the pixels of a rim lie inside the outline
@@ -50,23 +51,25 @@ def grown_to_outlines(
     Args:
         mesh_world: the fused surface, closed, mm.
         hair: probability that a vertex shows hair.
-        silhouettes: by camera.
+        silhouettes: by camera; those that are not usable are left out.
         rig: the cameras as calibrated, world frame.
 
     Returns:
         The moved mesh, and how far (mm) each vertex was moved.
     """
     sure = hair > SURELY
-    if not sure.any():
+    rig = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
+    if not sure.any() or not len(rig):
         return mesh_world, np.zeros(len(hair))
-    places, missing_mm = rims(mesh_world, sure, silhouettes, rig)
-    trust = strands_share(missing_mm)
+    few = rig.subset(rig.names[:: -(-len(rig) // FEW_VIEWS)])
+    trust = strands_share(rims(mesh_world, sure, silhouettes, few)[1])
     if trust == 0.0:
         return mesh_world, np.zeros(len(hair))
     mesh, beside = mesh_world, neighbours(mesh_world.faces, len(hair))
-    for round_ in range(ROUNDS):
-        if round_ > 0:
-            places, missing_mm = rims(mesh, sure, silhouettes, rig)
+    for _ in range(ROUNDS):
+        places, missing_mm = rims(mesh, sure, silhouettes, rig)
+        if len(places) < MIN_PLACES:
+            break
         outwards = np.zeros(len(hair))
         outwards[hair > 0.0] = missing_thickness(mesh.vertices[hair > 0.0], places, missing_mm)
         way = (SHARE * trust * hair * outwards)[:, None] * normals_of(mesh)
@@ -101,8 +104,7 @@ def rims(
         used = counts[vertex] & (np.abs(apart_mm) < FARTHEST_MM)
         return mesh_world.vertices[vertex[used]], apart_mm[used].astype(float)
 
-    cameras = [camera for camera in rig.cameras if camera.name in silhouettes]
-    found = map_in_threads(lambda k: seen_by(cameras[k]), len(cameras))
+    found = map_in_threads(lambda k: seen_by(rig.cameras[k]), len(rig))
     return np.concatenate([places for places, _ in found]), np.concatenate([apart for _, apart in found])
 
 

@@ -1,10 +1,13 @@
 """Hair is moved out to its outlines where windows matched its core, and nowhere else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 
 from pipeline.fusion.hair_outline import grown_to_outlines
+from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from rig.mesh import Mesh
 from tests.support.ellipsoid_depths import Ellipsoid, Scene, scene
 from tests.support.scenes import fan
@@ -58,6 +61,17 @@ def test_single_hairs_do_not_carry_the_surface_along(outlines: Scene) -> None:
     dented = Mesh(core.vertices * np.where(short, 44.0 / 56.0, 1.0)[:, None], core.faces)
     grown, _ = grown_to_outlines(dented, np.ones(len(core.vertices)), outlines.silhouettes, outlines.rig)
     assert np.median(radii(grown)[~short]) < OUTLINE_MM + 0.5
+
+
+def test_view_that_is_left_out_says_nothing(outlines: Scene) -> None:
+    core, name = ball(56.0), outlines.rig.names[1]
+    everywhere = silhouette_from_mask(np.ones_like(outlines.silhouettes[name].mask))
+    wrong = {**outlines.silhouettes, name: replace(everywhere, quality=ViewQuality(usable=False))}
+    without = {other: each for other, each in outlines.silhouettes.items() if other != name}
+    hair = np.ones(len(core.vertices))
+    grown, _ = grown_to_outlines(core, hair, wrong, outlines.rig)
+    expected, _ = grown_to_outlines(core, hair, without, outlines.rig)
+    np.testing.assert_array_equal(grown.vertices, expected.vertices)
 
 
 def test_head_without_hair_is_not_drawn(outlines: Scene) -> None:
