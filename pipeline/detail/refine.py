@@ -185,16 +185,9 @@ def deform_to_points(
     informative = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
     many = thinned(informative, settings.cell_mm)
     few = thinned(many, settings.coarse_cell_mm)
-    now = vertices
-    field = _laid_out(nodes.coarse, vertices, settings.coarse_length_mm)
-    directions = free_directions(nodes.coarse, nodes.coarse.shape @ amplitude)
-    for i, each in enumerate(COARSE):
-        report("fine", i / (len(COARSE) + 1))
-        shown = observe(
-            vertices, now, faces, few, loose, each=each, settings=settings, floor_mm=settings.coarse_floor_mm
-        )
-        both = with_outlines(shown.observed, outlines, vertices, now, each.robust_mm)
-        now = vertices + directions.moved(solve_field(field, directions, both).mean)
+    now = _coarsely_deformed(
+        vertices, amplitude, faces, nodes.coarse, few, settings, loose=loose, outlines=outlines, report=report
+    )
     base = now = unfolded(vertices, now, faces)
     normals = vertex_normals(base, faces)
     field = _laid_out(nodes.fine, base, settings.length_mm)
@@ -214,6 +207,32 @@ def deform_to_points(
     common_mm = np.hypot(settings.common_mm, settings.shared_error * typical_deviation(shown, faces, len(vertices)))
     deviation = field_deviation(posterior, base, normals, amplitude, seen, settings, common_mm=common_mm)
     return DeformedSurface(unfolded(base, now, faces), deviation, seen)
+
+
+def _coarsely_deformed(
+    vertices: Float[np.ndarray, "v 3"],
+    amplitude: Float[np.ndarray, " v"],
+    faces: Int[np.ndarray, "f 3"],
+    nodes: NodeMesh,
+    few: SurfacePoints,
+    settings: FineSettings,
+    *,
+    loose: Bool[np.ndarray, " v"],
+    outlines: Outlines | None,
+    report: Progress,
+) -> Float[np.ndarray, "v 3"]:
+    """Returns the vertices after the coarse rounds, which move them freely in space."""
+    now = vertices
+    field = _laid_out(nodes, vertices, settings.coarse_length_mm)
+    directions = free_directions(nodes, nodes.shape @ amplitude)
+    for i, each in enumerate(COARSE):
+        report("fine", i / (len(COARSE) + 1))
+        shown = observe(
+            vertices, now, faces, few, loose, each=each, settings=settings, floor_mm=settings.coarse_floor_mm
+        )
+        both = with_outlines(shown.observed, outlines, vertices, now, each.robust_mm)
+        now = vertices + directions.moved(solve_field(field, directions, both).mean)
+    return now
 
 
 def with_outlines(

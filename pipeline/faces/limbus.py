@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-from scipy.ndimage import gaussian_filter1d
 
 from rig.camera import Camera
 from rig.colour_space import linear_from_srgb
@@ -109,10 +108,10 @@ def limbus_offsets(
 
 def _averaged_along(slope: Float[np.ndarray, "n k"], valid: Bool[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     """Returns the mean slope of neighbouring rays that are valid, 0 where a ray itself is not."""
-    total, weight = (
-        gaussian_filter1d(values, ALONG_RAYS, axis=0, mode="wrap", truncate=3.0)
-        for values in (np.where(valid, slope, 0.0), valid.astype(float))
-    )
+    apart = np.abs(np.arange(len(slope)) - np.arange(len(slope))[:, None])
+    near = np.minimum(apart, len(slope) - apart)  # the rays go round
+    share = np.where(near <= 3 * ALONG_RAYS, np.exp(-0.5 * (near / ALONG_RAYS) ** 2), 0.0)
+    total, weight = share @ np.where(valid, slope, 0.0), share @ valid.astype(float)
     return np.where(valid, total / np.maximum(weight, 1e-9), 0.0)
 
 

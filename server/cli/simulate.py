@@ -81,8 +81,11 @@ def simulate(
     if gaze is not None and not max(map(abs, gaze)) <= MAX_GAZE_DEG:
         raise typer.BadParameter(f"at most {MAX_GAZE_DEG} degrees", param_hint="--gaze")
     if serve:
-        _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=subject, seed=seed, preset=preset,
-                      faults=fault or [], expression=expression or [], gaze_deg=gaze)  # fmt: skip
+        from server.tasks.subjects import SubjectChoice
+
+        seated = SubjectChoice(subject, expression or [], gaze)
+        _serve_studio(out or Path("studio"), json_out, port=port, fps=fps, subject=seated, seed=seed, preset=preset,
+                      faults=fault or [])  # fmt: skip
         return
     if out is None:
         raise typer.BadParameter("say where the capture goes, or --serve", param_hint="OUT")

@@ -20,7 +20,7 @@ from rig.studio.devices.serve import STUDIO, StudioDevices, device_fault_from_te
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, build_scene
 from rig.studio.sensor.preset import Preset
-from server.tasks.subjects import subject_of, turn_eyes
+from server.tasks.subjects import SubjectChoice
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +78,10 @@ class OpenStudio:
 def serve_studio(
     folder: Path,
     *,
-    subject: str,
+    subject: SubjectChoice,
     seed: int,
     preset: Preset,
     faults: Sequence[str],
-    expression: Sequence[str] = (),
-    gaze_deg: tuple[float, float] | None = None,
     fps: float,
     port: int,
     ready: Callable[[OpenStudio], None],
@@ -102,7 +100,7 @@ def serve_studio(
     rng = np.random.default_rng(seed)
     report("draw", 0.0)
     with Renderer.create() as renderer:
-        chosen = turn_eyes(subject_of(subject, load_model(), rng, expression), gaze_deg, seed)
+        chosen = subject.drawn(load_model(), seed, rng)
         scene = build_scene(chosen, default_layout(), preset, rng.spawn(1)[0], renderer=renderer)
     truth = folder.with_name(folder.name + ".truth")
     write_truth(truth, SimulatedCapture(Capture({}), scene.rig, scene, ()), seed=seed)

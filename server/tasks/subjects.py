@@ -1,6 +1,7 @@
 """Makes subjects of the simulated studio, and capture folders that show them."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -59,6 +60,20 @@ def subject_of(text: str, model: HeadModel, rng: np.random.Generator, expression
     return Subject(read_mesh(path), {} if marks is None else read_landmarks(marks), name=path.name)
 
 
+@dataclass(frozen=True, slots=True)
+class SubjectChoice:
+    """Says who sits in the studio: the text and the expression that ``subject_of`` reads, and where the eyes look
+    (azimuth and elevation), None for the model's own eyes."""
+
+    text: str
+    expression: Sequence[str] = ()
+    gaze_deg: tuple[float, float] | None = None
+
+    def drawn(self, model: HeadModel, seed: int, rng: np.random.Generator) -> Subject:
+        """Makes the subject as ``subject_of`` and ``turn_eyes`` do, with their errors."""
+        return turn_eyes(subject_of(self.text, model, rng, self.expression), self.gaze_deg, seed)
+
+
 def turn_eyes(subject: Subject, gaze_deg: tuple[float, float] | None, seed: int) -> Subject:
     """Returns a subject with eyeballs that look along ``gaze_deg`` (azimuth and elevation), their colour drawn by
     ``seed``; the subject as it is where that is None. Raises InputError for a head without landmarks."""
@@ -72,7 +87,7 @@ def simulate_folder(
     """Simulates a capture and writes it to the folder ``out``, as ``eigenhead simulate`` does. ``gaze_deg``: azimuth
     and elevation of eyeballs, which replace painted eyes. Returns the folder of the true head."""
     rng = np.random.default_rng(seed)
-    chosen = turn_eyes(subject_of(subject, load_model(), rng, expression), gaze_deg, seed)
+    chosen = SubjectChoice(subject, expression, gaze_deg).drawn(load_model(), seed, rng)
     planted = tuple(fault_from_text(text) for text in faults)
     taken = simulate(chosen, default_layout(), preset, rng, renderer=renderer, faults=planted)
     return simulate_to_folder(out, taken, seed=seed)
