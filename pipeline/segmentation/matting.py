@@ -54,6 +54,7 @@ class Matte:
     box: tuple[slice, slice]  # rows and columns of the image; a margin without subject but at the image's own border
     contrast: Float32[np.ndarray, " c"]  # |F - B| in standard deviations, at every pixel of the contour; 0 where
     # alpha was not solved beside it either
+    unsure: float  # share of the contour that has little contrast, or lies beside what was not solved
 
 
 def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings: SegmentationSettings) -> Matte:
@@ -83,7 +84,9 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     better = _subject_inside(cropped, alpha, paint, decision.reduction)
     alpha, contrast, trust = solve_alpha(LINEAR, cropped, plates, light, sigma, zones, guess, better, widths, False)
     alpha = _smooth(alpha, trust, settings.alpha_blur_px)
-    return Matte(alpha, box, _along_contour(contrast, alpha))
+    unsolved = dilated(contrast < 0, 1) if decision.reduction >= FULL_REDUCTION else contrast < 0
+    little = (contrast < settings.weak_contrast) | unsolved
+    return Matte(alpha, box, _along_contour(contrast, alpha), _share_of_edge(little, alpha))
 
 
 def _pixels(cells: tuple[slice, slice], coarse: tuple[int, ...], fine: tuple[int, ...]) -> tuple[slice, slice]:
@@ -138,6 +141,12 @@ def _subject_inside(
     total = cv2.GaussianBlur(known.astype(np.float32), (0, 0), WINDOW_PX * share / step)
     found = cv2.cvtColor(total, cv2.COLOR_RGBA2RGB) + 0.02 * cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
     return found / cv2.cvtColor(total[:, :, 3] / 255 + np.float32(0.02), cv2.COLOR_GRAY2RGB)
+
+
+def _share_of_edge(there: Bool[np.ndarray, "h w"], alpha: Float32[np.ndarray, "h w"]) -> float:
+    """Returns the share of the pixels that the contour halves where something is ``there``; 0 without a contour."""
+    edge = np.abs(alpha - 0.5) < 0.25
+    return float(there[edge].mean()) if edge.any() else 0.0
 
 
 def _along_contour(

@@ -185,6 +185,8 @@ def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings
     alpha[matte.box], holes = _without_specks(matte.alpha, coarse[matte.box])
     distance = distance_to_level(alpha)
     weak = float((matte.contrast < settings.weak_contrast).mean()) if len(matte.contrast) else 1.0
+    # What lies beside the unsolved is right in four of five places: reason for a warning, not to leave the view out.
+    weak = max(weak, min(matte.unsure, settings.weak_share_unusable))
     contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
     others = sum(a for a in decision.detached_component_areas if a > STRANGER_SHARE)
     background = decision.background

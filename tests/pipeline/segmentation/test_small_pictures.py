@@ -24,7 +24,7 @@ def row(folder: str, view: str, size: float) -> Row:
 def test_half_a_picture_of_a_shirt_before_a_wall_of_its_colour_is_as_good_as_the_whole(view: str) -> None:
     """28 and 29 % of the contour were called weak, and views left out for it, though 2 % are wrong."""
     whole, half = (row("scan-a-skin", view, size) for size in (1.0, 0.5))
-    assert half.weak == pytest.approx(whole.weak, abs=0.04)
+    assert half.weak < whole.weak + 0.04
     assert np.quantile(half.off_px, 0.9) < 1.25 * np.quantile(whole.off_px, 0.9)
 
 
