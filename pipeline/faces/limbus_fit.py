@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from pipeline.faces.limbus import EyeView, limbus_offsets
 from pipeline.faces.pupils import pupils_px
@@ -28,7 +28,6 @@ CORNEA = np.array([0.656, 0.755])  # its normal at the limbus (7.8 mm of radius)
 MIN_SEEN = 0.25  # cosine between that and the view: the cornea hides, or bends, the limbus behind it
 MIN_VIEWS = 2
 MIN_RAYS = 6  # with an edge, of a view that counts
-MIN_SIDE, ASIDE = 8, 0.5  # of rays over all views on each side of an iris: one side alone tells little; a cosine
 ENDS = (0.2, 0.5)  # weights of an arc's last two rays: lids shade the white there and draw the edge inwards
 ROBUST_PX, MIN_NOISE_PX = 0.4, 0.15
 PUPIL_PX = 0.8  # deviation of a pupil in a view: highlights eat into it
@@ -96,13 +95,12 @@ class LimbusCircle:
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbusEdges:
     """Holds how far beyond the circle a view has its edges (px), the derivatives of the circle's image along these rays
-    by a step, weights, their deviation (px), and how many lie towards the subject's left and right."""
+    by a step, weights, and their deviation (px)."""
 
     offsets: Float[np.ndarray, " n"]
     slopes: Float[np.ndarray, "n 7"]
     weights: Float[np.ndarray, " n"]
     noise: float
-    sides: Int[np.ndarray, " 2"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,11 +120,6 @@ class LimbusFit:
     def agreement(self) -> float:
         """Returns how many edges speak for the circle."""
         return float((1.0 / (1.0 + (self.offsets / AGREED_PX) ** 2) ** 2).sum())
-
-    @property
-    def sides(self) -> Int[np.ndarray, " 2"]:
-        """Returns how many edges lie towards the subject's left and right."""
-        return np.sum([edges.sides for edges in self.edges.values()], axis=0)
 
 
 def fitted(
@@ -171,14 +164,13 @@ def _edges(circle: LimbusCircle, view: EyeView, reach: float) -> LimbusEdges | N
     there = np.isfinite(offsets) & (bulge @ towards > MIN_SEEN * np.linalg.norm(towards))
     if np.count_nonzero(there) < MIN_RAYS:
         return None
-    sides = np.array([np.count_nonzero(there & (sign * np.cos(angles) > ASIDE)) for sign in (1.0, -1.0)])
     by_point = np.einsum("ni,nij->nj", outwards, slopes)[there]
     turns = [np.cross(axis, circle.radius * spokes[there]) for axis in axes]
     columns = [by_point, *(np.einsum("ni,ni->n", by_point, turn)[:, None] for turn in turns)]
     columns += [np.einsum("ni,ni->n", by_point, spokes[there])[:, None], np.zeros((len(by_point), 1))]
     found = offsets[there]
     noise = max(1.4826 * float(np.median(np.abs(found))), MIN_NOISE_PX)
-    return LimbusEdges(found, np.concatenate(columns, axis=1), _end_weights(there)[there], noise, sides)
+    return LimbusEdges(found, np.concatenate(columns, axis=1), _end_weights(there)[there], noise)
 
 
 def _end_weights(there: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
