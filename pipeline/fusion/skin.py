@@ -1,12 +1,13 @@
 """Combines the fused surface with the fitted head where both show the same skin. The head is a second measurement of
 it, from its own shape and from patches that have no window bias.
 
-Where the two lie as far apart as their errors, the vertex moves to their weighted mean. Where they lie farther apart,
-the surroundings decide. If most of them agree with the head, the vertex is in a crater or on a speck (a chance match,
-the rest of a highlight), and moves to the head. If not, one of the two shows something else (hair, a fold that the head
-lacks, a wrong head), and the vertex stays. Where silhouettes hold the head, the two count as agreed, however far apart
-they lie: on an oily tip of the nose all windows err alike, and outlines show it in profile. What no view sees is skin,
-too, where seen skin encloses it: gaps of a few vertices would stand as pits.
+Where the two lie as far apart as their errors, the vertex moves to their weighted mean, in which noisy places of the
+surface count less. Where they lie farther apart, the surroundings decide. If most of them agree with the head, the
+vertex is in a crater or on a speck (a chance match, the rest of a highlight), and moves to the head. If not, one of the
+two shows something else (hair, a fold that the head lacks, a wrong head), and the vertex stays. Where silhouettes hold
+the head, the two count as agreed, however far apart they lie: on an oily tip of the nose all windows err alike, and
+outlines show it in profile. What no view sees is skin, too, where seen skin encloses it: gaps of a few vertices would
+stand as pits.
 
 What the two differ by over whole neighbourhoods is no noise of the surface: the head has the wrong shape there. Where
 that is much of the skin, by what the head states about itself, the model cannot make this subject (a statue, say), its
@@ -25,7 +26,9 @@ from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh
 
-HEAD_SHARE = 0.7  # of the mean: against the truth of two captures and two studio heads, better than 0.5 and 1
+# The head's share of the mean, where skin has texture: against the truth of two captures and two studio heads, better
+# than 0.5 and 1. The surface's share falls by its variance (inverse-variance weights) from this deviation on, in mm.
+HEAD_SHARE, TEXTURED_MM = 0.7, 0.12
 SAME_MM = 1.0  # distance at which agreement has fallen to 1 / e, at least ...
 # ... and so many of the deviations that the surface states about a place: 0.15 mm where skin has texture, where 1 mm
 # prevails, 0.39 at 512 x 384 with noise of 6 levels. Normals' p95 there: 32 degrees without it, 25 at 4, 23 at 6.
@@ -35,8 +38,9 @@ CONSENT = (0.5, 0.75)  # mean agreement of the surroundings from which on the he
 ENCLOSED = (0.5, 0.75)  # mean probability of seen skin around what no view sees, from which on that is skin, and surely
 # The upper quartile of the distances of the two over neighbourhoods, by the head's median deviation, up to which the
 # head counts whole and from which on it counts for nothing: 0.25 to 0.33 of scan-a, draw-b and scan-a's oily version,
-# 0.40 under a beard, 0.84 of the photographs of a Buddha, whose head the model cannot make.
-WRONG_SHAPE = (0.5, 0.75)
+# 0.40 under a beard, 0.54 of a studio head of oily skin, 0.84 of the photographs of a Buddha, whose head
+# the model cannot make.
+WRONG_SHAPE = (0.6, 0.8)
 QUARTILE, SURELY = 0.75, 0.5  # probability from which on a vertex counts as skin there
 FARTHEST = 4.0  # times as far nothing of that share is left
 CANDIDATES = 3  # triangles looked at for each vertex: twice as fast as six, off by more than 0.01 mm in one of 100
@@ -78,7 +82,8 @@ def drawn_to_skin(
     """
     vertices = mesh_world.vertices.copy()
     beside = neighbours(mesh_world.faces, len(vertices))
-    same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * mean_around(beside, deviation_mm, skin))
+    noise_mm = mean_around(beside, deviation_mm, skin)
+    same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * noise_mm)
     reach = FARTHEST * float(same_mm.max(initial=SAME_MM))
     low, high = head.mesh_world.vertices.min(axis=0) - reach, head.mesh_world.vertices.max(axis=0) + reach
     enclosed = _ramp(mean_around(beside, skin, np.ones(len(vertices))), ENCLOSED)
@@ -96,7 +101,8 @@ def drawn_to_skin(
     near, agreement[candidates] = agreement[candidates], np.maximum(agreement[candidates], held)
     around = mean_around(beside, agreement, shown)[candidates]
     consent = np.maximum(_ramp(around, CONSENT), held)
-    share = drawn[candidates] * same * np.maximum(HEAD_SHARE * near, consent * (1.0 - (1.0 - HEAD_SHARE) * near))
+    head_share = 1.0 - (1.0 - HEAD_SHARE) * (TEXTURED_MM / np.maximum(noise_mm[candidates], TEXTURED_MM)) ** 2
+    share = drawn[candidates] * same * np.maximum(head_share * near, consent * (1.0 - (1.0 - head_share) * near))
     apart_mm, compared = np.zeros(len(vertices)), np.zeros(len(vertices))
     apart_mm[candidates] = ((hit.points - vertices[candidates]) * hit.normals).sum(axis=1)
     compared[candidates] = skin[candidates] * same

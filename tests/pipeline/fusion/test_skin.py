@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from pipeline.fusion.skin import FARTHEST, HEAD_SHARE, SAME_MM, HeadSkin, drawn_to_skin, measured_skin
+from pipeline.fusion.skin import FARTHEST, HEAD_SHARE, SAME_MM, TEXTURED_MM, HeadSkin, drawn_to_skin, measured_skin
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
 
 
 def sure(mesh: Mesh) -> np.ndarray:
     """Deviations of good photographs."""
-    return np.full(len(mesh.vertices), 0.15)
+    return np.full(len(mesh.vertices), 0.1)
 
 
 def stating(head: Mesh, deviation_mm: float = 0.4) -> HeadSkin:
@@ -31,6 +31,16 @@ def test_skin_that_both_show_goes_to_their_weighted_mean(height_mm: float) -> No
     drawn = drawn_to_skin(surface, np.ones(len(surface.vertices)), stating(head), sure(head))
     left = ((drawn.vertices - head.vertices) * head.normals()).sum(axis=1)
     assert np.median(left) == pytest.approx((1.0 - HEAD_SHARE) * height_mm, rel=0.15)
+
+
+def test_a_noisy_surface_counts_by_its_variance() -> None:
+    """Twice the deviation of skin with texture: a fourth of the surface's share."""
+    head = ellipsoid(5)
+    surface = off_by(head, 0.1)
+    noisy = np.full(len(surface.vertices), 2.0 * TEXTURED_MM)
+    drawn = drawn_to_skin(surface, np.ones(len(surface.vertices)), stating(head), noisy)
+    left = ((drawn.vertices - head.vertices) * head.normals()).sum(axis=1)
+    assert np.median(left) == pytest.approx((1.0 - HEAD_SHARE) / 4.0 * 0.1, rel=0.2)
 
 
 @pytest.mark.parametrize(("stated_mm", "share"), [(0.5, 0.0), (4.0, 0.37)])
