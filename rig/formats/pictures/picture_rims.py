@@ -18,7 +18,7 @@ from rig.messages.message import Message, compose
 
 MAX_LEVEL = 4  # of 255 that an empty pixel is from black or white; the rest is JPEG's
 MIN_SHARE = 0.002  # of the picture: less is no rim
-MAX_SHARE = 0.9  # of the picture: more is a picture that is dark or burnt out; beside a fisheye's circle lies 0.6 at most
+MAX_SHARE = 0.9  # of the picture: more is one that is dark or burnt out; beside a fisheye's circle lies 0.6 at most
 SOFT_PX = 2  # where the edge of a rim is averaged with the picture
 
 
