@@ -33,7 +33,7 @@ def read_fields(kind: type[T], document: Any, where: str, faults: list[Message])
     hints = typing.get_type_hints(kind)
     for key in document:
         if key not in hints:
-            near = suggest(str(key), hints)
+            near = _sections_with(str(key), hints) or suggest(str(key), hints)
             shown = f"{where + str(key)!r:.80}"
             faults.append(
                 compose("setting-unknown-near", key=shown, near=f"{near[0]!r}")
@@ -42,6 +42,12 @@ def read_fields(kind: type[T], document: Any, where: str, faults: list[Message])
             )
     values = {key: _value(hints[key], document[key], where + key, faults) for key in hints if key in document}
     return kind(**{key: value for key, value in values.items() if value is not ...})
+
+
+def _sections_with(key: str, hints: Mapping[str, Any]) -> list[str]:
+    """Returns ``section.key`` for each table in a table that has the key."""
+    tables = {name: dataclasses.fields(hint) for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
+    return [f"{name}.{key}" for name, fields in tables.items() if key in (field.name for field in fields)]
 
 
 def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:

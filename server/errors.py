@@ -5,11 +5,14 @@ line or by a worker.
 ``server.wire.problems`` gives each class its HTTP status.
 """
 
+import errno
 from collections.abc import Iterable
 
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, compose, message_of
 from server.problem_types import type_of_input
+
+UNWRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 class Refused(EigenheadError):
@@ -75,6 +78,14 @@ class DiskFull(Refused):
 
     def __init__(self) -> None:
         super().__init__("disk-full", compose("service-disk-full"))
+
+
+class DataUnwritable(Unavailable):
+    """Refuses what would be stored while the data folder cannot be written: mounted read-only after an error of the
+    disk, say, or another user's."""
+
+    def __init__(self) -> None:
+        super().__init__("data-unwritable", compose("service-data-unwritable"))
 
 
 def unusable_input(error: InputError) -> InvalidInput:

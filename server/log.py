@@ -86,12 +86,13 @@ def set_up(as_json: bool, level: str = "info", jobs: Path | None = None) -> None
 
 
 def is_no_known_failure(record: logging.LogRecord) -> bool:
-    """Returns False for a log record with the traceback of a job that failed for a known reason or was cancelled, True
-    for all others."""
+    """Returns False for a log record with the traceback of a job that failed for a known reason or was cancelled, or of
+    a webhook that did not answer, which is said in a line of its own; True for all others."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return True
-    from dbos import error as dbos_error  # 2 s, and a process that logs such a line has it
+    import httpx  # 2 s for both, and a process that logs such a line has them
+    from dbos import error as dbos_error
 
     cancelled = (dbos_error.DBOSWorkflowCancelledError, dbos_error.DBOSAwaitedWorkflowCancelledError)
-    return not isinstance(error, (EigenheadError, *cancelled))
+    return not isinstance(error, (EigenheadError, httpx.HTTPError, *cancelled))

@@ -18,6 +18,7 @@ PROBLEM_TYPES = {
     "capture-in-use": "Capture in use",
     "capture-missing": "Capture missing",
     "consent-missing": "Consent missing",
+    "data-unwritable": "Data unwritable",
     "database-unavailable": "Database unavailable",
     "deliveries-off": "Deliveries off",
     "delivery-active": "Delivery active",

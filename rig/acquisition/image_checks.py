@@ -45,12 +45,16 @@ class Registration:
 
     ``patches``: number of textured patches of the plate; ``found``: share of them that are found in the picture, all
     moved by one similarity; ``moved_px``: the farthest that this similarity moves a corner of the image, 0 where
-    nothing was found.
+    nothing was found; ``moved_sd_px``: its standard deviation, from how well the patches agree; ``in_place``: share of
+    patches that look alike where they were, which soft light on a plain wall does although nothing there can be
+    placed.
     """
 
     patches: int
     found: float
     moved_px: float
+    moved_sd_px: float = 0.0
+    in_place: float = 0.0
 
     @property
     def conclusive(self) -> bool:
@@ -133,16 +137,21 @@ def register(image: ImageRgb, plate: ImageRgb) -> Registration:
     here, there = _working(plate, factor), _working(image, factor)
     points = _textured_points(here)
     moved = [(point, place) for point in points if (place := _find(here, there, point)) is not None]
+    in_place = sum(_is_alike(here, there, point) for point in points) / max(len(points), 1)
+    nothing = Registration(len(points), 0.0, 0.0, in_place=in_place)
     if len(points) < _PATCHES_LEAST or len(moved) < 3:
-        return Registration(len(points), 0.0, 0.0)
+        return nothing
     source, target = (np.asarray(side, np.float64) for side in zip(*moved, strict=True))
     similarity, agree = cv2.estimateAffinePartial2D(source, target, ransacReprojThreshold=_AGREE_PX, maxIters=500)
     if similarity is None or agree is None or int(agree.sum()) < 3:
-        return Registration(len(points), 0.0, 0.0)
+        return nothing
     moved_px = _largest_move(similarity, here.shape)
     if abs(np.hypot(similarity[0, 0], similarity[1, 0]) - 1) > _SCALE_MOST or moved_px > 2 * _REACH_PX:
-        return Registration(len(points), 0.0, 0.0)  # no camera can move like this: the patches agree by chance
-    return Registration(len(points), float(agree.sum()) / len(points), moved_px / factor)
+        return nothing  # no camera can move like this: the patches agree by chance
+    kept = agree.ravel() > 0
+    moved_sd_px = _corner_deviation(similarity, source[kept], target[kept], here.shape)
+    found = float(kept.sum()) / len(points)
+    return Registration(len(points), found, moved_px / factor, moved_sd_px / factor, in_place)
 
 
 def _block_variance(after: ImageRgb, before: ImageRgb) -> float:
@@ -195,6 +204,12 @@ def _find(here: Grey, there: Grey, point: tuple[int, int]) -> tuple[float, float
     )
 
 
+def _is_alike(here: Grey, there: Grey, point: tuple[int, int]) -> bool:
+    (x, y), half = point, _PATCH_PX // 2
+    window = slice(y - half, y + half + 1), slice(x - half, x + half + 1)
+    return bool(cv2.matchTemplate(there[window], here[window], cv2.TM_CCOEFF_NORMED)[0, 0] >= _ALIKE)
+
+
 def _peak(values: Float[np.ndarray, " n"], at: int) -> float:
     """Returns how far the peak lies from the highest value, in samples; 0 at the ends."""
     if not 0 < at < len(values) - 1:
@@ -204,8 +219,31 @@ def _peak(values: Float[np.ndarray, " n"], at: int) -> float:
     return 0.0 if curvature >= 0 else max(-0.5, min(0.5, vertex_offset(left, right, curvature)))
 
 
-def _largest_move(similarity: Float[np.ndarray, "2 3"], shape: tuple[int, ...]) -> float:
+def _corners(shape: tuple[int, ...]) -> Float[np.ndarray, "4 2"]:
     height, width = shape[:2]
-    corners = np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], float)
+    return np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], float)
+
+
+def _corner_deviation(
+    similarity: Float[np.ndarray, "2 3"],
+    source: Float[np.ndarray, "n 2"],
+    target: Float[np.ndarray, "n 2"],
+    shape: tuple[int, ...],
+) -> float:
+    """Returns the standard deviation (px) of the corner that a similarity fitted to points places worst.
+
+    With x - mean as a complex number, a similarity is a factor and a shift; their variances are sigma^2 over the sum
+    of |x - mean|^2 and over n.
+    """
+    residuals = target - source @ similarity[:, :2].T - similarity[:, 2]
+    variance = float((residuals**2).sum()) / (2 * len(source) - 4)  # per coordinate, four parameters
+    centre = source.mean(axis=0)
+    spread2 = float(((source - centre) ** 2).sum())
+    reach2 = float(((_corners(shape) - centre) ** 2).sum(axis=1).max())
+    return float(np.sqrt(2 * variance * (1 / len(source) + reach2 / spread2)))
+
+
+def _largest_move(similarity: Float[np.ndarray, "2 3"], shape: tuple[int, ...]) -> float:
+    corners = _corners(shape)
     moved = corners @ similarity[:, :2].T + similarity[:, 2]
     return float(np.linalg.norm(moved - corners, axis=1).max())

@@ -123,8 +123,9 @@ def reconstruct(
     ] = None,
     surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
     formats: Formats = None,
-    delight: Annotated[
-        bool, typer.Option("--delight", help="Also texture/albedo.png: the texture with its light taken off.")
+    albedo: Annotated[
+        bool,
+        typer.Option("--albedo", "--delight", help="Also texture/albedo.png: the texture with its light taken off."),
     ] = False,
     cap: CapColour = None,
     cap_thickness: CapThickness = None,
@@ -150,7 +151,7 @@ def reconstruct(
     from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
-    switches = {"obj": obj, "atlas": atlas, "delight": delight, "normal_map": normal_map}
+    switches = {"obj": obj, "atlas": atlas, "delight": albedo, "normal_map": normal_map}
     switches |= {"neutral": neutral, "morphs": morphs, "slicer": slicer}
     outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}

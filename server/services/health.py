@@ -54,6 +54,8 @@ def _database(service: Service) -> Check:
 
 
 def _disk(service: Service) -> Check:
+    if not os.access(service.settings.data, os.W_OK):
+        return Check(ok=False, detail=compose("disk-unwritable"))
     free, spare = service.store.free_bytes(), service.settings.free_bytes
     code = "disk-free" if free > spare else "disk-too-full"
     return Check(ok=free > spare, detail=compose(code, free_gb=free / 1e9, spare_gb=spare / 1e9))

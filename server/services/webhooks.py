@@ -17,6 +17,7 @@ from typing import Any
 
 import httpx
 import sqlalchemy as sa
+import structlog
 from dbos import EnqueueOptions
 
 from rig.messages.message import compose
@@ -26,6 +27,8 @@ from server.services.job_rows import APPLICATION_VERSION, DELIVERY
 from server.services.records import NewWebhook, Webhook
 from server.storage.database import now_sql, webhooks
 from server.storage.records import JobWebhook, WebhookMessage
+
+log = structlog.get_logger()
 
 WEBHOOKS_QUEUE = "webhooks"
 OWN = "own"  # in the place of an id: the job's own webhook
@@ -107,6 +110,17 @@ class Webhooks:
         Raises httpx.HTTPError if the receiver cannot be reached or does not accept the message, and InvalidInput if the
         settings no longer allow the address of a job's own webhook.
         """
+        try:
+            return self._send(message)
+        except httpx.HTTPError as error:
+            refusal = error.response.status_code if isinstance(error, httpx.HTTPStatusError) else None
+            # Without the address, which may hold a secret.
+            log.warning(
+                "webhook not reached", webhook=message["webhook"], of=message["id"], reason=refusal or str(error)
+            )
+            raise
+
+    def _send(self, message: WebhookMessage) -> int:
         if "own" in message:
             return self._post_own(message, message["own"])
         with self._engine.connect() as connection:

@@ -18,7 +18,9 @@ from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, MessageDocument, compose, documents_of, message_of
 from rig.text import printable
 from server.errors import (
+    UNWRITABLE,
     Conflict,
+    DataUnwritable,
     DiskFull,
     Forbidden,
     Gone,
@@ -150,6 +152,9 @@ def problem_from(error: Exception) -> Problem:
         return Problem(error.status_code, type_of_status(error.status_code), detail, headers=error.headers)
     if (isinstance(error, OSError) and error.errno in DISK_FULL) or "database or disk is full" in str(error):
         return problem_from(DiskFull())
+    if isinstance(error, OSError) and error.errno in UNWRITABLE:
+        log.error("data folder cannot be written", error=str(error))
+        return problem_from(DataUnwritable())
     if isinstance(error, DataError):
         return Problem(422, "invalid-request", compose("database-value-refused"))
     if isinstance(error, DBAPIError):

@@ -41,10 +41,7 @@ def send_file(request: Request, file: StoredFile) -> Response:
     if not path.is_file():
         raise Problem(404, "not-found", compose("file-gone"))
     headers = {"ETag": etag, "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
-    if (
-        etag in re.split(r"\s*,\s*", request.headers.get("if-none-match", ""))
-        or request.headers.get("if-none-match") == "*"
-    ):
+    if _is_at_client(request, etag):
         return Response(status_code=304, headers=headers)
     _check_range(request, path.stat().st_size)
     return FileResponse(path, headers=headers, media_type=media_type(path.name))
@@ -61,10 +58,16 @@ def send_archive(
     digest = hashlib.sha256("\n".join(f"{name} {file['sha256']}" for name, file in files.items()).encode()).hexdigest()
     headers = {"ETag": f'"{digest}"', "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
     headers["Content-Disposition"] = "attachment" if name is None else f'attachment; filename="{name}"'
-    if request.headers.get("if-none-match") == headers["ETag"]:
+    if _is_at_client(request, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     blocks = () if request.method == "HEAD" else _zipped(folder, list(files))
     return StreamingResponse(blocks, headers=headers, media_type="application/zip")  # its length is not known yet
+
+
+def _is_at_client(request: Request, etag: str) -> bool:
+    """Whether If-None-Match names the file. Proxies that compress mark its tag as weak (RFC 9110, 13.1.2)."""
+    held = re.split(r"\s*,\s*", request.headers.get("if-none-match", ""))
+    return held == ["*"] or etag in (tag.removeprefix("W/") for tag in held)
 
 
 def _zipped(folder: Path, names: list[str]) -> Iterator[bytes]:

@@ -32,7 +32,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from pipeline.settings import settings_from_document
 from rig.errors import Cancelled, InputError
 from rig.messages.message import compose
-from server.errors import unusable_input
+from server.errors import UNWRITABLE, unusable_input
 from server.problem_types import type_of_failure
 from server.processes import process_identity
 from server.services import calibrations
@@ -187,7 +187,10 @@ class Worker:
         """Checks that a job's capture exists and that the disk has space, and makes the job's folder. Raises JobFailed
         with a clear reason for what would make the fit fail later."""
         self.events.append(job_id, {"state": "running", "stage": "ingest", "progress": 0.0, "eta_s": None})
-        self.store.folder("jobs", job_id).mkdir(parents=True, exist_ok=True)  # where its log goes
+        try:
+            self.store.folder("jobs", job_id).mkdir(parents=True, exist_ok=True)  # where its log goes
+        except OSError as error:
+            raise self._failure(error) from error
         log.info("job started", capture=request["capture_id"])
         self._captures.check(request["capture_id"])
 
@@ -292,6 +295,8 @@ class Worker:
             return JobFailed(problem.kind, problem.detail, error.faults)
         if isinstance(error, OSError) and error.errno in DISK_FULL:
             return JobFailed("disk-full", compose("disk-full"))
+        if isinstance(error, OSError) and error.errno in UNWRITABLE:
+            return JobFailed("data-unwritable", compose("data-unwritable"))
         if isinstance(error, WorkFailed):
             if error.trace:
                 log.error("work raised", trace=error.trace)

@@ -22,6 +22,7 @@ def nested(depth: int) -> list[Any]:
         ({"fail_on": ["\ud800"]}, "fail_on is "),
         ({"\ud800": 1}, r"unknown key '\ud800'"),
         ({"outputs": {"\ud800": 1}}, r"unknown key 'outputs.\ud800'"),
+        ({"surface": "head"}, "unknown key 'surface'; did you mean 'outputs.surface'?"),
         ({"outputs": {"texture_sizes": 1}}, "unknown key 'outputs.texture_sizes'; did you mean 'texture_size'?"),
         ({"bust": {"spacing_mm": 10**400}}, "bust.spacing_mm is 1000"),
         ({"bust": {"spacing_mm": 10**5000}}, "bust.spacing_mm is too large a value"),

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import httpx
 import pytest
 import structlog
 from dbos import error as dbos_error
@@ -48,6 +49,7 @@ def test_a_known_failure_leaves_no_traceback(capsys: pytest.CaptureFixture[str])
         InputError("capture", ["cam00 sees nobody"]),
         dbos_error.DBOSWorkflowCancelledError("cancelled"),
         dbos_error.DBOSAwaitedWorkflowCancelledError("cancelled"),
+        httpx.ConnectError("Connection refused"),
     ):
         logging.getLogger("dbos").error("Exception encountered in background workflow:", exc_info=error)
     assert capsys.readouterr().err == ""

@@ -18,6 +18,7 @@ from rig.messages.message import Message, compose
 
 MAX_LEVEL = 4  # of 255 that an empty pixel is from black or white; the rest is JPEG's
 MIN_SHARE = 0.002  # of the picture: less is no rim
+MAX_SHARE = 0.9  # of the picture: more is one that is dark or burnt out; beside a fisheye's circle lies 0.6 at most
 SOFT_PX = 2  # where the edge of a rim is averaged with the picture
 
 
@@ -47,7 +48,7 @@ def fill_rims(
 def _without_rim(image: ImageRgb, other: ImageRgb) -> ImageRgb:
     """Returns the picture with its empty rim as ``other`` shows it, or as it is where it has none or both have it."""
     rim = empty_rim(image)
-    if rim is None or (rim & ~_empty(other)).mean() < MIN_SHARE:
+    if rim is None or rim.mean() > MAX_SHARE or (rim & ~_empty(other)).mean() < MIN_SHARE:
         return image
     soft = cv2.dilate(rim.view(np.uint8), np.ones((2 * SOFT_PX + 1, 2 * SOFT_PX + 1), np.uint8)).view(bool)
     filled = np.where(soft[..., None], other, image)

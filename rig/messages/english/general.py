@@ -7,6 +7,8 @@ TEMPLATES = {
     "located": "{where}: {fault}",
     "service-disk-full": "The disk of the service is full. Delete captures or jobs, then send it again.",
     "disk-full": "The disk is full. Delete captures or jobs, then restart the job.",
+    "service-data-unwritable": "The service cannot write its data folder. Its operator must make it writable; then send it again.",
+    "data-unwritable": "The data folder cannot be written. Make it writable, then restart the job.",
     "out-of-memory": "The work needed more memory than there is.",
     "faults-found": "{subject:word}: {count} fault found. | {subject:word}: {count} faults found.",
     "things-to-mend": "{subject:word}: {count} thing to mend. | {subject:word}: {count} things to mend.",

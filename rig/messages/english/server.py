@@ -8,6 +8,7 @@ TEMPLATES = {
     "faces-slow": "The faces were not found within {seconds:g} s: the machine is busy; try again.",
     "shot-no-capture": "The shot is no capture: {faults}",
     "disk-free": "{free_gb:.1f} GB free; uploads and jobs leave {spare_gb:.1f} GB",
+    "disk-unwritable": "the data folder cannot be written: mount it writable, or give it to the service's user",
     "disk-too-full": "{free_gb:.1f} GB free; uploads and jobs leave {spare_gb:.1f} GB: delete captures or jobs",
     "form-field-too-long": "The form field {field} is longer than {bytes:,} bytes; the archive is the part 'file'.",
     "form-field-unknown-near": "unknown field {field}; did you mean {near}?",

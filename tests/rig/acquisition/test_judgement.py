@@ -33,3 +33,24 @@ def test_each_fault_is_named_for_its_camera() -> None:
 def test_without_a_clean_plate_neither_light_nor_view_is_judged() -> None:
     pictures = {name: SEATED(name, 0.0) // 8 for name in NAMES[:3]}
     assert judged(pictures, {}) == set()
+
+
+def plain_wall(seed: int, *, seated: bool) -> np.ndarray:
+    """A wall under a soft lamp with few marks on it; the subject throws a soft shadow."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:480, :640].astype(np.float32)
+    wall = 90 + 60 * np.exp(-(((columns - 400) / 380) ** 2) - ((rows - 150) / 300) ** 2)
+    for column, row in rng.uniform((40, 40), (600, 440), (5, 2)):
+        wall += 6 * np.exp(-((columns - column) ** 2 + (rows - row) ** 2) / (2 * 9.0**2))
+    if seated:
+        wall *= 1 - 0.25 * np.exp(-(((columns - 230) / 110) ** 2) - ((rows - 260) / 160) ** 2)
+        cv2.ellipse(wall, (320, 300), (90, 130), 0, 0, 360, 150.0, -1, cv2.LINE_AA)
+    noise = np.random.default_rng(seed + 100 * (1 + seated)).normal(0, 2.0, (480, 640, 3))
+    return np.clip(np.round(wall[..., None] + noise), 0, 255).astype(np.uint8)
+
+
+def test_soft_light_on_a_plain_wall_moves_no_camera() -> None:
+    """Few patches there can be placed, and what they say of the corners is an extrapolation."""
+    pictures = {name: plain_wall(seed, seated=True) for seed, name in enumerate(NAMES)}
+    plates = {name: plain_wall(seed, seated=False) for seed, name in enumerate(NAMES)}
+    assert judged(pictures, plates) == set()

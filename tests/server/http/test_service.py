@@ -105,6 +105,7 @@ def test_foreign_pages_may_not_use_the_keyless_service(http: httpx.Client) -> No
 def test_health_metrics_models(http: httpx.Client) -> None:
     assert http.get("/healthz").json()["status"] == "ok"
     ready = http.get("/readyz")
+    assert (http.head("/healthz").status_code, http.head("/readyz").status_code) == (200, ready.status_code)
     assert {"egl", "disk", "database", "rig", "worker"} <= set(ready.json()["checks"])
     assert "eigenhead_requests_total" in http.get("/metrics").text
     assert any(model["default"] for model in http.get("/v1/models").json()["models"])

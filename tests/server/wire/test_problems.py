@@ -1,6 +1,7 @@
 """Errors as answers: whose fault it is, and text that can be sent whatever it quotes."""
 
 import ast
+import errno
 import importlib
 import json
 from pathlib import Path
@@ -25,6 +26,12 @@ ROOT = Path(__file__).resolve().parents[3]
 )
 def test_a_value_that_the_database_cannot_keep_is_the_callers_fault(error: Exception, status: int) -> None:
     assert problem_from(error).status == status
+
+
+def test_a_data_folder_that_cannot_be_written_is_told() -> None:
+    problem = problem_from(OSError(errno.EROFS, "Read-only file system", "/srv/heads/incoming/1"))
+    assert (problem.status, problem.kind) == (503, "data-unwritable")
+    assert "/srv" not in json.dumps(problem.document())
 
 
 def test_an_answer_quotes_what_is_no_text() -> None:

@@ -100,6 +100,18 @@ def test_a_job_begins_where_its_capture_is_and_the_disk_has_room(
         assert full.value.kind == "disk-full"
 
 
+def test_a_job_whose_folder_cannot_be_made_says_so(
+    worker: Worker, capture: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(self: Path, *positional: Any, **named: Any) -> None:
+        raise OSError(30, "Read-only file system", str(self))
+
+    monkeypatch.setattr(Path, "mkdir", refused)
+    with pytest.raises(JobFailed) as unwritable:
+        worker.ingest(JOB, request(capture))
+    assert unwritable.value.kind == "data-unwritable"
+
+
 def test_a_fit_is_published_once_whoever_publishes_it(worker: Worker, capture: str) -> None:
     worker.ingest(JOB, request(capture))
     attempts = []
@@ -184,6 +196,7 @@ def test_a_report_that_cannot_be_read_has_no_warnings(tmp_path: Path, text: str 
     ("error", "kind"),
     [
         (OSError(28, "No space left on device"), "disk-full"),
+        (OSError(30, "Read-only file system"), "data-unwritable"),
         (InputError("cameras.json", ["cameras.json: no camera"]), "invalid-cameras"),
         (WorkFailed("NoHull", "No hull was found."), "no-hull"),
         (WorkFailed("NobodyKnowsThis", "?"), "eigenhead-error"),
@@ -196,7 +209,7 @@ def test_each_cause_has_its_kind(worker: Worker, error: BaseException, kind: str
 
 
 def test_what_is_no_failure_of_the_job_is_left_to_the_engine(worker: Worker) -> None:
-    for error in (Cancelled(), OSError(13, "Permission denied"), KeyboardInterrupt()):
+    for error in (Cancelled(), OSError(5, "Input/output error"), KeyboardInterrupt()):
         assert worker._failure(error) is error
 
 

@@ -39,6 +39,15 @@ def test_a_rim_of_the_plate_alone_is_filled_with_the_picture() -> None:
     assert len(remarks) == 1
 
 
+@pytest.mark.parametrize("value", [0, 2, 255])
+def test_a_picture_that_is_dark_or_burnt_out_is_no_rim(value: int) -> None:
+    """It would show its clean plate, or the clean plate would show the subject."""
+    blank = np.full((*SHAPE, 3), value, np.uint8)
+    for image, plate in ((blank, noise(1)), (noise(0), blank)):
+        images, plates, remarks = fill_rims({"cam00": image}, {"cam00": [plate]}, ())
+        assert (images["cam00"] is image, plates["cam00"][0] is plate, remarks) == (True, True, [])
+
+
 def test_pictures_that_need_nothing_stay_the_same_objects() -> None:
     rim = outside_lens()[..., None]
     clothes = noise(3)
