@@ -44,7 +44,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         alignment = run(align_head, context, views, faces)
         labels, head = fit_shape(run, context, views, alignment)
     depth = run(measure_depth, context, views, head, labels)
-    with run.beside(fuse_depth, context, views, head.mesh_world, depth) as fused:
+    with run.beside(fuse_depth, context, views, head.mesh_world, labels, depth) as fused:
         refined = run(refine_head, context, views, faces, head, labels, depth)
     with run.beside(shape_bust, context, views, depth, refined, fused.product) as surface:
         texturing = run(texture_head, context, views, head, refined, labels)

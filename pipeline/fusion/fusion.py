@@ -20,9 +20,11 @@ from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
 from pipeline.fusion.refinement import Measured, refine_vertices
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
+from pipeline.fusion.silent_hair import SilentHair, shell_deviation_mm
 from pipeline.fusion.skin import HeadSkin, drawn_to_skin
 from pipeline.fusion.view_stack import stack_views
 from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
@@ -67,6 +69,7 @@ class DepthSurface:
     safe_world: Float[np.ndarray, "v 3"]  # places (mm) with which the mesh cannot cross itself
     measured: Measured
     warnings: tuple[ReportWarning, ...]
+    shell_deviation_mm: float | None = None  # of hair that is a guess inside its outlines; None without such hair
 
 
 def fuse(
@@ -78,6 +81,7 @@ def fuse(
     bias: WindowBias,
     settings: BustSettings,
     report: Progress,
+    hair: SilentHair | None = None,
 ) -> DepthSurface:
     """Fuses the depth maps to one closed surface.
 
@@ -89,6 +93,7 @@ def fuse(
         bias: of the matching windows.
         settings: spacing of the vertices.
         report: called with the stage's progress.
+        hair: of which the depth maps say nothing; None if there is none.
 
     Raises:
         NoSurface: fewer than three views have any depth, or they contradict each other.
@@ -98,7 +103,7 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level = solve(maps, views, head_world, settings.spacing_mm)
+    level = solve(maps, views, head_world, settings.spacing_mm, hair)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)
@@ -106,7 +111,9 @@ def fuse(
     measured = without_islands(mesh, measured)
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(_mask_warnings(names, contradicted))
-    return DepthSurface(without_bias(mesh, measured.views > 0, bias), safe, measured, warnings)
+    straight = without_bias(mesh, measured.views > 0, bias)
+    shell_mm = None if hair is None else shell_deviation_mm(hair, views)
+    return DepthSurface(straight, safe, measured, warnings, shell_mm)
 
 
 @traced
@@ -135,13 +142,24 @@ def finished(
         skin = 1.0 if shares is None else shares[:, Part.SKIN.channel]
         mesh = drawn_to_skin(mesh, seen * skin, head, seen_deviation_mm(measured))
     moved_mm = np.zeros(len(seen))
-    if shares is not None:
+    if shares is not None and surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, shares[:, Part.HAIR.channel], silhouettes, rig)
     mesh, _ = without_crossings(mesh, surface.safe_world)
     mesh = without_coincidences(mesh)
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
     deviation = np.hypot(deviation_mm(mesh, measured), STRAND_SHARE * moved_mm)
+    if surface.shell_deviation_mm is not None:
+        guessed = ~seen & facing_a_camera(mesh, rig)
+        deviation[guessed] = np.minimum(deviation[guessed], surface.shell_deviation_mm)
     return BustSurface(mesh, deviation, part, measured.views, surface.warnings)
+
+
+def facing_a_camera(mesh_world: Mesh, rig: Rig) -> Bool[np.ndarray, " v"]:
+    """Tells which vertices turn their outside to a camera, whether or not something hides them."""
+    normals, facing = normals_of(mesh_world), np.zeros(len(mesh_world.vertices), bool)
+    for camera in rig:
+        facing |= ((camera.centre_world - mesh_world.vertices) * normals).sum(axis=1) > 0.0
+    return facing
 
 
 def _mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -> Iterator[ReportWarning]:

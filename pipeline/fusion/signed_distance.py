@@ -25,6 +25,7 @@ from pipeline.fusion.exclusion_kernels import BLOCK, mark_excluded
 from pipeline.fusion.grid import Grid, everywhere, marked_box, refined, whole_box
 from pipeline.fusion.prior import distance_to_head
 from pipeline.fusion.relaxation_kernels import Membrane, relax
+from pipeline.fusion.silent_hair import SilentHair, distance_to_shell
 from pipeline.fusion.view_stack import ViewStack
 from pipeline.fusion.vote_kernels import vote
 from pipeline.stereo.depth_map import DepthMap, points_world
@@ -142,16 +143,26 @@ def _votes(index: Int32[np.ndarray, "n 3"], corner: Float[np.ndarray, " 3"], ste
 
 
 @traced
-def solve(depth_maps: Sequence[DepthMap], views: ViewStack, head_world: Mesh | None, spacing_mm: float) -> Level:
+def solve(
+    depth_maps: Sequence[DepthMap],
+    views: ViewStack,
+    head_world: Mesh | None,
+    spacing_mm: float,
+    hair: SilentHair | None = None,
+) -> Level:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
-    fine."""
+    fine. ``hair`` is what the depth maps do not show."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
     seen = np.concatenate([points_world(depth_map)[::EVERY] for depth_map in depth_maps])
-    grid = whole_box(*_box(depth_maps, seen, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
+    shown = seen if hair is None else np.concatenate([seen, hair.places])
+    grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
     votes = votes_in_box(grid, views)
-    level = solve_level(grid, votes, _prior(grid, votes, head_world, seen), SWEEPS, FACTOR)
+    guess = _prior(grid, votes, head_world, shown)
+    if hair is not None:
+        guess = _with_shell(guess, votes, grid, hair, views)
+    level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
     for halving in range(halvings):
         wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
@@ -200,6 +211,15 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> F
         prior[unseen] = np.maximum(prior[unseen], distance_to_head(places, head_world, seen[::10]))
     prior[grid.outer] = REACH * grid.step_mm
     return without_horns(prior, votes, grid).astype(np.float32)
+
+
+def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: SilentHair, views: ViewStack) -> Field:
+    """Returns the first guess with the shell of hair that no depth is known of, where photographs show its
+    outside."""
+    shell, shown = distance_to_shell(hair, views, grid)
+    reach = REACH * grid.step_mm
+    mixed = shown * np.maximum(shell, votes.bound) + (1.0 - shown) * guess
+    return np.where(grid.outer | (votes.weight > 0), guess, np.clip(mixed, -reach, reach)).astype(np.float32)
 
 
 def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:

@@ -8,12 +8,14 @@ from jaxtyping import Float, UInt8
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
 from pipeline.fusion.signed_distance import NoSurface
+from pipeline.fusion.silent_hair import find_silent_hair
 from pipeline.fusion.skin import measured_skin
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.normals import normals_of, vertex_normals
 from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
+from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged, stage
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
@@ -43,9 +45,10 @@ class Bust:
 
 @stage("bust")
 def fuse_depth(
-    context: ReconstructionContext, views: Views, head_world: Mesh, depth: Depth
+    context: ReconstructionContext, views: Views, head_world: Mesh, labels: PartLabels, depth: Depth
 ) -> Staged[DepthSurface | None]:
-    """Fuses the depth maps to one closed surface; where no camera sees the subject, the fitted head is used.
+    """Fuses the depth maps to one closed surface; where no camera sees the subject, the fitted head is used,
+    and where long hair has hardly any depth, a shell inside its outlines.
 
     Returns None if the settings ask for the head only. Returns None with the warning ``no-bust`` if the depth maps do
     not determine a surface.
@@ -53,15 +56,17 @@ def fuse_depth(
     settings = context.settings
     if settings.outputs.surface == "head":
         return Staged(None)
+    hair, maps = find_silent_hair(depth.maps, labels.maps, depth.votes, context.rig, head_world)
     try:
         surface = fuse(
-            depth.maps,
+            maps,
             views.silhouettes,
             context.rig,
             head_world,
             bias=depth.window_bias,
             settings=settings.bust,
             report=context.progress,
+            hair=hair,
         )
     except NoSurface as reason:
         return Staged(None, [compose("no-bust", reason=reason.message)])

@@ -19,6 +19,7 @@ from pipeline.settings import BustSettings, OutputSettings, Settings, settings_f
 from pipeline.stages.bust import Bust, colour_bust, fuse_depth, push_out_hair, shape_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
+from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.stereo.window_bias import WindowBias
@@ -60,7 +61,7 @@ def photographed(renderer: Renderer) -> tuple[Bust, Capture, dict]:
     depth = Depth(made.maps, images, None, nothing, points_on_face(nothing, head, np.zeros(0, bool)), bias)
     refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", verbatim("planted")))
     views = Views(capture, made.silhouettes, {})
-    fused = fuse_depth(context, views, head, depth).product
+    fused = fuse_depth(context, views, head, PartLabels({}), depth).product
     surface = shape_bust(context, views, depth, refined, fused).product
     bust = colour_bust(context, views, surface, capture).product
     assert bust is not None
