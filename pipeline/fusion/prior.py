@@ -1,4 +1,12 @@
-"""Guesses the surface where no camera sees it: the fitted head, with hair as thick as where it is seen."""
+"""Guesses the surface where no camera sees it, or hardly: the fitted head, with hair as thick as where it is seen, and
+the visual hull, with a gap as wide as where the surface is seen.
+
+Whichever lies nearer to the seen surface about a place counts more. Outlines leave a millimetre open about a skull,
+while a fitted head that takes a bald scalp for hair lies 6 to 12 mm too deep; below brows and chin, and before cameras
+that all stand on one side, it is the other way round.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,42 +20,62 @@ RIM_MM = 12.0  # about the open rim of a model the head goes on in a way that it
 EVERY = 4  # vertices of the head stand for the others: 3 mm apart is enough for a guess
 MIN_POINTS = 3  # of the surface near a vertex, for a thickness
 NEAREST, EVEN_MM = 64, 5.0  # vertices that a mean is taken of, and the distance within which they count alike
+SURE_MM = 0.5  # no guess is better
 
 
-def distance_to_head(
-    places: Float[np.ndarray, "n 3"], head_world: Mesh, seen: Float[np.ndarray, "m 3"]
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenSurface:
+    """Holds m points of the surface that is seen (world frame, mm), their signed distances to the visual hull (mm,
+    negative inside), and how much each counts."""
+
+    points: Float[np.ndarray, "m 3"]
+    hull_mm: Float[np.ndarray, " m"]
+    weight: Float[np.ndarray, " m"]
+
+
+def distance_to_subject(
+    places: Float[np.ndarray, "n 3"], hull_mm: Float[np.ndarray, " n"], head_world: Mesh, seen: SeenSurface
 ) -> Float[np.ndarray, " n"]:
-    """Returns the signed distance (mm, positive outside) of points to the outside of the head's hair; -inf near the
-    open border where the model ends. The thickness of the hair above each vertex is measured from the ``seen`` points
-    of the surface, and interpolated where there are none."""
+    """Returns the signed distance (mm, positive outside) of points to the guessed surface; -inf near the open border
+    where the model ends.
+
+    Args:
+        places: the points, world frame, mm.
+        hull_mm: their signed distances to the visual hull.
+        head_world: the fitted head.
+        seen: what says how far the surface lies from both.
+    """
     vertices, normals = head_world.vertices[::EVERY], normals_of(head_world)[::EVERY]
     tree = PointTree.of(vertices)
-    thickness = _thickness(tree, normals, seen)
+    (thickness, gap), (head_square, hull_square) = _offsets(tree, normals, seen)
     far, near = nearest(tree, places)
     height = ((places - vertices[near]) * normals[near]).sum(axis=1)
-    signed = np.copysign(far, height) - thickness[near]
-    return np.where(near_rim(head_world, vertices)[near], -np.inf, signed)
+    by_head, by_hull = np.copysign(far, height) - thickness[near], hull_mm + gap[near]
+    share = (hull_square / (hull_square + head_square))[near]
+    return np.where(near_rim(head_world, vertices)[near], -np.inf, share * by_head + (1.0 - share) * by_hull)
 
 
-def _thickness(
-    tree: PointTree, normals: Float[np.ndarray, "v 3"], seen: Float[np.ndarray, "m 3"]
-) -> Float[np.ndarray, " v"]:
-    """Returns the thickness of the hair (mm) over each vertex: the mean height of the seen points above it. Vertices
-    with too few points take the mean of the nearest others, weighted by the inverse square of the distance."""
+def _offsets(
+    tree: PointTree, normals: Float[np.ndarray, "v 3"], seen: SeenSurface
+) -> tuple[Float[np.ndarray, "2 v"], Float[np.ndarray, "2 v"]]:
+    """Returns how far (mm) the seen surface about each vertex lies outside the head and inside the hull, and the mean
+    squares (mm^2): means over vertices with points of their own, weighted by these and by the inverse square of the
+    distance. With too few of them the head alone counts, as it is."""
     vertices = tree.points
-    far, near = nearest(tree, seen, within=THICKEST_MM)
-    near, points = near[np.isfinite(far)], seen[np.isfinite(far)]
-    height = np.maximum(((points - vertices[near]) * normals[near]).sum(axis=1), 0.0)
-    count = np.bincount(near, minlength=len(vertices))
-    thickness = np.bincount(near, height, len(vertices)) / np.maximum(count, 1)
-    known = np.flatnonzero(count >= MIN_POINTS)
+    far, near = nearest(tree, seen.points, within=THICKEST_MM)
+    within = np.isfinite(far)
+    near, weight = near[within], seen.weight[within]
+    height = np.maximum(((seen.points[within] - vertices[near]) * normals[near]).sum(axis=1), 0.0)
+    depth = np.maximum(-seen.hull_mm[within], 0.0)
+    known = np.flatnonzero(np.bincount(near, minlength=len(vertices)) >= MIN_POINTS)
     if len(known) < NEAREST:
-        return np.zeros(len(vertices))
-    blank = np.flatnonzero(count < MIN_POINTS)
-    far, near = nearest(PointTree.of(vertices[known]), vertices[blank], count=NEAREST)
-    share = 1.0 / (far * far + EVEN_MM**2)
-    thickness[blank] = (share * thickness[known[near]]).sum(axis=1) / share.sum(axis=1)
-    return thickness
+        return np.zeros((2, len(vertices))), np.tile([[0.0], [1.0]], len(vertices))
+    total = np.bincount(near, weight, len(vertices))[known]
+    own = np.stack([np.bincount(near, weight * each, len(vertices))[known] / total for each in (height, depth)])
+    far, near = nearest(PointTree.of(vertices[known]), vertices, count=NEAREST)
+    share = total[near] / (far * far + EVEN_MM**2)
+    share /= share.sum(axis=1, keepdims=True)
+    return (share * own[:, near]).sum(axis=2), (share * own[:, near] ** 2).sum(axis=2) + SURE_MM**2
 
 
 def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

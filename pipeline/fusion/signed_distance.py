@@ -4,7 +4,7 @@ fitted head.
 It goes from a coarse box around the subject down to the requested spacing. Every view votes at every node
 (``vote_kernels``): with the distance to the surface that it sees there, and free space in front of it; it says nothing
 of what lies behind. Silhouettes bound the body from outside. Between votes a membrane interpolates
-(``relaxation_kernels``); what no camera sees is drawn to the fitted head with its hair, or to the visual hull. The
+(``relaxation_kernels``); what no camera sees is drawn to the fitted head with its hair and to the visual hull. The
 coarsest level decides what is inside; each finer level is solved around the surface of the one before.
 
 Volumetric fusion with free space: Curless and Levoy, *A volumetric method for building complex models from range
@@ -23,10 +23,10 @@ from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
 from pipeline.fusion.exclusion_kernels import BLOCK, mark_excluded
 from pipeline.fusion.grid import Grid, everywhere, marked_box, refined, whole_box
-from pipeline.fusion.prior import distance_to_head
+from pipeline.fusion.prior import SeenSurface, distance_to_subject
 from pipeline.fusion.relaxation_kernels import Membrane, relax
 from pipeline.fusion.silent_hair import SilentHair, distance_to_shell
-from pipeline.fusion.view_stack import ViewStack
+from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE, ViewStack
 from pipeline.fusion.vote_kernels import vote
 from pipeline.stereo.depth_map import DepthMap, points_world
 from rig.errors import EigenheadError
@@ -47,7 +47,9 @@ BLEND_MM = 1.5  # from the edge of what is seen to where the guess prevails: its
 UNDECIDED_BLEND_MM = 150.0  # the same where there is hardly a guess
 SWEEPS, FINE_SWEEPS = 60, 16
 FACTOR, FINE_FACTOR = 1.8, 1.4  # of over-relaxation
+WEAK = 1.0  # votes of less weight are drawn to the guess, too: chance matches of two views are among them
 EVERY = 7  # known pixel is used to tell where a surface may be
+THINNED = 10  # of these tell how far the surface lies from head and hull
 WIDENINGS = 4  # of a grid by one coarse step
 STRAYS = 0.1  # per cent of these that may lie outside of the box
 HORN_MM, AWAY_MM = 30.0, 20.0  # radius of what a guess must hold, and how far from all that is seen it must
@@ -81,14 +83,15 @@ class Level:
 
 def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
     """Computes the signed distance on one grid. It follows the votes where there are some, stays outside the
-    silhouettes, and is drawn to ``start`` at nodes that no view sees. ``sweeps`` and ``factor`` are those of the
-    relaxation."""
+    silhouettes, and is drawn to ``start``, which prevails where no view sees a node, or hardly. ``sweeps`` and
+    ``factor`` are those of the relaxation."""
     reach = np.float32(REACH * grid.step_mm)
     start = np.clip(start, -reach, reach)
-    unseen = votes.weight <= 0
-    target = np.where(unseen, start, votes.value).astype(np.float32)
     blend = np.where(votes.weight < 0, UNDECIDED_BLEND_MM, BLEND_MM)
-    pull = np.where(unseen, (grid.step_mm / blend) ** 2, DATA_WEIGHT * votes.weight).astype(np.float32)
+    held = np.where(votes.weight < WEAK, (grid.step_mm / blend) ** 2, 0.0)
+    data = DATA_WEIGHT * np.maximum(votes.weight, 0.0)
+    pull = (held + data).astype(np.float32)
+    target = ((held * start + data * votes.value) / pull).astype(np.float32)
     field = np.where(grid.outer, start, np.maximum(target, votes.bound)).astype(np.float32)
     free, odd = ~grid.outer & (votes.bound < reach), (np.bitwise_xor.reduce(grid.index, axis=1) & 1) == 1
     colours = [np.flatnonzero(free & ~odd).astype(np.int32), np.flatnonzero(free & odd).astype(np.int32)]
@@ -156,10 +159,16 @@ def solve(
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
     seen = np.concatenate([points_world(depth_map)[::EVERY] for depth_map in depth_maps])
-    shown = seen if hair is None else np.concatenate([seen, hair.places])
+    agreed = np.concatenate([depth_map.views[depth_map.known][::EVERY] for depth_map in depth_maps])
+    shown = seen
+    if hair is not None:
+        shown = np.concatenate([seen, hair.places])
+        agreed = np.concatenate([agreed, np.full(len(hair.places), VIEWS_SURE)])
     grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
     votes = votes_in_box(grid, views)
-    guess = _prior(grid, votes, head_world, shown)
+    known = shown[::THINNED]
+    weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
+    guess = _prior(grid, votes, head_world, SeenSurface(known, at_points(grid, votes.bound, known), weight))
     if hair is not None:
         guess = _with_shell(guess, votes, grid, hair, views)
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
@@ -201,14 +210,17 @@ def _box(
     return low, high - low
 
 
-def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: Points) -> Field:
-    """Returns the first guess of the signed distance: the visual hull, cut down to the fitted head with its hair where
-    there is a head."""
+def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface) -> Field:
+    """Returns the first guess of the signed distance: what views see for sure, and elsewhere the visual hull, cut down
+    to the fitted head and the hull's usual gap where there is a head."""
     prior = np.maximum(votes.value, votes.bound).astype(float)
     if head_world is not None:
-        unseen = (prior < 0) & (votes.weight <= 0)
-        places = grid.corner + grid.step_mm * grid.index[unseen]
-        prior[unseen] = np.maximum(prior[unseen], distance_to_head(places, head_world, seen[::10]))
+        weak = (votes.weight > 0) & (votes.weight < WEAK) & (votes.bound < 0)
+        asked = weak | ((votes.weight <= 0) & (prior < 0))
+        hull = np.where(weak, votes.bound, prior)[asked]
+        places = grid.corner + grid.step_mm * grid.index[asked]
+        guess = distance_to_subject(places, hull, head_world, seen)
+        prior[asked] = np.where(weak[asked] & np.isneginf(guess), prior[asked], np.maximum(hull, guess))
     prior[grid.outer] = REACH * grid.step_mm
     return without_horns(prior, votes, grid).astype(np.float32)
 
@@ -219,7 +231,18 @@ def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: SilentHair, views:
     shell, shown = distance_to_shell(hair, views, grid)
     reach = REACH * grid.step_mm
     mixed = shown * np.maximum(shell, votes.bound) + (1.0 - shown) * guess
-    return np.where(grid.outer | (votes.weight > 0), guess, np.clip(mixed, -reach, reach)).astype(np.float32)
+    return np.where(grid.outer | (votes.weight >= WEAK), guess, np.clip(mixed, -reach, reach)).astype(np.float32)
+
+
+def at_points(box: Grid, values: Field, points: Points) -> Float[np.ndarray, " m"]:
+    """Returns the values of a whole box's nodes, interpolated linearly at points."""
+    at = np.clip((points - box.corner) / box.step_mm, 0.0, np.array(box.shape) - 1.001)
+    low = at.astype(int)
+    share, total, volume = at - low, np.zeros(len(points)), values.reshape(box.shape)
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, share, 1.0 - share).prod(axis=1)
+        total += weight * volume[tuple((low + corner).T)]
+    return total
 
 
 def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
