@@ -71,11 +71,11 @@ def _offsets(
     if len(known) < NEAREST:
         return np.zeros((2, len(vertices))), np.tile([[0.0], [1.0]], len(vertices))
     total = np.bincount(near, weight, len(vertices))[known]
-    own = np.stack([np.bincount(near, weight * each, len(vertices))[known] / total for each in (height, depth)])
+    mean_mm = np.stack([np.bincount(near, weight * each, len(vertices))[known] / total for each in (height, depth)])
     far, near = nearest(PointTree.of(vertices[known]), vertices, count=NEAREST)
     share = total[near] / (far * far + EVEN_MM**2)
     share /= share.sum(axis=1, keepdims=True)
-    return (share * own[:, near]).sum(axis=2), (share * own[:, near] ** 2).sum(axis=2) + SURE_MM**2
+    return (share * mean_mm[:, near]).sum(axis=2), (share * mean_mm[:, near] ** 2).sum(axis=2) + SURE_MM**2
 
 
 def near_rim(head_world: Mesh, places: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:

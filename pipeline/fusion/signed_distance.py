@@ -216,11 +216,11 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface)
     prior = np.maximum(votes.value, votes.bound).astype(float)
     if head_world is not None:
         weak = (votes.weight > 0) & (votes.weight < WEAK) & (votes.bound < 0)
-        asked = weak | ((votes.weight <= 0) & (prior < 0))
-        hull = np.where(weak, votes.bound, prior)[asked]
-        places = grid.corner + grid.step_mm * grid.index[asked]
+        guessed = weak | ((votes.weight <= 0) & (prior < 0))
+        hull = np.where(weak, votes.bound, prior)[guessed]
+        places = grid.corner + grid.step_mm * grid.index[guessed]
         guess = distance_to_subject(places, hull, head_world, seen)
-        prior[asked] = np.where(weak[asked] & np.isneginf(guess), prior[asked], np.maximum(hull, guess))
+        prior[guessed] = np.where(weak[guessed] & np.isneginf(guess), prior[guessed], np.maximum(hull, guess))
     prior[grid.outer] = REACH * grid.step_mm
     return without_horns(prior, votes, grid).astype(np.float32)
 
