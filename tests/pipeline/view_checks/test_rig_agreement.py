@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.research.subjects import off_by
-from pipeline.view_checks.rig_agreement import misplaced_camera, wrong_rig
+from pipeline.view_checks.rig_agreement import are_loose, misplaced_camera, wrong_rig
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
 from rig.rig import Rig
@@ -49,6 +49,17 @@ def test_the_rig_that_took_the_pictures_is_left_alone(seen):
     assert wrong_rig(of_all, rig) is None
     for count in range(3, 11):
         assert wrong_rig(of_all, rig.subset(rng.choice(rig.names, count, replace=False))) is None
+
+
+@pytest.mark.parametrize(
+    ("quarter", "half", "loose"),
+    [(22e-4, 50e-4, True), (20e-4, 60e-4, False), (20e-4, 90e-4, True), (40e-4, 50e-4, False)],
+)
+def test_masks_are_loose_where_half_of_the_planes_meet_closely_or_a_quarter_far_better_than_the_rest(
+    quarter: float, half: float, loose: bool
+) -> None:
+    missed = np.interp(np.linspace(0, 1, 121), [0, 0.25, 0.5, 1], [0.0, quarter, half, 3 * half]).reshape(11, 11, 1)
+    assert are_loose(np.append(missed, np.full((11, 11, 1), np.nan), axis=2)) is loose
 
 
 @pytest.mark.parametrize("axis", [0, 1])
