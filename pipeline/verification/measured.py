@@ -16,6 +16,7 @@ from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
+from rig.messages.message import compose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,5 +91,7 @@ def read_report(folder: Path) -> ReportDocument:
     """Returns the decoded report.json of a result; its contents are not checked. Raises InputError."""
     try:
         return json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{folder.name}/report.json", [compose("report-missing")]) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{folder.name}/report.json", [f"cannot be read ({error})"]) from error

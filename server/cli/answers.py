@@ -4,11 +4,13 @@ import errno
 import json
 import math
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -171,6 +173,22 @@ def prepare_folder(path: Path) -> None:
         raise CannotWrite(path, FileExistsError(errno.ENOTDIR, "it is a file, and a folder is written")) from error
     except OSError as error:
         raise CannotWrite(path, error) from error
+
+
+@contextmanager
+def terminated_like_interrupted() -> Iterator[None]:
+    """Makes SIGTERM end the block as Ctrl-C does, so that nothing unfinished is left. Schedulers send it some seconds
+    before SIGKILL."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        sys.stderr.flush()
 
 
 @contextmanager

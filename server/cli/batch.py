@@ -1,11 +1,7 @@
 """Implements ``eigenhead batch``: reconstructs many captures, one result folder each, and makes a table of all."""
 
-import signal
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -21,6 +17,7 @@ from server.cli.answers import (
     fail,
     model_names,
     prepare_folder,
+    terminated_like_interrupted,
     warn,
     wrong_usage,
 )
@@ -142,7 +139,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     folder, cores = BatchFolder(out), usable_cores()
     count = workers or worker_count(cores, free_memory(), len(share_tasks))
     files: list[Path] = []
-    with _terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
+    with terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
         display.prepare(share_tasks)
         variables = {"EIGENHEAD_THREADS": str(threads_of_worker(cores, count))} | _threads_variable()
         run = BatchRun(folder, share_tasks, workers=count, variables=variables, observer=display)
@@ -196,18 +193,3 @@ def _document(
         "workers": workers,
         "seconds": seconds,
     }
-
-
-@contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """Makes SIGTERM end the batch as Ctrl-C does. Schedulers send it some seconds before SIGKILL."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-        sys.stderr.flush()

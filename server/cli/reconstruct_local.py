@@ -11,7 +11,7 @@ from rig.capture import TEXTURE_SETS
 from rig.formats.captures.capture_folder import capture_root
 from rig.formats.captures.shot_files import BESIDE_PICTURES, picture_folder
 from rig.progress import Progress
-from server.cli.answers import CannotWrite, SpoilsCapture, prepare_file
+from server.cli.answers import CannotWrite, SpoilsCapture, prepare_file, terminated_like_interrupted
 from server.processes import share_one_heap
 from server.storage.result_folder import fresh_folder
 from server.tasks.child import WorkerContext
@@ -48,7 +48,7 @@ def reconstruct_locally(
     if trace is not None:
         check_apart(trace.parent, capture, "--trace")
         prepare_file(trace, option="--trace")
-    with _traced(trace), _result_folder(out) as fresh, folder_of(capture) as folder:
+    with terminated_like_interrupted(), _traced(trace), _result_folder(out) as fresh, folder_of(capture) as folder:
         _reconstruct_folder(folder, fresh, kept=out, model=model, chosen=chosen, report=report)
         document = json.loads((fresh / "report.json").read_text(encoding="utf-8"))
     return document

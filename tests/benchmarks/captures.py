@@ -3,14 +3,18 @@
 python -m tests.benchmarks.captures --json
 python -m tests.benchmarks.captures --noise 6 --levels photo fine
 
+With one thread of BLAS, as jobs run: rounding by two of them moves three frontal cameras from 0.53 to 0.48 mm.
 Distances from the true face region to the head's surface, mm, weighted by area; default model, the project's own masks.
 """
 
 import argparse
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported
 
 from pipeline.head_model.model import load_model
 from pipeline.reconstruct import reconstruct

@@ -196,6 +196,7 @@ TEMPLATES = {
     "mask-alone-ready": "{share:.1%} of the mask is where the other cameras see nothing: correct the mask, or those of the others where they leave something out",
     "mask-incomplete-ready": "the mask lacks {share:.1%} of what the other cameras show: correct the mask",
     "cameras-scaled": "the cameras were scaled by {factor:.4g}: {scale}",
+    "report-missing": "is not there: name the folder of a result, which holds report.json and head.ply",
     "report-unread": "is no report.json that can be read ({reason})",
     "sizes-unread": "cannot be read ({reason})",
     "sizes-no-table": 'has no [[table]], or does not begin with format = "{format}"',

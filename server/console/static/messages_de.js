@@ -653,6 +653,7 @@ export default {
   "means-cache-bytes": "das Meiste, das Silhouetten und Vorschaubilder einnehmen",
   "means-upload-hours": "wie lange ein unfertiges Hochladen aufbewahrt wird",
   "refinement-camera-moved": "{camera} hat sich in {captures} bewegt und nahm dort nicht teil: mit der Tafel neu kalibrieren, denn die Verfeinerung ist für Bruchteile eines Pixels",
+  "report-missing": "ist nicht da: den Ordner eines Ergebnisses nennen, der report.json und head.ply enthält",
   "report-unread": "ist keine report.json, die sich lesen lässt ({reason})",
   "sizes-unread": "lässt sich nicht lesen ({reason})",
   "sizes-no-table": "enthält keine [[table]], oder beginnt nicht mit format = \"{format}\"",

@@ -1,6 +1,10 @@
 """What the commands that make heads say beside their answer."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -13,7 +17,7 @@ from rig.errors import EigenheadError
 from server.cli import reconstruct_local
 from server.cli.answers import SpoilsCapture
 from server.cli.main import app
-from tests.support.services import small_capture
+from tests.support.services import ROOT, small_capture
 
 
 @pytest.mark.parametrize("as_json", [False, True])
@@ -147,3 +151,21 @@ def test_a_result_never_looks_like_a_camera_s_folder_of_photographs(tmp_path: Pa
         reconstruct_local.reconstruct_locally(
             photographs, photographs / "out", model=None, settings={}, report=lambda stage, share: None
         )
+
+
+def test_a_scheduler_ends_a_reconstruction_and_nothing_is_left(tmp_path: Path) -> None:
+    script = (
+        "import pathlib, time\nfrom server.cli import reconstruct_local\n"
+        "def work(*a, out, **n):\n    (out / 'begun').touch()\n    time.sleep(60)\n"
+        "reconstruct_local.reconstruct_folder = work\nfrom server.cli.main import main\nmain()"
+    )
+    small_capture(tmp_path / "shot")
+    command = [sys.executable, "-c", script, "reconstruct", str(tmp_path / "shot"), "--out", str(tmp_path / "head")]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as running:
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.rglob("begun")):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        running.send_signal(signal.SIGTERM)
+        assert running.wait(45) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["shot"]
