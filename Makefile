@@ -46,19 +46,19 @@ format:
 	@if [ -x $(BIN)/biome ]; then $(BIN)/biome format --write; else echo "format: skipped: no biome for this machine, JavaScript is as it was"; fi
 
 bench: setup ## timings of inner loops
-	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib" tests/benchmarks
+	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib" tests/laboratory/benchmarks
 
 dependencies: setup ## docs/dependencies.md: every locked package with licence and reason
-	$(BIN)/python -m tests.support.dependencies
+	$(BIN)/python -m tests.tools.dependencies
 
 reference: setup ## pages that are made of the program: commands, environment variables, settings
-	$(BIN)/python -m tests.support.reference
+	$(BIN)/python -m tests.tools.reference
 
 results: setup ## the documents' tables from docs/results/; with TABLE=name that table's command is run first (it may take hours)
-	$(BIN)/python -m tests.support.results $(TABLE)
+	$(BIN)/python -m tests.tools.results $(TABLE)
 
 pictures: demo ## docs/pictures from what the demo made
-	$(BIN)/python -m tests.support.pictures
+	$(BIN)/python -m tests.tools.pictures
 
 docs: ## the documents as a site, out/site
 	@deploy/setup.sh --docs

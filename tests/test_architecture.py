@@ -95,11 +95,11 @@ LONG_FOR_A_REASON = {
 MANY_FOR_A_REASON = {
     "server.cli.heads.reconstruct": "each is an option of a command",
     "server.cli.batch.batch": "each is an option of a command",
-    "server.cli.experiments.experiments": "each is an option of a command",
+    "tests.laboratory.experiments": "each is an option of a command",
     "server.http.routes.jobs.list_jobs": "each is a parameter of the query",
     "server.cli.simulate.simulate": "each is an option of a command",
     "pipeline.stereo.window_bias_kernels.windowed_heights": "a compiled loop over a thread's share of plain arrays",
-    "pipeline.research.peers.soft_rasteriser.loss": "JAX compiles a function of plain arrays",
+    "tests.laboratory.experiments.peers.soft_rasteriser.loss": "JAX compiles a function of plain arrays",
 }
 
 
@@ -186,7 +186,7 @@ def test_what_everybody_uses_is_defined_once() -> None:
             elif isinstance(node, ast.Import | ast.ImportFrom):
                 names = [*(alias.name for alias in node.names), getattr(node, "module", None)]
                 homes["difflib"] |= {name} if "difflib" in names else set()
-    left = {name for name in product_modules() if name.startswith("pipeline.research.")} | PROGRESS_LEFT
+    left = {name for name in product_modules() if name.startswith("tests.laboratory.experiments.")} | PROGRESS_LEFT
     assert {key: found - left for key, found in homes.items()} == {
         "Progress": {"rig.progress"},
         "ImageRgb": {"rig.image"},

@@ -5,8 +5,8 @@ import re
 import subprocess
 import tomllib
 
-from tests.support.dependencies import ABSENT, PAGE, ROOT, locked, reasons
 from tests.support.uv import uv
+from tests.tools.dependencies import ABSENT, PAGE, ROOT, locked, reasons
 
 
 def named(requirement: str) -> str:

@@ -14,8 +14,8 @@ import jsonschema_rs
 import numpy as np
 import pytest
 
+from pipeline.applications.templates.names import templates_folder
 from pipeline.head_model.data_folder import models_folder
-from pipeline.templates.names import templates_folder
 from rig.camera import Camera, Intrinsics
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import document_from_rig, rig_from_document
@@ -26,9 +26,9 @@ from rig.rig import Rig
 from server.cli.doctor import OTHER_VARIABLES
 from server.settings import PREFIX, ServiceSettings
 from server.storage.store import FOLDERS
-from tests.support.reference import OF_OTHERS
 from tests.support.report_schema import report_schema
 from tests.support.services import ROOT, running_service, small_capture
+from tests.tools.reference import OF_OTHERS
 
 DOCS = ROOT / "docs"
 KEPT = DOCS / "results"  # words around kept figures, no pages

@@ -14,7 +14,7 @@ from pipeline.settings import settings_from_document
 from server.cli.doctor import OTHER_VARIABLES
 from server.cli.main import app
 from server.settings import PREFIX, ServiceSettings
-from tests.support.reference import DOCS, OF_EVERY_COMMAND, OF_OTHERS, ROOMS, pages
+from tests.tools.reference import DOCS, OF_EVERY_COMMAND, OF_OTHERS, ROOMS, pages
 
 ROOT = DOCS.parent
 PAGES = pages()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import results
-from tests.support.results import DOCUMENTS, TABLE, UnknownTable, kept, main, names, take, with_tables
+from tests.tools import results
+from tests.tools.results import DOCUMENTS, TABLE, UnknownTable, kept, main, names, take, with_tables
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.stem)

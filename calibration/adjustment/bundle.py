@@ -2,7 +2,7 @@
 
 It uses the project's Levenberg-Marquardt on blocks of the normal equations (``corner_term``). Eleven cameras and thirty
 shots have 339 unknowns, which a dense Cholesky factor solves in ten milliseconds, so sparse methods would bring nothing
-(docs/lab-notes/calibration.md compares the times with scipy's and Ceres's).
+(tests/laboratory/notes/calibration.md compares the times with scipy's and Ceres's).
 
 Cost: ``sum rho(|r|^2 / sigma_c^2) + priors``. rho is Cauchy's while outliers are sought and Huber's at the end; sigma_c
 is each camera's own noise."""

@@ -9,7 +9,7 @@ around, there is no front camera to be guessed, and every direction is tried. Th
 From each start the contour solver fits pose and a few modes on the coarsest mesh; the best few continue on a finer one,
 and the pose wins that all eigenheads explain most closely: under thick hair, 15 modes cannot distinguish the right pose
 from one that is 50 degrees off. A start that is 10 mm off ends in a local minimum under hair
-(docs/lab-notes/robustness.md), so the robust scale begins at 40 px.
+(tests/laboratory/notes/robustness.md), so the robust scale begins at 40 px.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -4,7 +4,7 @@
 those of a job without the dense stage (``--detail photo --surface head``), after an empty line those that it adds.
 ``float32[2C]`` is a two-dimensional array in C order (A: any strides), with ``r`` behind it one that is not written to;
 ``4*float64`` is a tuple, ``stereo.matching_kernels:Sight{float64[2C];int64}`` a named one. The list is recorded, not
-thought out: ``python -m tests.support.kernel_recorder`` writes it from jobs that it runs, and a test runs a job and
+thought out: ``python -m tests.tools.kernel_recorder`` writes it from jobs that it runs, and a test runs a job and
 fails where the list lacks a loop.
 
 Signatures in the decorators would say the same in 105 places, most of them loops that only other loops call, and a type

@@ -28,7 +28,7 @@ MAX_FOLD_DEG = 100.0  # between the normals of triangles that share an edge
 RINGS = (1, 1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 33, 41, 50)  # about a spot that was spoilt so many times; heads of random
 # shapes and expressions need 5 to 8 of them
 REST_RINGS = (1, 2, 3, 5)  # the same while spots get the mean head's shape. Larger ones move more vertices, and those
-# that are not clean by then seldom are later (docs/lab-notes/meshes.md)
+# that are not clean by then seldom are later (tests/laboratory/notes/meshes.md)
 PLACED_BY = 32  # every so-many-th vertex places the mean head; of so few, BLAS sums alike with any number of threads
 ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles cut off is a part of their loop or lens
 

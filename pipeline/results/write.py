@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.applications.templates.template_file import Template
 from pipeline.compute.threads import task_pool
 from pipeline.results.head_files import write_head
 from pipeline.results.metadata import asset_extras, ply_comments
@@ -36,7 +37,6 @@ from pipeline.results.write_hair import write_hair
 from pipeline.results.write_template import template_colours, write_template
 from pipeline.results.write_template_shapes import write_template_shapes
 from pipeline.stages.bust import Bust
-from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, reassign_images
 from rig.formats.meshes.glb import write_glb

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.applications.templates.flame_fit import FlameFit, fit_flame
+from pipeline.applications.templates.template_file import Template
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.templates.flame_fit import FlameFit, fit_flame
-from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.flame_param import FILE, encoded, flame_param
 

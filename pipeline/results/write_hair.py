@@ -5,11 +5,11 @@ They have the vertex order of head.ply and of head-NAME.obj, whose frames they s
 
 from pathlib import Path
 
+from pipeline.applications.templates.template_file import Template
 from pipeline.results.metadata import asset_extras, ply_comments
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write_template import carried_colours
 from pipeline.stages.bust import HairyHead
-from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.glb import write_glb
 from rig.formats.meshes.ply import write_ply

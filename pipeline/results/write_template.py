@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from pipeline.applications.templates.template_file import Template
 from pipeline.results.head_files import ENCODINGS
 from pipeline.results.metadata import ply_comments
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.templates.template_file import Template
 from pipeline.texturing.template_texture import Tile, corner_tiles, skin_polygons, template_textures
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.obj import MATERIAL

@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from pipeline.applications.templates.animated import AnimatedMesh, animated_mesh
+from pipeline.applications.templates.eyeballs import AHEAD, turn_to
+from pipeline.applications.templates.inner_mouth import WITH_JAW
+from pipeline.applications.templates.template_file import Template
 from pipeline.evidence.expression import BlendshapeRig
 from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.head_model.visemes import VISEMES
 from pipeline.results.metadata import asset_extras
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.templates.animated import AnimatedMesh, animated_mesh
-from pipeline.templates.eyeballs import AHEAD, turn_to
-from pipeline.templates.inner_mouth import WITH_JAW
-from pipeline.templates.template_file import Template
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.glb import glb_bytes
 from rig.formats.meshes.morph_glb import with_morphs

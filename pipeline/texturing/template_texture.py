@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from pipeline.applications.templates.carrying import SurfaceBinding
 from pipeline.geometry.raster_kernels import interpolate, rasterise
-from pipeline.templates.carrying import SurfaceBinding
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
 from rig.formats.meshes.polygon_obj import PolygonMesh, fan
 

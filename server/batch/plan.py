@@ -4,9 +4,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 
+from pipeline.applications.templates.header import check_template
 from pipeline.head_model.model_names import model_path, model_sha256
 from pipeline.settings import Settings, document_from_settings, settings_from_document
-from pipeline.templates.header import check_template
 from rig.digest import document_sha256
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, compose

@@ -9,7 +9,7 @@ import typer
 from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder, warn
 
 if TYPE_CHECKING:
-    from pipeline.clinic.comparison import Comparison
+    from pipeline.applications.clinic.comparison import Comparison
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -43,9 +43,9 @@ def compare(
     tables, and a PDF; what is below two combined standard deviations is grey."""
     if (out / "compare.json").exists() and not overwrite:
         raise Overwrites(out / "compare.json")
-    from pipeline.clinic.comparison import compare as compare_visits
-    from pipeline.clinic.comparison_files import write_comparison
-    from pipeline.clinic.visit import read_visit
+    from pipeline.applications.clinic.comparison import compare as compare_visits
+    from pipeline.applications.clinic.comparison_files import write_comparison
+    from pipeline.applications.clinic.visit import read_visit
 
     comparison = compare_visits(read_visit(earlier, model), read_visit(later, model))
     prepare_folder(out)
@@ -110,11 +110,11 @@ def register(
         raise Overwrites(out / "registration.json")
     from typing import cast
 
-    from pipeline.clinic.registration import register as register_head
-    from pipeline.clinic.registration_files import write_registration
-    from pipeline.clinic.surface import read_surface
-    from pipeline.clinic.surface_landmarks import read_surface_landmarks
-    from pipeline.clinic.visit import read_visit
+    from pipeline.applications.clinic.registration import register as register_head
+    from pipeline.applications.clinic.registration_files import write_registration
+    from pipeline.applications.clinic.surface import read_surface
+    from pipeline.applications.clinic.surface_landmarks import read_surface_landmarks
+    from pipeline.applications.clinic.visit import read_visit
     from rig.formats.meshes.markups import Axes
 
     patient = read_surface(surface, cast(Axes | None, axes))

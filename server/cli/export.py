@@ -21,7 +21,7 @@ def _forms() -> tuple[str, ...]:
 
 
 def _planes() -> tuple[str, ...]:
-    from pipeline.clinic.anatomical_frame import PLANES
+    from pipeline.applications.clinic.anatomical_frame import PLANES
 
     return PLANES
 
@@ -117,9 +117,9 @@ def _export_patient(
     """Writes a result's head in a patient's axes."""
     from typing import cast
 
-    from pipeline.clinic.anatomical_frame import frankfurt_axes, head_axes
-    from pipeline.clinic.patient_files import FRAME_FILE, marked_points, write_patient_files
-    from pipeline.clinic.visit import read_visit
+    from pipeline.applications.clinic.anatomical_frame import frankfurt_axes, head_axes
+    from pipeline.applications.clinic.patient_files import FRAME_FILE, marked_points, write_patient_files
+    from pipeline.applications.clinic.visit import read_visit
     from rig.formats.meshes.markups import Axes
 
     if (out / FRAME_FILE).exists() and not overwrite:

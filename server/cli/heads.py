@@ -46,7 +46,7 @@ def of_output(name: str) -> Callable[[], tuple[str, ...]]:
 
 
 def _templates() -> tuple[str, ...]:
-    from pipeline.templates.names import list_templates
+    from pipeline.applications.templates.names import list_templates
 
     return tuple(list_templates())
 

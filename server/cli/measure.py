@@ -9,7 +9,7 @@ import typer
 from server.cli.answers import Data, Json, answer
 
 if TYPE_CHECKING:
-    from pipeline.clinic.sizes import SizeTable
+    from pipeline.applications.clinic.sizes import SizeTable
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -31,9 +31,9 @@ def measure(
 
     Prints each measure with its standard deviation and ISO name, and of every table of sizes how likely each size
     fits."""
-    from pipeline.clinic.fitting import ISO_NAMES, MEASURES, Fitted, fitting_measures
-    from pipeline.clinic.sizes import choose_size, read_size_tables
-    from pipeline.clinic.visit import read_visit
+    from pipeline.applications.clinic.fitting import ISO_NAMES, MEASURES, Fitted, fitting_measures
+    from pipeline.applications.clinic.sizes import choose_size, read_size_tables
+    from pipeline.applications.clinic.visit import read_visit
 
     tables = [] if sizes is None else read_size_tables(sizes)
     visit = read_visit(result, model)

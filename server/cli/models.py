@@ -51,9 +51,9 @@ def model_import(
 
     It is kept among the models under its name.
     """
+    from pipeline.applications.model_building.sources.imports import import_model
     from pipeline.head_model.data_folder import models_folder
     from pipeline.head_model.model_file import save_model
-    from pipeline.model_building.sources.imports import import_model
 
     with progress_bar() as report:
         parts = import_model(source, name=name, report=report)
@@ -80,8 +80,8 @@ def model_build(
 
     Or from delivered heads: results of one model, a result a person, whose deviations say how far each counts."""
     prepare_file(out)
-    from pipeline.model_building.training.build import build_model
-    from pipeline.verification.delivered_heads import build_from_results
+    from pipeline.applications.model_building.training.build import build_model
+    from pipeline.applications.verification.delivered_heads import build_from_results
 
     with progress_bar() as report:
         if from_results:
@@ -114,7 +114,7 @@ def model_fetch(
 
     Its licence is shown, and it is kept among the models.
     """
-    from pipeline.model_building.sources.fetch import fetch_model
+    from pipeline.applications.model_building.sources.fetch import fetch_model
 
     with progress_bar() as report:
         fetched = fetch_model(name, source=source, report=report)
@@ -133,8 +133,8 @@ def model_show(
     """Draw a model's modes and a correspondence (figures 2 and 3).
 
     And how compact, general and specific it is."""
+    from pipeline.applications.model_building.training.figures import show_model
     from pipeline.head_model.model import load_model
-    from pipeline.model_building.training.figures import show_model
 
     with progress_bar() as report:
         drawn = [str(path) for path in show_model(load_model(name), out, modes=modes, report=report)]

@@ -38,8 +38,8 @@ def reconstruct_locally(
     one is complete. Settings, model, template, capture, ``out`` and ``trace`` are checked before heavy modules are
     loaded. The file ``trace`` receives which thread ran what when, also if the job fails.
     """
+    from pipeline.applications.templates.header import check_template
     from pipeline.settings import settings_from_document
-    from pipeline.templates.header import check_template
 
     share_one_heap()
     chosen = settings_from_document(settings)

@@ -40,17 +40,17 @@ def template_add(
     Its unit and axes are found, or told by landmarks. Look at the picture that is written beside it: skin must lie on
     skin. `reconstruct --template NAME` then writes heads in its vertex order, with its polygons and texture
     coordinates; of a FLAME model it writes the parameters, too. The file stays under its own licence."""
-    from pipeline.templates.names import new_path
+    from pipeline.applications.templates.names import new_path
 
     path = new_path(name or file.stem)
     if path.exists() and not overwrite:
         raise Overwrites(path)
     prepare_file(path)
+    from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks
+    from pipeline.applications.templates.make import make_template
+    from pipeline.applications.templates.template_file import save_template
     from pipeline.head_model.model import load_model
-    from pipeline.model_building.correspondence.scans import landmark_file, read_landmarks
     from pipeline.results.template_picture import template_picture
-    from pipeline.templates.make import make_template
-    from pipeline.templates.template_file import save_template
     from rig.formats.pictures.images import write_image
 
     marked = landmarks or landmark_file(file)
@@ -82,8 +82,8 @@ def _registration_lines(figures: Mapping[str, float]) -> list[str]:
 @template_app.command("list", epilog="Example: eigenhead template list")
 def template_list(data: Data = None, json_out: Json = False) -> None:
     """List the templates at hand, and the models that carry them."""
-    from pipeline.templates.header import BadTemplate, read_header
-    from pipeline.templates.names import list_templates
+    from pipeline.applications.templates.header import BadTemplate, read_header
+    from pipeline.applications.templates.names import list_templates
 
     found, lines = {}, []
     for name, path in list_templates().items():
@@ -103,7 +103,7 @@ def template_remove(
     name: Annotated[str, typer.Argument(help="A template of the list.")], data: Data = None, json_out: Json = False
 ) -> None:
     """Remove a template and its picture."""
-    from pipeline.templates.names import remove_template
+    from pipeline.applications.templates.names import remove_template
 
     path = remove_template(name)
     answer({"name": name, "file": str(path)}, json_out, [f"removed {path}"])

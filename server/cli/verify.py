@@ -11,8 +11,8 @@ from rig.progress import Progress
 from server.cli.reconstruct_local import reconstruct_locally
 
 if TYPE_CHECKING:
-    from pipeline.verification.limits import Limits
-    from pipeline.verification.report import VerificationReport
+    from pipeline.applications.verification.limits import Limits
+    from pipeline.applications.verification.report import VerificationReport
 
 
 class LimitsMissed(EigenheadError):
@@ -44,12 +44,12 @@ def verify_captures(
     The reference is checked before anything is reconstructed. Raises InputError, also if results were made with
     different models, and the errors of the pipeline.
     """
+    from pipeline.applications.verification.judgement import judge
+    from pipeline.applications.verification.measured import identity_of, is_result, read_measured
+    from pipeline.applications.verification.reference import read_reference
+    from pipeline.applications.verification.report import Occasion
+    from pipeline.applications.verification.write import write_verification
     from pipeline.head_model.model import load_model
-    from pipeline.verification.judgement import judge
-    from pipeline.verification.measured import identity_of, is_result, read_measured
-    from pipeline.verification.reference import read_reference
-    from pipeline.verification.report import Occasion
-    from pipeline.verification.write import write_verification
 
     names = _names(captures)
     scan = read_reference(reference, landmarks)
@@ -81,7 +81,7 @@ def verify_captures(
 def read_limits(path: Path | None) -> "Limits":
     """Reads limits from a TOML or JSON file. Those that it omits, or all without a file, have their defaults. Raises
     InputError."""
-    from pipeline.verification.limits import limits_from_document
+    from pipeline.applications.verification.limits import limits_from_document
     from server.tasks.settings_file import settings_document
 
     return limits_from_document(settings_document(path), path.name if path else "limits")

@@ -8,7 +8,7 @@ import typer
 from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, prepare_folder, progress_bar, warn
 
 if TYPE_CHECKING:
-    from pipeline.wrapping.wrap import Wrapped
+    from pipeline.applications.wrapping.wrap import Wrapped
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -38,12 +38,12 @@ def wrap(
     unit, the distance of every vertex from the scan, and a picture to look at."""
     if (out / "wrapped.obj").exists() and not overwrite:
         raise Overwrites(out / "wrapped.obj")
+    from pipeline.applications.model_building.correspondence.scans import read_landmarks
+    from pipeline.applications.templates.load import load_template
+    from pipeline.applications.wrapping.scan import read_raw_scan
+    from pipeline.applications.wrapping.wrap import wrap as wrap_scan
+    from pipeline.applications.wrapping.write import write_wrapped
     from pipeline.head_model.model import load_model
-    from pipeline.model_building.correspondence.scans import read_landmarks
-    from pipeline.templates.load import load_template
-    from pipeline.wrapping.scan import read_raw_scan
-    from pipeline.wrapping.wrap import wrap as wrap_scan
-    from pipeline.wrapping.write import write_wrapped
 
     head_model = load_model(model)
     known = load_template(template, head_model)

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from pipeline.applications.templates.header import BadTemplate, TemplateHeader, read_header
+from pipeline.applications.templates.names import list_templates
 from pipeline.head_model.model_names import list_models, model_path, model_sha256
-from pipeline.templates.header import BadTemplate, TemplateHeader, read_header
-from pipeline.templates.names import list_templates
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,12 +52,12 @@ def reconstruct_capture(
     """
     report("read", 0.0)  # a fresh child loads for seconds what this takes
     share_one_heap()
+    from pipeline.applications.templates.load import load_template
     from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
     from pipeline.settings import settings_from_document
     from pipeline.stages.context import ReconstructionContext
-    from pipeline.templates.load import load_template
     from rig.render.renderer import Renderer
     from server.storage.silhouette_cache import segment_once
     from server.tasks.matching_device import matching_device

@@ -60,11 +60,11 @@ def reconstruct_folder(
     kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
     with span("stage", "compiling"):
         context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))
+    from pipeline.applications.templates.load import load_template
     from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
     from pipeline.stages.context import ReconstructionContext
-    from pipeline.templates.load import load_template
     from rig.render.renderer import Renderer
     from server.tasks.matching_device import matching_device
 

@@ -7,9 +7,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks
 from pipeline.head_model.expressions import closed_lids, weights_from_text
 from pipeline.head_model.model import HeadModel, load_model
-from pipeline.model_building.correspondence.scans import landmark_file, read_landmarks
 from rig.errors import InputError
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh

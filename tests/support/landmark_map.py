@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 
+from pipeline.applications.model_building.sources.imports import import_model
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.landmark_map import faces_digest
 from pipeline.faces.networks import PACKS, FaceNetworks, load_networks
@@ -36,7 +37,6 @@ from pipeline.faces.points import (
 from pipeline.faces.triangulated_face import triangulate_face, unbiased_px
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel, assemble, load_model
-from pipeline.model_building.sources.imports import import_model
 from rig.geometry import Similarity, rigid_fit
 from rig.mesh import vertex_normals
 from rig.render.renderer import Renderer

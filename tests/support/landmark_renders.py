@@ -17,7 +17,6 @@ from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.points import point_table
 from pipeline.head_model.expressions import closed_lids
 from pipeline.head_model.model import HeadModel
-from pipeline.research.people.expressions import drawn_weights
 from rig.capture import ImageRgb
 from rig.formats.cameras.cameras_json import document_from_rig, rig_from_document
 from rig.geometry import Similarity, rigid_fit, rotation_from_vector
@@ -29,6 +28,7 @@ from rig.studio.scene.layout import rig_from_directions
 from rig.studio.scene.lights import LAMPS, Lamp
 from rig.studio.scene.subject import Subject, dress, random_look
 from rig.studio.sensor.sensor import Sensor, expose, focus
+from tests.laboratory.experiments.people.expressions import drawn_weights
 
 SEED = 11
 AZIMUTHS_DEG = (0, 0, 0, -25, 25, -45, 45, -65, 65, -85, 85)

@@ -13,10 +13,10 @@ import scipy.sparse
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from pipeline.applications.templates.carrying import bind_vertices, surface_binding
+from pipeline.applications.templates.flame_model import FlameModel
+from pipeline.applications.templates.template_file import Template
 from pipeline.head_model.model import HeadModel, load_model
-from pipeline.templates.carrying import bind_vertices, surface_binding
-from pipeline.templates.flame_model import FlameModel
-from pipeline.templates.template_file import Template
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
 

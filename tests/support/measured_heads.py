@@ -4,10 +4,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from pipeline.applications.verification.measured import Measured
 from pipeline.head_model.model import load_model
 from pipeline.head_model.regions import head_regions
 from pipeline.head_model.subdivision import vertex_areas
-from pipeline.verification.measured import Measured
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 

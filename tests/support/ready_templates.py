@@ -4,9 +4,9 @@ made by taking out the skin that the model has between them."""
 import numpy as np
 import trimesh
 
+from pipeline.applications.templates.carrying import bind_vertices, surface_binding
+from pipeline.applications.templates.template_file import Template
 from pipeline.head_model.model import HeadModel
-from pipeline.templates.carrying import bind_vertices, surface_binding
-from pipeline.templates.template_file import Template
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
 

@@ -21,7 +21,9 @@ from jaxtyping import AbstractArray, jaxtyped
 
 ROOT = Path(__file__).resolve().parents[2]
 
-COMPILED_BESIDE_OTHERS = ("pipeline/research/peers/soft_rasteriser.py",)  # a loop of its own beside what JAX compiles
+COMPILED_BESIDE_OTHERS = (
+    "tests/laboratory/experiments/peers/soft_rasteriser.py",
+)  # a loop of its own beside what JAX compiles
 
 # PEP 484: where a float is wanted a whole number will do.
 check_types = beartype(conf=BeartypeConf(is_pep484_tower=True))

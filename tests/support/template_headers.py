@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.applications.templates.header import FORMAT
 from pipeline.head_model.model_names import model_path, model_sha256
-from pipeline.templates.header import FORMAT
 
 FIGURES = {
     "vertices": 5023.0,

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.clinic.visit import Visit
+from pipeline.applications.clinic.visit import Visit
+from pipeline.applications.verification.measured import ResultIdentity
 from pipeline.evidence.measurements import Measurement
 from pipeline.head_model.regions import stable_region
-from pipeline.verification.measured import ResultIdentity
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from tests.support.measured_heads import LEVEL, mannequin, measured_head, model

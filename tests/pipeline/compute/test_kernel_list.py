@@ -59,13 +59,13 @@ def test_a_default_job_calls_no_loop_that_the_list_lacks(tmp_path: Path) -> None
         subprocess.run(command, env=python_environment(), check=True, timeout=280)
 
     run(python_command("cli", "simulate", str(tmp_path / "shot"), "--seed", "1"))
-    run([sys.executable, "-m", "tests.support.kernel_recorder", str(tmp_path / "list"), str(tmp_path / "shot")])
+    run([sys.executable, "-m", "tests.tools.kernel_recorder", str(tmp_path / "list"), str(tmp_path / "shot")])
     parts = (tmp_path / "list").read_text(encoding="utf-8").split("\n\n")
     plain, added = ({Kernel.from_line(line) for line in part.splitlines()} for part in parts)
     for called, dense in ((plain, False), (plain | added, True)):
         missing = sorted(kernel.line for kernel in called - set(listed_kernels(dense=dense)))
         assert not missing, (
-            "write the list: python -m tests.support.kernel_recorder pipeline/compute/kernels.txt CAPTURE..."
+            "write the list: python -m tests.tools.kernel_recorder pipeline/compute/kernels.txt CAPTURE..."
         )
     assert len(plain) > 15  # that something was recorded at all
     assert len(added) > 10

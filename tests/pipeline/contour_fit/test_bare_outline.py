@@ -11,11 +11,11 @@ from pipeline.contour_fit.contour import ContourSolution, solve_contour
 from pipeline.head_model.gaussian_process import with_kernel
 from pipeline.head_model.model import HeadModel, load_model, with_modes
 from pipeline.imaging.silhouette import Silhouette, signed_distance, silhouette_from_mask
-from pipeline.research.subjects import exact
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.support.subjects import exact
 
 PX_PER_MM = 1.0
 RADIUS, MIDDLE, SIZE = 90.0, 150, 300

@@ -13,12 +13,12 @@ from pipeline.contour_fit.rim_term import observed_rim, rim_rows
 from pipeline.head_model.gaussian_process import SCALES, covariance, with_kernel
 from pipeline.head_model.model import HeadModel, load_model, with_modes
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.research.paper.robustness import OVER_EARS, spoiled
-from pipeline.research.subjects import binary_silhouettes, exact, mean_error_mm, random_subjects, worn_silhouettes
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.laboratory.experiments.paper.robustness import OVER_EARS, spoiled
+from tests.support.subjects import binary_silhouettes, exact, mean_error_mm, random_subjects, worn_silhouettes
 
 SETTINGS = FittingSettings()
 

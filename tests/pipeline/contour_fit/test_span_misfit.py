@@ -9,11 +9,11 @@ from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.contour_fit.span_misfit import judged_by, with_span_misfit
 from pipeline.head_model.gaussian_process import with_kernel
 from pipeline.head_model.model import HeadModel, load_model, with_modes
-from pipeline.research.subjects import Planted, binary_silhouettes, exact
 from pipeline.settings import FittingSettings
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals
 from rig.studio.scene.layout import default_layout
+from tests.support.subjects import Planted, binary_silhouettes, exact
 
 RELIEF_MM = 0.5
 

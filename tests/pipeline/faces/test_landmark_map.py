@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.applications.model_building.sources.imports import import_model
 from pipeline.faces.landmark_map import (
     CARRIED_MM,
     LandmarkMap,
@@ -17,7 +18,6 @@ from pipeline.faces.points import point_table
 from pipeline.head_model.model import HeadModel, assemble, load_model
 from pipeline.head_model.model_file import read_parts
 from pipeline.head_model.model_names import model_path
-from pipeline.model_building.sources.imports import import_model
 from tests.support.shared_data import shared
 
 NAMED = {  # points that lie on a landmark of the model, or a few millimetres from it

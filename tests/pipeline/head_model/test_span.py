@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from pipeline.applications.model_building.training.model_metrics import of_draws
 from pipeline.head_model.model import load_model, with_modes
-from pipeline.model_building.training.model_metrics import of_draws
-from pipeline.research.paper.span import floor, random_draws, read_truth, run, weighted_quantile
 from rig.errors import InputError
+from tests.laboratory.experiments.paper.span import floor, random_draws, read_truth, run, weighted_quantile
 from tests.support.shared_data import shared
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.applications.templates.flame_file import read_flame
 from pipeline.contour_fit.fit import Fit
 from pipeline.head_model.model import load_model
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
-from pipeline.templates.flame_file import read_flame
 from rig.capture import Capture
 from rig.formats.meshes.polygon_obj import read_polygons
 from rig.geometry import Similarity, rotation_from_vector

@@ -7,13 +7,13 @@ import pytest
 
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.research.subjects import random_subjects, worn_silhouettes
 from pipeline.segmentation.view_consistency import judge_agreement
 from pipeline.settings import SegmentationSettings
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
+from tests.support.subjects import random_subjects, worn_silhouettes
 
 pytestmark = pytest.mark.gl
 SETTINGS = SegmentationSettings()

@@ -5,8 +5,6 @@ import pytest
 
 from pipeline.geometry.raster import depth_maps
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.research.surface.colour_difference import difference_2000, lab_from_srgb
-from pipeline.research.surface.light import face_texels, texels
 from pipeline.settings import TextureSettings
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo, shine_left
 from pipeline.texturing.inpaint import neighbours
@@ -18,6 +16,8 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.mesh import Mesh
+from tests.laboratory.experiments.surface.colour_difference import difference_2000, lab_from_srgb
+from tests.laboratory.experiments.surface.light import face_texels, texels
 from tests.pipeline.texturing.test_paint import without_neck
 from tests.support.photographs import SCREEN
 from tests.support.scenes import SEMI_AXES, ellipsoid, fan, pattern, pixel_grid, ray_ellipsoid

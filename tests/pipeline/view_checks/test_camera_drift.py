@@ -8,11 +8,11 @@ import pytest
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.multiview.tangency import Tangency, find_tangencies
-from pipeline.research.faults.drift import close_up, loosened
 from pipeline.view_checks.camera_drift import _judge, find_drift
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.laboratory.experiments.faults.drift import close_up, loosened
 from tests.support.silhouette_subjects import dressed_head
 
 

@@ -8,10 +8,10 @@ import pytest
 from calibration.scene.rig_scale import times
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.research.subjects import random_subjects, worn_silhouettes
 from pipeline.view_checks.head_size import WrongScale, crown_disc, head_diameter_mm, judge_head_size
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
+from tests.support.subjects import random_subjects, worn_silhouettes
 
 pytestmark = pytest.mark.gl
 STYLES = {

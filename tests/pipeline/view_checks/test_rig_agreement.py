@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
-from pipeline.research.subjects import off_by
 from pipeline.view_checks.rig_agreement import are_loose, misplaced_camera, wrong_rig
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.studio.scene.layout import ARRANGEMENTS_DEG, HEIGHT, WIDTH, arrangement, default_layout
+from tests.support.subjects import off_by
 
 pytestmark = pytest.mark.gl
 

@@ -6,9 +6,9 @@ from types import MappingProxyType
 
 import pytest
 
+from pipeline.applications.templates.names import UnknownTemplate
 from pipeline.head_model.model_names import UnknownModel, model_path, model_sha256
 from pipeline.settings import document_from_settings, settings_from_document
-from pipeline.templates.names import UnknownTemplate
 from rig.errors import InputError
 from rig.messages.message import texts_of
 from server.batch.captures import BatchCapture

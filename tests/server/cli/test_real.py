@@ -11,7 +11,7 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.pictures.images import write_image
 from server.cli.main import app
-from server.cli.real import judge_folders, read_real_capture
+from tests.laboratory.experiments.judge_real import judge_folders, read_real_capture
 from tests.support.services import small_capture
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.applications.model_building.correspondence.scans import write_landmarks
+from pipeline.applications.verification.limits import Limits
 from pipeline.head_model.model import load_model
-from pipeline.model_building.correspondence.scans import write_landmarks
-from pipeline.verification.limits import Limits
 from rig.errors import InputError
 from rig.formats.meshes.obj import obj_bytes
 from rig.formats.meshes.ply import write_ply

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
+from pipeline.applications.templates.names import new_path
+from pipeline.applications.templates.template_file import save_template
 from pipeline.head_model.model import load_model
-from pipeline.templates.names import new_path
-from pipeline.templates.template_file import save_template
 from rig.errors import EigenheadError, InputError
 from server.cli.main import app
 from tests.support.ready_templates import ready_template

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.model_building.correspondence.scans import write_landmarks
+from pipeline.applications.model_building.correspondence.scans import write_landmarks
 from rig.formats.meshes.obj import obj_bytes
 from rig.studio.scene.subject import Subject
 from server.tasks.subjects import subject_of, turn_eyes

@@ -1,0 +1,251 @@
+"""Measures what helmets, masks and spectacles are fitted by, on a delivered head, with standard deviations.
+
+Names are those of ISO 7250-1 and ISO 8559-1 where these have one (``ISO_NAMES``). Measures are taken in the Frankfurt
+plane's attitude (``anatomical_frame``), as a person holds the head:
+
+- head circumference: the tape around the section that holds glabella and opisthocranion and is level from side to side;
+  it lies on the section's convex hull, ears left out;
+- nose-bridge width: of the level section ``BRIDGE_BELOW_NASION_MM`` below nasion, ``PAD_DEPTH_MM`` behind its crest,
+  where the pads of spectacles lie; splay angle: of each flank there to straight ahead; frontal angle: of each flank
+  to the vertical, by the width at two heights;
+- frame angle: of the line that touches brow and cheek before each eye to the vertical, positive where the lower rim of
+  spectacles comes nearer to the face (pantoscopic).
+
+Standard deviations are those of ``DRAWS`` heads: the result's own deviation along the normals (``quality`` of
+head.ply), times a smooth random field with the correlation that the head models have (``gaussian_process.SCALES``).
+That of the frame angle has the plane's own tilt, too.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull, QhullError
+
+from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
+from pipeline.applications.clinic.visit import Visit
+from pipeline.head_model.gaussian_process import SCALES
+
+ISO_NAMES: Mapping[str, str] = {
+    "head_circumference": "head circumference (ISO 7250-1), head girth (ISO 8559-1)",
+    "head_length": "head length (ISO 7250-1)",
+    "head_breadth": "head breadth (ISO 7250-1)",
+    "pupil_distance": "interpupillary distance, far (ISO 13666)",
+    "face_height": "face length, nasion to menton (ISO 7250-1)",
+}
+BRIDGE_BELOW_NASION_MM = 7.0
+PAD_DEPTH_MM = 8.0
+FLANK_DEPTHS_MM = (4.0, 8.0)
+FLANK_HEIGHTS_MM = (5.0, 11.0)  # below nasion
+EYE_HALF_WIDTH_MM = 4.0  # of the band before an eye that a frame's rim spans
+ABOVE_EYE_MM, BELOW_EYE_MM = 35.0, 40.0
+CRANIUM_BEHIND_MM = 40.0  # the ears' line; less is a face without a cranium
+SPARE_MM = 15.0  # longer than any edge of a head
+LOWEST_MM = 60.0  # below nasion nothing is measured
+DRAWS, WAVES = 48, 32
+
+Points = Float[np.ndarray, "_ 3"]
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """Holds a measure and its standard deviation, in ``unit`` (mm or deg)."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UprightHead:
+    """Holds a head in RAS axes of the Frankfurt plane (mm), its landmarks, and which vertices are ears."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: np.ndarray
+    marks: Mapping[str, Float[np.ndarray, " 3"]]
+    ears: Bool[np.ndarray, " v"]
+
+
+def fitting_measures(visit: Visit) -> dict[str, Fitted]:
+    """Returns every measure that the head allows. Raises InputError for heads without the landmarks of the plane."""
+    measured = visit.measured
+    frame = frankfurt_axes(measured, "RAS")
+    motion = frame.patient_from_world
+    marks = {name: motion.apply(point) for name, point in measured.landmarks.items()}
+    whole = motion.apply(measured.mesh_world.vertices)
+    kept = whole[:, 2] > marks["nasion"][2] - LOWEST_MM
+    faces = (np.cumsum(kept) - 1)[measured.mesh_world.faces[kept[measured.mesh_world.faces].all(axis=1)]]
+    vertices, stated = whole[kept], measured.stated_mm[kept]
+    normals = measured.mesh_world.normals()[kept] @ motion.rotation.T
+    head = UprightHead(vertices, faces, marks, measured.regions["ears"][kept])
+    units = {name: value for name, value in _all(head).items() if value is not None}
+    drawn: dict[str, list[float]] = {name: [] for name in units}
+    for field in _fields(vertices):
+        moved = UprightHead(vertices + (stated * field)[:, None] * normals, head.faces, marks, head.ears)
+        for name, value in _all(moved).items():
+            if name in drawn and value is not None:
+                drawn[name].append(value)
+    shared = {"frame_angle": frame.tilt_std_deg or 0.0}
+    return {
+        name: Fitted(
+            value,
+            float(np.hypot(np.std(drawn[name], ddof=1), shared.get(name, 0.0))),
+            "deg" if name.endswith("angle") else "mm",
+        )
+        for name, value in units.items()
+        if len(drawn[name]) > DRAWS // 2
+    }
+
+
+def _all(head: UprightHead) -> dict[str, float | None]:
+    return {name: measure(head) for name, measure in MEASURES.items()}
+
+
+def head_circumference(head: UprightHead) -> float | None:
+    """Returns the length of a tape around the head, mm; None for heads without a cranium."""
+    front = head.marks["glabella"]
+    middle = (np.abs(head.vertices[:, 0] - front[0]) < 5.0) & (head.vertices[:, 2] > 0.0)
+    middle &= head.vertices[:, 1] < -CRANIUM_BEHIND_MM
+    if not middle.any():
+        return None
+    behind = head.vertices[middle]
+    back = behind[np.argmax(np.linalg.norm(behind - front, axis=1))]
+    along = (back - front) * (0.0, 1.0, 1.0)
+    along /= np.linalg.norm(along)
+    normal = np.cross((1.0, 0.0, 0.0), along)
+    faces = head.faces[~head.ears[head.faces].any(axis=1)]
+    points = section(head.vertices, faces, front, normal)
+    return hull_perimeter(np.stack([points[:, 0], points @ along], axis=1))
+
+
+def bridge_width(head: UprightHead) -> float | None:
+    """Returns the width of the nose's bridge where pads lie, mm."""
+    return _width(head, BRIDGE_BELOW_NASION_MM, PAD_DEPTH_MM)
+
+
+def splay_angle(head: UprightHead) -> float | None:
+    """Returns the mean angle of the bridge's flanks to straight ahead, degrees."""
+    narrow, wide = (_width(head, BRIDGE_BELOW_NASION_MM, depth) for depth in FLANK_DEPTHS_MM)
+    return (
+        None if narrow is None or wide is None else _half_angle(wide - narrow, FLANK_DEPTHS_MM[1] - FLANK_DEPTHS_MM[0])
+    )
+
+
+def frontal_angle(head: UprightHead) -> float | None:
+    """Returns the mean angle of the bridge's flanks to the vertical, degrees, positive where it widens downwards."""
+    crest = _crest(head, FLANK_HEIGHTS_MM[0])
+    if crest is None:
+        return None
+    plane = crest - PAD_DEPTH_MM  # a front of spectacles is upright
+    high, low = (_width(head, below, None, plane) for below in FLANK_HEIGHTS_MM)
+    return None if high is None or low is None else _half_angle(low - high, FLANK_HEIGHTS_MM[1] - FLANK_HEIGHTS_MM[0])
+
+
+def frame_angle(head: UprightHead) -> float | None:
+    """Returns the mean tilt of the lines that touch brow and cheek before both eyes, degrees."""
+    found = [_brow_to_cheek(head, side) for side in ("right", "left")]
+    return None if None in found else float(np.mean([angle for angle in found if angle is not None]))
+
+
+MEASURES: Mapping[str, Callable[[UprightHead], float | None]] = {
+    "head_circumference": head_circumference,
+    "nose_bridge_width": bridge_width,
+    "nose_bridge_splay_angle": splay_angle,
+    "nose_bridge_frontal_angle": frontal_angle,
+    "frame_angle": frame_angle,
+}
+
+
+def section(vertices: Points, faces: np.ndarray, origin: Float[np.ndarray, " 3"], normal: np.ndarray) -> Points:
+    """Returns the points where the edges of triangles pass a plane."""
+    height = (vertices - origin) @ normal
+    above = height > 0.0
+    first, second, third = (above[faces[:, corner]] for corner in range(3))
+    passed = faces[(first != second) | (second != third)]
+    edges = np.concatenate([passed[:, [0, 1]], passed[:, [1, 2]], passed[:, [2, 0]]])
+    edges = np.unique(np.sort(edges[above[edges[:, 0]] != above[edges[:, 1]]], axis=1), axis=0)
+    one, other = height[edges[:, 0]], height[edges[:, 1]]
+    share = one / (one - other)
+    return vertices[edges[:, 0]] + share[:, None] * (vertices[edges[:, 1]] - vertices[edges[:, 0]])
+
+
+def hull_perimeter(points: Float[np.ndarray, "n 2"]) -> float | None:
+    """Returns the length of a tape around points of a plane, None if they lie on a line."""
+    try:
+        return float(ConvexHull(points).area)  # the length of the border, in two dimensions
+    except (QhullError, ValueError):
+        return None
+
+
+def _nose_section(head: UprightHead, below_mm: float) -> Points:
+    """Returns the level section of the nose at a height below nasion, from right to left (mm)."""
+    nasion = head.marks["nasion"]
+    reach = np.abs(head.marks["endocanthion_right"][0] - head.marks["endocanthion_left"][0]) / 2.0
+    off = head.vertices - nasion
+    nose = (np.abs(off[:, 0]) < reach + SPARE_MM) & (off[:, 1] > -30.0 - SPARE_MM)
+    nose &= np.abs(off[:, 2] + below_mm) < SPARE_MM
+    faces = head.faces[nose[head.faces[:, 0]]]  # all of them would be a hundred times as many
+    points = section(head.vertices, faces, nasion - (0.0, 0.0, below_mm), np.array([0.0, 0.0, 1.0]))
+    near = (np.abs(points[:, 0] - nasion[0]) < reach) & (points[:, 1] > nasion[1] - 30.0)
+    return points[near][np.argsort(points[near, 0])]
+
+
+def _crest(head: UprightHead, below_mm: float) -> float | None:
+    points = _nose_section(head, below_mm)
+    return float(points[:, 1].max()) if len(points) else None
+
+
+def _width(head: UprightHead, below_mm: float, depth_mm: float | None, plane: float | None = None) -> float | None:
+    """Returns the distance between the flanks in a section, at a depth behind its crest or in an upright plane."""
+    points = _nose_section(head, below_mm)
+    if len(points) < 4:
+        return None
+    top = int(np.argmax(points[:, 1]))
+    level = points[top, 1] - depth_mm if depth_mm is not None else plane
+    sides = []
+    for flank in (points[: top + 1][::-1], points[top:]):
+        behind = np.flatnonzero(flank[:, 1] <= level)
+        if not len(behind) or behind[0] == 0:
+            return None
+        before, after = flank[behind[0] - 1], flank[behind[0]]
+        share = (before[1] - level) / max(before[1] - after[1], 1e-9)
+        sides.append(before[0] + share * (after[0] - before[0]))
+    return float(sides[1] - sides[0])
+
+
+def _half_angle(wider_mm: float, length_mm: float) -> float:
+    return float(np.degrees(np.arctan2(0.5 * wider_mm, length_mm)))
+
+
+def _brow_to_cheek(head: UprightHead, side: str) -> float | None:
+    """Returns the tilt of the line that touches the face above and below an eye, degrees."""
+    eye = 0.5 * (head.marks[f"exocanthion_{side}"] + head.marks[f"endocanthion_{side}"])
+    off = head.vertices - eye
+    near = (np.abs(off[:, 0]) < EYE_HALF_WIDTH_MM) & (off[:, 1] > -25.0)
+    near &= (off[:, 2] < ABOVE_EYE_MM) & (off[:, 2] > -BELOW_EYE_MM)
+    profile = off[near][:, 1:]
+    try:
+        corners = profile[ConvexHull(profile).vertices]
+    except (QhullError, ValueError):
+        return None
+    for one, other in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        low, high = sorted((one, other), key=lambda point: point[1])
+        if low[1] < 0.0 <= high[1] and 0.5 * (low[0] + high[0]) > profile[:, 0].mean():
+            return float(np.degrees(np.arctan2(high[0] - low[0], high[1] - low[1])))
+    return None
+
+
+def _fields(vertices: Points) -> list[Float[np.ndarray, " v"]]:
+    """Returns smooth random fields of unit variance over a surface: sums of waves with the spectrum of the kernel."""
+    rng = np.random.default_rng(0)
+    weights = np.array([scale.amplitude_mm**2 for scale in SCALES])
+    lengths = np.array([scale.length_mm for scale in SCALES])
+    picked = lengths[rng.choice(len(SCALES), (DRAWS, WAVES), p=weights / weights.sum())]
+    waves = rng.standard_normal((DRAWS, WAVES, 3)) / picked[:, :, None]
+    phases = rng.uniform(0.0, 2.0 * np.pi, (DRAWS, WAVES))
+    places = vertices.astype(np.float32)
+    return [
+        np.sqrt(2.0 / WAVES) * np.cos(places @ wave.T.astype(np.float32) + phase.astype(np.float32)).sum(axis=1)
+        for wave, phase in zip(waves, phases, strict=True)
+    ]

@@ -1,0 +1,143 @@
+"""Lays a head on the surface of the same person's CT or CBCT, given as a mesh in mm in LPS or RAS.
+
+The motion is rigid: photographs and CT both measure millimetres, and what a scale would take up is an error that should
+be seen. It starts from landmarks where the surface has some, else from the head in the Frankfurt plane, for a patient
+stands or lies in a scanner upright within some tens of degrees: turned by up to ``TURNS_DEG``, its face at many places
+of the surface. The best starts are completed by a trimmed, robust fit of the face (``trimmed_fit``), and the one in
+which most of the face lies on the surface wins: soft tissue of another day, a chin rest, a field of view that ends at
+the forehead, and the surfaces of skull and airways contradict the rest.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.cluster.vq import kmeans2
+from scipy.spatial.transform import Rotation
+
+from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
+from pipeline.applications.clinic.surface import PatientSurface
+from pipeline.applications.clinic.trimmed_fit import Patch, TrimmedFit, trimmed_fit
+from pipeline.applications.clinic.visit import Visit
+from pipeline.applications.verification.best_fit import ROUNDS, drawn, search_motions, surface_points
+from pipeline.head_model.landmarks import stacked
+from rig.errors import InputError
+from rig.geometry import RigidTransform, rigid_fit
+from rig.messages.message import compose
+
+TURNS_DEG = {"x": (-25.0, 0.0, 25.0), "z": (-30.0, 0.0, 30.0)}  # nodding and turning; tilts are found by the way
+PLACES = 12  # of the surface's parts that look forward, at which the face may begin
+FORWARD = 0.2  # cosine to the front from which a surface looks forward
+SHARE = 0.8  # of the face with a counterpart that must agree
+POINTS = 2500
+FEW = 600  # of these, for telling starts apart
+STARTS = 5
+MIN_MARKS = 3
+MIN_KEPT = 0.3  # share of the face, below which it is not this head
+NOT_THIS_MM = 2.0
+SAME_MM = 1.0  # near enough to the surface to count for a start
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """Holds the motion of a head onto a surface. ``distance_mm`` is each vertex's signed distance (positive outside the
+    surface), NaN without a counterpart; ``start`` is "landmarks" or "frankfurt"."""
+
+    visit: Visit
+    surface: PatientSurface
+    start: str
+    fit: TrimmedFit
+    distance_mm: Float[np.ndarray, " v"]
+
+    def figures(self) -> dict[str, float]:
+        """Returns what is left between head and surface (mm), over the face."""
+        face = self.visit.measured.regions["face"]
+        known = face & np.isfinite(self.distance_mm)
+        away, areas = np.abs(self.distance_mm[known]), self.visit.measured.areas
+        return {
+            "covered_share": float(areas[known].sum() / areas[face].sum()),
+            "kept_share": self.fit.kept_share,
+            "kept_std_mm": self.fit.std_mm,
+            "median_mm": float(np.median(away)),
+            "rms_mm": float(np.sqrt(np.average(away**2, weights=areas[known]))),
+            "p95_mm": float(np.quantile(away, 0.95)),
+        }
+
+
+def register(
+    visit: Visit, surface: PatientSurface, landmarks: Mapping[str, Float[np.ndarray, " 3"]] | None = None
+) -> Registration:
+    """Finds the motion of a head onto a surface. Raises InputError if the surface is not that of this head.
+
+    Args:
+        visit: the head.
+        surface: of the patient.
+        landmarks: of the surface, in its frame, three or more of the 26; or none.
+    """
+    measured = visit.measured
+    rng = np.random.default_rng(0)
+    face = measured.regions["face"] & ~measured.regions["eyes"]
+    rows = np.flatnonzero(face & (visit.views > 0) if (face & (visit.views > 0)).any() else face)
+    rows = rows[drawn(measured.areas[rows], POINTS, rng)]
+    normals = measured.mesh_world.normals()
+    patch = Patch(measured.mesh_world.vertices[rows], normals[rows], measured.areas[rows])
+    names = [name for name in landmarks or {} if name in measured.landmarks]
+    if landmarks and len(names) >= MIN_MARKS:
+        start, starts = "landmarks", [rigid_fit(stacked(measured.landmarks, names), stacked(landmarks, names))]
+    else:
+        start, starts = "frankfurt", _searched(visit, surface, patch, rng)
+    best = _best(patch, surface, starts)
+    if best is None or best.kept_share < MIN_KEPT or best.std_mm > NOT_THIS_MM:
+        off = float("inf") if best is None else best.std_mm
+        raise InputError(surface.reference.name, [compose("surface-not-this-head", head=measured.name, off_mm=off)])
+    distance = _distances(visit, surface, best.motion, normals)
+    return Registration(visit, surface, start, best, distance)
+
+
+def _searched(visit: Visit, surface: PatientSurface, patch: Patch, rng: np.random.Generator) -> list[RigidTransform]:
+    """Returns starting motions: the head in the Frankfurt plane, turned a little, its face on the surface's parts that
+    look forward."""
+    upright = frankfurt_axes(visit.measured, surface.axes).patient_from_world
+    forward = np.array([0.0, -1.0 if surface.axes == "LPS" else 1.0, 0.0])
+    angles = [(nod, turn) for nod in TURNS_DEG["x"] for turn in TURNS_DEG["z"]]
+    turns = Rotation.from_euler("xz", angles, degrees=True).as_matrix()
+    points, facing = surface_points(surface.reference, rng)
+    ahead = points[facing @ forward > FORWARD]
+    ahead = points if len(ahead) < 10 * PLACES else ahead
+    places = np.asarray(kmeans2(ahead, PLACES, minit="++", rng=rng)[0])
+    some = slice(0, ROUNDS[-1].points)
+    there = upright.apply(patch.points[some])
+    found = search_motions(
+        there, patch.normals[some] @ upright.rotation.T, points, facing, turns=turns, places=places
+    )  # fmt: skip
+    return [RigidTransform(motion.rotation, motion.translation) @ upright for motion in found]
+
+
+def _best(patch: Patch, surface: PatientSurface, starts: list[RigidTransform]) -> TrimmedFit | None:
+    """Returns the completed fit of the start from which most of the face comes to lie on the surface."""
+    reference = surface.reference
+    few = Patch(patch.points[:FEW], patch.normals[:FEW], patch.areas[:FEW])
+    if len(starts) > 1:
+        tried = [
+            trimmed_fit(few, reference.index, start, share=SHARE, beside=reference.beside) for start in starts[:STARTS]
+        ]
+        fits = [fit for fit in tried if fit is not None]
+        if not fits:
+            return None
+        starts = [
+            max(fits, key=lambda fit: np.mean(np.abs(np.nan_to_num(fit.residual_mm, nan=np.inf)) < SAME_MM)).motion
+        ]
+    return trimmed_fit(patch, reference.index, starts[0], share=SHARE, beside=reference.beside)
+
+
+def _distances(
+    visit: Visit, surface: PatientSurface, motion: RigidTransform, normals: Float[np.ndarray, "v 3"]
+) -> Float[np.ndarray, " v"]:
+    """Returns the signed distance of every vertex to the surface, NaN where that has nothing of the head."""
+    there, facing = motion.apply(visit.measured.mesh_world.vertices), normals @ motion.rotation.T
+    hits = surface.reference.index.closest(there, facing=facing)
+    alike: Bool[np.ndarray, " v"] = np.einsum("nx,nx->n", facing, hits.normals) > 0.3
+    known = (hits.distances < 10.0) & alike & ~surface.reference.beside(hits)
+    side = np.einsum("nx,nx->n", there - hits.points, hits.normals)
+    return np.where(known, np.copysign(hits.distances, side), np.nan)

@@ -1,0 +1,119 @@
+"""Fits a model directly to a surface: Gauss-Newton on point-to-plane distances, pose and coefficients together.
+
+It measures the best fit that a model can reach (tests/laboratory/notes/head-models.md), transfers landmarks from one
+model to another, and starts correspondence. Point-to-plane steps follow Chen and Medioni (1992); the prior is z ~ N(0, I)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.geometry.surface_index import Hits, SurfaceIndex
+from pipeline.head_model.model import HeadModel
+from rig.geometry import RigidTransform, rotation_from_vector
+
+_STEP_MM = 5e-3  # mean move of a step at which the iteration ends
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceFit:
+    """Holds the head of a model that fits a surface best."""
+
+    coefficients: Float[np.ndarray, " m"]  # standard deviations
+    target_from_head: RigidTransform
+    distances: Float[np.ndarray, " N"]  # mm, of each point to the fitted surface
+    iterations: int
+
+    def vertices(self, model: HeadModel, level: str = "full") -> Float[np.ndarray, "V 3"]:
+        """Returns the fitted head in the target's frame."""
+        return self.target_from_head.apply(model.vertices(self.coefficients, level))
+
+    def measured(self, model: HeadModel, points: Float[np.ndarray, "N 3"], level: str = "full") -> "SurfaceFit":
+        """Returns the same fit with the distances of other points."""
+        index = SurfaceIndex(self.vertices(model, level), model.levels[level].faces)
+        return replace(self, distances=index.closest(points).distances)
+
+
+def fit_surface(
+    model: HeadModel,
+    points: Float[np.ndarray, "N 3"],
+    weights: Float[np.ndarray, " N"],
+    start: RigidTransform,
+    count: int,
+    *,
+    sigma_mm: float = 0.5,
+    spread_mm: float = 10.0,
+    level: str = "full",
+    iterations: int = 40,
+) -> SurfaceFit:
+    """Estimates the pose and ``count`` coefficients that bring the model's surface to the points, under the prior.
+
+    ``weights`` are the areas (mm²) that the points represent. Residuals of neighbouring points are not independent, so
+    one residual of standard deviation ``sigma_mm`` counts per ``spread_mm`` squared of surface. The first iterations
+    fit only the pose and few modes and downweight distant points (Geman and McClure), so that a rough start does not
+    distort the head."""
+    basis = model.basis(level, count)
+    faces = model.levels[level].faces
+    z, pose = np.zeros(count), start
+    information = weights / spread_mm**2 / sigma_mm**2
+    used = 0
+    for step in range(iterations):
+        active = count if step >= 8 else (0, 0, 0, 5, 5, 15, 15, 30)[step]
+        hits = _closest(model, z, pose, level, faces, points)
+        scale = max(3.0 * float(np.median(hits.distances)), 3.0 * sigma_mm) if step < 12 else np.inf
+        robust = (1 + (hits.distances / scale) ** 2) ** -2
+        moved, z, pose = _gauss_newton_step(
+            basis[: min(active, count)], faces, hits, points, information * robust, z=z, pose=pose
+        )
+        used = step + 1
+        if step > 12 and moved < _STEP_MM:
+            break
+    return SurfaceFit(z, pose, _closest(model, z, pose, level, faces, points).distances, used)
+
+
+def _closest(
+    model: HeadModel,
+    z: Float[np.ndarray, " m"],
+    pose: RigidTransform,
+    level: str,
+    faces: Int[np.ndarray, "F 3"],
+    points: Float[np.ndarray, "N 3"],
+) -> Hits:
+    return SurfaceIndex(pose.apply(model.vertices(z, level)), faces).closest(points)
+
+
+def _gauss_newton_step(
+    basis: Float[np.ndarray, "m V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    hits: Hits,
+    points: Float[np.ndarray, "N 3"],
+    information: Float[np.ndarray, " N"],
+    *,
+    z: Float[np.ndarray, " M"],
+    pose: RigidTransform,
+) -> tuple[float, Float[np.ndarray, " M"], RigidTransform]:
+    """Takes one Gauss-Newton step. Returns the mean length of its move (mm), and the new coefficients and pose."""
+    active = len(basis)
+    corners = faces[hits.triangles]
+    normals = hits.normals
+    centre = points.mean(0)
+    jacobian = np.empty((len(points), active + 6))
+    turned = normals @ pose.rotation  # n^T R
+    for k in range(active):
+        moves = np.einsum("nc,ncx->nx", hits.weights, basis[k][corners])
+        jacobian[:, k] = np.einsum("nx,nx->n", moves, turned)
+    jacobian[:, active : active + 3] = normals
+    jacobian[:, active + 3 :] = np.cross(hits.points - centre, normals)
+    residual = np.einsum("nx,nx->n", points - hits.points, normals)
+    weighted = jacobian * information[:, None]
+    normal_matrix = weighted.T @ jacobian
+    normal_matrix[range(active), range(active)] += 1.0  # prior
+    gradient = weighted.T @ residual
+    gradient[:active] -= z[:active]
+    delta = np.linalg.solve(normal_matrix, gradient)
+    new = z.copy()
+    new[:active] += delta[:active]
+    twist = rotation_from_vector(delta[active + 3 :])
+    shift = delta[active : active + 3]
+    moved = RigidTransform(twist @ pose.rotation, twist @ (pose.translation - centre) + centre + shift)
+    return float(np.abs(jacobian @ delta).mean()), new, moved

@@ -1,0 +1,116 @@
+"""Builds a head model from a folder of raw scans: checks, correspondence (section 3.2), alignment, principal components
+(3.1)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.applications.model_building.correspondence.correspondence import Matching, correspond
+from pipeline.applications.model_building.correspondence.parallel import workers
+from pipeline.applications.model_building.correspondence.scan_checks import Checked, check
+from pipeline.applications.model_building.correspondence.scans import Scan, find_scans, read_scan
+from pipeline.applications.model_building.training.training import Training, train
+from pipeline.head_model.model import HeadModel, assemble
+from pipeline.head_model.model_file import ModelParts, read_parts, save_model
+from pipeline.head_model.model_names import model_path
+from rig.errors import InputError
+from rig.progress import Progress
+
+FEWEST = 3  # heads; they give two modes, and each can be left out to measure generalisation
+_SHARPENINGS = 4  # steps of the iteration in ``cages_through``
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Built:
+    """Holds a model built from scans, and the names of the scans that were used, repaired or skipped."""
+
+    parts: ModelParts
+    used: tuple[str, ...]
+    repaired: Mapping[str, tuple[str, ...]]  # what was repaired, by scan
+    skipped: Mapping[str, str]  # why a scan was left out, by scan
+
+
+def build_model(
+    scans_folder: Path,
+    out: Path,
+    *,
+    name: str,
+    licence: str = "not stated",
+    on_bad: Literal["stop", "skip"] = "stop",
+    matching: Matching | None = None,
+    report: Progress | None = None,
+) -> Built:
+    """Builds a model from the scans of a folder and saves it as ``out``.
+
+    Every scan is checked before any other work. With ``on_bad="stop"`` bad scans raise InputError, which names all of
+    them; with ``"skip"`` they are left out. Raises InputError too if fewer than 3 sound scans remain."""
+    parts, sha256 = read_parts(model_path("default"))
+    template = assemble(parts, sha256)
+    good, skipped = read_checked(scans_folder, template, report=report)
+    if skipped and on_bad == "stop":
+        raise InputError(str(scans_folder), [*skipped.values(), "mend or remove them, or choose to skip bad scans"])
+    if len(good) < FEWEST:
+        raise InputError(str(scans_folder), [f"{len(good)} sound scans, needed are {FEWEST}", *skipped.values()])
+    heads = corresponded_cages([entry.scan for entry in good], template, matching, report=report)
+    training = Training(
+        name=name,
+        licence=licence,
+        source=f"{len(good)} raw scans",
+        notice="Built by eigenhead from raw scans; the rights in the scans apply.",
+        subjects={"total": len(good), "male": 0, "female": 0},  # scans do not say
+        heads=heads,
+        faces=parts.faces,
+        landmarks=template.landmarks,
+        subdivisions=parts.subdivisions,
+    )
+    built = train(training, report=report)
+    save_model(out, built)
+    repaired = {entry.scan.name: entry.repairs for entry in good if entry.repairs}
+    return Built(built, tuple(entry.scan.name for entry in good), repaired, skipped)
+
+
+def read_checked(
+    folder: Path, template: HeadModel, *, report: Progress | None = None
+) -> tuple[list[Checked], dict[str, str]]:
+    """Returns the sound scans of a folder, and the faults of the others by name. Raises InputError for an empty
+    folder."""
+    paths = find_scans(folder)
+    with workers(2, len(paths)) as crew:
+        found = crew.over(partial(_read_and_check, template), paths, "checking scans", report)
+    good = [entry for entry in found if isinstance(entry, Checked)]
+    return good, {path.stem: fault for path, fault in zip(paths, found, strict=True) if isinstance(fault, str)}
+
+
+def _read_and_check(template: HeadModel, path: Path) -> Checked | str:
+    """Returns the checked scan, or a text that says what is wrong with it."""
+    try:
+        return check(read_scan(path), template)
+    except InputError as fault:
+        return str(fault)
+
+
+def corresponded_cages(
+    scans: Sequence[Scan], template: HeadModel, matching: Matching | None = None, *, report: Progress | None = None
+) -> Float[np.ndarray, "N V0 3"]:
+    """Computes cages (mm) whose subdivided surface passes through the corresponded points of the scans."""
+    return cages_through(correspond(scans, template, matching, report=report).heads, template)
+
+
+def cages_through(points: Float[np.ndarray, "N V0 3"], template: HeadModel) -> Float[np.ndarray, "N V0 3"]:
+    """Computes cages (mm) whose subdivided surface passes through the points at the cage's vertices.
+
+    The subdivided surface lies inside of the cage. So the cage C must solve S C = P, where S are the rows of the
+    subdivision matrix for the cage vertices. S nearly removes detail as fine as the cage itself, so its inverse would
+    amplify noise. A few steps C += P - S C, started with the template's own detail, stop before that."""
+    rows = template.levels["full"].operator[: len(template.mean)]
+    mean = template.mean.astype(float)
+    away = points - rows @ mean
+    cages = away.copy()
+    for _ in range(_SHARPENINGS):
+        cages += away - np.array([rows @ cage for cage in cages])
+    return mean + cages

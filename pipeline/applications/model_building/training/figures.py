@@ -1,0 +1,181 @@
+"""Draws a model: its first modes (figure 2), correspondence step by step (figure 3), and curves of its quality.
+
+Everything is shaded and drawn in software, so that machines without graphics card and plotting library show the
+same."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from pipeline.applications.model_building.correspondence.correspondence import (
+    Matching,
+    common_frame,
+    on_reference,
+    prepared,
+    warp_and_resample,
+)
+from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex
+from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
+from pipeline.applications.model_building.training import model_metrics
+from pipeline.applications.model_building.training.training import USED_MODES
+from pipeline.geometry.raster import picture
+from pipeline.head_model.landmarks import NAMES
+from pipeline.head_model.model import HeadModel
+from rig.camera import Camera, Intrinsics
+from rig.geometry import look_at
+from rig.mesh import vertex_normals
+from rig.progress import Progress
+
+Image = UInt8[np.ndarray, "H W 3"]
+
+PANEL = (260, 320)  # width, height of one head
+SKIN, VOID = np.array([214.0, 190.0, 172.0]), np.array([196.0, 60.0, 40.0])
+INK, GRID, PAPER = (40, 40, 40), (222, 222, 222), (255, 255, 255)
+LINES = ((0, 114, 178), (213, 94, 0), (0, 158, 115))  # Okabe and Ito: distinct for every kind of colour vision
+_LIGHT = np.array([0.35, 0.45, 0.82])
+_FIELD_MM = 365.0  # height of every panel: one scale for all, since size is one of the modes
+_DISTANCE_MM = 1600.0
+_BEHIND_RAD = 2.4
+
+
+def show_model(model: HeadModel, folder: Path, *, modes: int = 5, report: Progress | None = None) -> list[Path]:
+    """Writes modes.png, correspondence.png and curves.png (the last where training heads are known) into a folder."""
+    say = report or (lambda stage, fraction: None)
+    say("drawing modes", 0.0)
+    pictures = {"modes.png": modes_figure(model, modes)}
+    say("drawing correspondence", 0.0)
+    pictures["correspondence.png"] = correspondence_figure(model)
+    if len(model.scores):
+        pictures["curves.png"] = curves_figure(model, report=report)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in pictures.items():
+        _, data = cv2.imencode(".png", image[:, :, ::-1])
+        (folder / name).write_bytes(data.tobytes())
+    return [folder / name for name in pictures]
+
+
+def shaded(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    marked: Bool[np.ndarray, " V"] | None = None,
+    azimuth_rad: float = 0.45,
+) -> Image:
+    """Returns one head (head frame, mm) lit from the upper left; ``marked`` vertices are red."""
+    turn = np.array([np.sin(azimuth_rad), 0.0, np.cos(azimuth_rad)])
+    width, height = 2 * PANEL[0], 2 * PANEL[1]
+    focal = height * _DISTANCE_MM / _FIELD_MM
+    centre = np.array([0.0, -15.0, 0.0])
+    lens = Intrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    camera = Camera("figure", lens, look_at(centre + _DISTANCE_MM * turn, centre, np.array([0.0, 1.0, 0.0])))
+    right = np.array([turn[2], 0.0, -turn[0]])
+    light = _LIGHT[2] * turn + _LIGHT[1] * np.array([0.0, 1.0, 0.0]) - _LIGHT[0] * right
+    brightness = 0.35 + 0.65 * np.clip(vertex_normals(vertices, faces) @ light, 0, 1)
+    tone = np.where(marked[:, None], VOID, SKIN) if marked is not None else SKIN
+    colours = np.clip(brightness[:, None] * tone * 1.1, 0, 255).astype(np.uint8)
+    return cv2.resize(picture(camera, vertices, faces, colours, PAPER), PANEL, interpolation=cv2.INTER_AREA)
+
+
+def modes_figure(model: HeadModel, modes: int = 5) -> Image:
+    """Draws figure 2: one row for each mode, with heads at -3, 0 and +3 standard deviations."""
+    faces = model.levels["full"].faces
+    rows = []
+    for k in range(min(modes, len(model.modes))):
+        z = np.eye(k + 1)[k]
+        panels = []
+        for step in (-3, 0, 3):
+            drawn = shaded(model.vertices(step * z), faces)
+            panels.append(_titled(drawn, f"mode {k + 1}: {step:+d} sd" if step else "mean"))
+        rows.append(np.hstack(panels))
+    return np.vstack(rows)
+
+
+def correspondence_figure(model: HeadModel, *, seed: int = 3) -> Image:
+    """Draws figure 3: reference, target scan, warped reference, and resampled head with its voids in red.
+
+    Each is seen from the front and from behind. Both heads are drawn at random from the model and scanned by the
+    simulated scanner, holes included."""
+    rng = np.random.default_rng(seed)
+    count = min(20, len(model.modes))
+    faces = model.levels["full"].faces
+    scanner = Scanner(spacing_mm=2.0, holes=5, hole_mm=20.0)
+    scans = [
+        scan_head("drawn", model.vertices(rng.standard_normal(count)), faces, model.landmarks, scanner, rng)
+        for _ in range(2)
+    ]
+    frames = common_frame(scans, model)
+    reference, target = (prepared(scan, frame) for scan, frame in zip(scans, frames, strict=True))
+    matching = Matching()
+    index = np.array([model.landmarks[name] for name in NAMES])
+    shape = on_reference(reference, model, matching)
+    cylinder = CylinderIndex(target.vertices, scans[1].faces)
+    warped, sampled, void = warp_and_resample(shape, index, target.marks, cylinder, matching)
+    cage = model.levels["cage"].faces
+    steps = (
+        ("reference", shape, cage, None),
+        ("target scan", target.vertices, scans[1].faces, None),
+        ("warped reference", warped, cage, None),
+        (f"resampled, {void.mean():.0%} void", sampled, cage, void),
+    )
+    front = [_titled(shaded(v, f, marked), title) for title, v, f, marked in steps]
+    return np.vstack([np.hstack(front), np.hstack([shaded(v, f, marked, _BEHIND_RAD) for _, v, f, marked in steps])])
+
+
+def curves_figure(model: HeadModel, *, report: Progress | None = None) -> Image:
+    """Draws compactness, generalisation (leave one out) and specificity as curves over the number of modes."""
+    counts = [
+        c for c in (1, 2, 5, 10, 20, 40, USED_MODES, 100, 137) if c <= min(len(model.modes), len(model.scores) - 1)
+    ]
+    region = model.levels["cage"].face_region
+    components = model_metrics.components_of(model.mean, model.modes, model.scores)
+    compact = model_metrics.compactness(model.sigma)
+    apart = model_metrics.generalisation(components, region, counts, report=report)
+    heads = (model.mean + np.tensordot(model.scores, model.modes, 1)).astype(float)
+    special = {
+        c: model_metrics.specificity(components.mean, components.modes[:c], heads, region, draws=30) for c in counts
+    }
+    charts = [
+        ("compactness: share of variance", {k + 1: float(v) for k, v in enumerate(compact)}),
+        ("generalisation: leave one out, mm", apart),
+        ("specificity: random draw to nearest head, mm", special),
+    ]
+    return np.hstack([chart(title, values, colour) for (title, values), colour in zip(charts, LINES, strict=True)])
+
+
+def chart(title: str, values: Mapping[int, float], colour: tuple[int, int, int]) -> Image:
+    """Draws one curve over the number of modes, from zero up, with its axes."""
+    width, height, left, bottom, top = 420, 320, 55, 275, 40
+    canvas = np.full((height, width, 3), PAPER, np.uint8)
+    most, highest = max(values), max(values.values())
+    step = next(s for s in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 100.0) if highest / s <= 6)
+    ceiling = step * np.ceil(highest / step - 1e-9)
+
+    def at(modes: float, value: float) -> tuple[int, int]:
+        return round(left + (width - left - 20) * modes / most), round(bottom - (bottom - top) * value / ceiling)
+
+    for k in range(round(ceiling / step) + 1):
+        place = at(0, k * step)
+        cv2.line(canvas, place, at(most, k * step), GRID, 1)
+        _text(canvas, f"{k * step:.1f}", (10, place[1] + 4))
+    for modes in range(0, most + 1, 20 if most > 40 else max(1, most // 5)):
+        _text(canvas, str(modes), (at(modes, 0)[0] - 8, bottom + 18))
+    points: Sequence[tuple[int, int]] = [at(m, v) for m, v in sorted(values.items())]
+    cv2.polylines(canvas, [np.array(points, np.int32)], isClosed=False, color=colour, thickness=2, lineType=cv2.LINE_AA)
+    if len(points) < 20:
+        for point in points:
+            cv2.circle(canvas, point, 4, colour, -1, cv2.LINE_AA)
+    _text(canvas, title, (left, 22), 0.48)
+    _text(canvas, "modes", (width - 70, bottom + 36))
+    return canvas
+
+
+def _titled(image: Image, title: str) -> Image:
+    out = image.copy()
+    _text(out, title, (8, 18), 0.48)
+    return out
+
+
+def _text(image: Image, text: str, at: tuple[int, int], size: float = 0.42) -> None:
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, INK, 1, cv2.LINE_AA)

@@ -1,0 +1,98 @@
+"""A registered mesh that can be animated: Apple's 52 shapes and the visemes on it, without crossing, its pivots, and
+eyeballs, teeth and a tongue where its eyes are open and its lips part and it has none."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.applications.templates.carrying import SurfaceBinding
+from pipeline.applications.templates.contact import RestSurface, kept_apart, rest_surface
+from pipeline.applications.templates.eyeballs import STRAIGHT, Eyeball, lifted, placed_eyeballs
+from pipeline.applications.templates.inner_mouth import InnerMouth, kept_off_teeth, placed_inner_mouth
+from pipeline.applications.templates.pivots import EYE_REACH_MM, Points, jaw_motions, pivots
+from pipeline.applications.templates.shape_carrying import Neutral, carried_shapes, loose_parts
+from pipeline.head_model.visemes import VISEMES, mixed
+
+LIDS = "eye"  # what the names of shapes that close or move lids begin with
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnimatedMesh:
+    """Holds a mesh without expression, its shapes and its pivots, in the head frame, mm."""
+
+    neutral: Float[np.ndarray, "t 3"]
+    shapes: Mapping[str, Float[np.ndarray, "t 3"]]  # displacements at weight 1: Apple's, others of the head, visemes
+    pivots: Mapping[str, Float[np.ndarray, " 3"]]
+    eyeballs: Mapping[str, Int[np.ndarray, " b"]]  # rows of the mesh, by pivot
+    added: Mapping[str, Eyeball] = field(default_factory=dict)  # eyeballs that the mesh lacks, by pivot
+    inner: InnerMouth = field(default_factory=InnerMouth)  # teeth and tongue that the mesh lacks
+    gazes: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # of eyes that were seen, by pivot
+
+
+def animated_mesh(
+    surface_binding: SurfaceBinding,
+    triangles: Int[np.ndarray, "g 3"],
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    shapes: Mapping[str, Float[np.ndarray, "v 3"]],
+    landmark_rows: Mapping[str, int],
+    *,
+    gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
+) -> AnimatedMesh:
+    """Carries shapes to a mesh and keeps its lips and lids apart; adds the visemes, pivots, eyeballs, teeth and
+    tongue.
+
+    Args:
+        surface_binding: how the model carries the mesh.
+        triangles: of the mesh.
+        vertices: the model's full level without expression, head frame, mm.
+        faces: its triangles.
+        shapes: displacements of that level, by Apple's names or the model's.
+        landmark_rows: the model's landmarks, rows of that level.
+        gazes: where eyes look (unit vectors, head frame), by pivot; straight ahead where there is none.
+    """
+    mesh = surface_binding.on(vertices, faces)
+    landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
+    carried = carried_shapes(surface_binding, triangles, Neutral(vertices, faces, mesh), shapes, landmarks)
+    balls = [
+        np.flatnonzero(surface_binding.wholes == number) for number in range(surface_binding.wholes.max(initial=-1) + 1)
+    ]
+    found = pivots(landmarks, vertices, shapes, [mesh[rows] for rows in balls])
+    eyes = {
+        name: rows
+        for name, pivot in found.items()
+        for rows in balls
+        if name.startswith("eye_") and np.linalg.norm(mesh[rows].mean(axis=0) - pivot) < 0.5 * EYE_REACH_MM
+    }
+    lacking = {name: pivot for name, pivot in found.items() if name.startswith("eye_") and name not in eyes}
+    added = placed_eyeballs(mesh, triangles, landmarks, lacking, gazes)
+    found |= {name: eyeball.centre for name, eyeball in added.items()}
+    shapes_of_mesh = parted_shapes(rest_surface(mesh, triangles), carried)
+    if added:
+        shapes_of_mesh = {name: lifted(mesh, triangles, shape, added) for name, shape in shapes_of_mesh.items()}
+    loose = np.where(surface_binding.wholes >= 0, -1, loose_parts(surface_binding, triangles, len(mesh)))
+    jaw = jaw_motions(landmarks, vertices, shapes)
+    inner = placed_inner_mouth(mesh, triangles, shapes_of_mesh, landmarks, jaw, loose)
+    moves = kept_off_teeth(mesh, triangles, shapes_of_mesh, inner)
+    return AnimatedMesh(mesh, moves, found, eyes, added, inner, gazes)
+
+
+def parted_shapes(
+    rest: RestSurface, shapes: Mapping[str, Float[np.ndarray, "t 3"]]
+) -> dict[str, Float[np.ndarray, "t 3"]]:
+    """Returns shapes without crossing, and the visemes mixed of them without crossing.
+
+    ``mouthClose`` closes a mouth that ``jawOpen`` has opened, and is kept apart together with that shape: without it
+    lips cross, as Apple's definition has it."""
+    out = {
+        name: kept_apart(rest, shape, closing=name.startswith(LIDS))
+        for name, shape in shapes.items()
+        if name != "mouthClose"
+    }
+    if "mouthClose" in shapes:
+        jaw = out.get("jawOpen", np.zeros_like(rest.vertices))
+        out["mouthClose"] = kept_apart(rest, jaw + shapes["mouthClose"], closing=False) - jaw
+    out = {name: out[name] for name in shapes}
+    return out | {name: kept_apart(rest, mixed(out, mixture), closing=False) for name, mixture in VISEMES.items()}

@@ -1,0 +1,100 @@
+"""Reads the header of a template's file, without its arrays, and checks whether a job may use the template. Loads no
+model: the command line, the service and the console call it before any work begins."""
+
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.applications.templates.names import template_path
+from pipeline.head_model.model_names import model_path, model_sha256
+from rig.errors import EigenheadError
+from rig.messages.message import Message, compose
+
+FORMAT = "eigenhead-template/1"
+WORDS = ("name", "source", "source_sha256", "model_name", "model_sha256")
+DAMAGE = (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+class BadTemplate(EigenheadError):
+    """Reports a file that should hold a registered template but is of another kind, or damaged."""
+
+    def __init__(self, path: Path, why: Message | str) -> None:
+        super().__init__(compose("template-unusable", path=str(path), why=why, name=path.stem))
+        self.why = why
+
+
+class OtherModel(EigenheadError):
+    """Reports a template that was registered to another model than the one in use."""
+
+    def __init__(self, template: "TemplateHeader", model_name: str) -> None:
+        same = template.model_name == model_name
+        super().__init__(
+            compose(
+                "template-of-other-version" if same else "template-of-other-model",
+                template=f"{template.name!r}",
+                model=f"{template.model_name!r}",
+                wanted=f"{model_name!r}",
+                source=template.source,
+                name=f"{template.name[:20]}-2",
+                wanted_name=model_name,
+            )
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class TemplateHeader:
+    """Holds which mesh was registered to which model, and the figures that say how well."""
+
+    name: str
+    source: str  # the OBJ file's name
+    source_sha256: str
+    model_name: str
+    model_sha256: str
+    figures: Mapping[str, float] = field(default_factory=dict)  # of the registration
+
+    def check_model(self, model_name: str, model_sha256: str) -> None:
+        """Raises OtherModel if the template was registered to another model."""
+        if model_sha256 != self.model_sha256:
+            raise OtherModel(self, model_name)
+
+
+def read_header(path: Path) -> TemplateHeader:
+    """Returns the header of a template file. Raises BadTemplate if the file cannot be read, is damaged or of another
+    kind."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            meta = read_meta(path, file)
+        return TemplateHeader(**header_words(meta), figures=meta["figures"])
+    except OSError as error:
+        raise BadTemplate(path, error.strerror or compose("file-unreadable")) from None
+    except DAMAGE as fault:
+        raise BadTemplate(path, compose("file-incomplete", reason=str(fault))) from None
+
+
+def read_meta(path: Path, file: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Returns the decoded ``meta`` of an open template file. Raises BadTemplate for another kind of file."""
+    if "meta" not in file:
+        raise BadTemplate(path, compose("template-without-format"))
+    meta = json.loads(file["meta"].tobytes())
+    if meta.get("format") != FORMAT:
+        raise BadTemplate(path, compose("format-other", format=f"{meta.get('format')!r:.40}", wanted=f"{FORMAT!r}"))
+    return meta
+
+
+def header_words(meta: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the text fields of a header from its decoded ``meta``. Raises KeyError if one is missing."""
+    return {word: str(meta[word]) for word in WORDS}
+
+
+def check_template(name: str | None, model: str) -> None:
+    """Checks that a job with this model (a name or a file) can use the named template; None is always allowed. Raises
+    UnknownTemplate, BadTemplate, OtherModel, UnknownModel."""
+    path = model_path(model)
+    if name is not None:
+        read_header(template_path(name)).check_model(model, model_sha256(path))

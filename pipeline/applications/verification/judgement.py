@@ -1,0 +1,197 @@
+"""The figures of a verification, in the spirit of VDI/VDE 2634 part 3, with a mannequin in place of its spheres.
+
+Deviations are signed distances (mm, positive outside) of a measured head's vertices to the reference after the best
+fit, weighted by the area that each vertex stands for. Vertices whose closest point lies at the rim of the scan, or
+farther than 10 mm, are not judged, and the share that is left is told.
+
+- probing error, form: the range of the deviations of 99.7 % of the face's area;
+- probing error, size: the scale of the best fit with a scale, by 1, in percent;
+- distance error: distances between landmarks, measured less those of the reference. They need no alignment;
+- repeatability: scatter of the heads over the captures (``repeatability``); the limit is for that along the normal,
+  the surface's own, since which vertex lies where on it is no one's concern here;
+- error by region: mean, RMS, median and 95th percentile, and what all captures have in common (``repeated``).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.applications.verification.best_fit import BestFit, best_fit, counted
+from pipeline.applications.verification.limits import Check, Limits, checks
+from pipeline.applications.verification.measured import Measured
+from pipeline.applications.verification.reference import Reference
+from pipeline.applications.verification.repeatability import scatter
+from pipeline.evidence.measurements import DISTANCES
+from pipeline.head_model.regions import REGIONS
+from rig.errors import InputError
+
+FORM_SHARE = 0.997  # of the area; the rest are outliers, as three of a thousand points
+FEATURES = ("eyes", "nose", "mouth")
+MIN_COVERED = 0.2  # share of a region, below which it has no figures
+MIN_FACING = 0.5  # share of the judged face where both surfaces face the same way
+
+
+@dataclass(frozen=True, slots=True)
+class RegionError:
+    """Holds the deviations (mm) of a region of the head, weighted by area. ``covered`` is the share of the region's
+    area that the reference shows."""
+
+    covered: float
+    mean_mm: float
+    rms_mm: float
+    median_mm: float  # of the distances, as ``p95_mm``
+    p95_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """Holds the judgement of one capture. ``deviation_mm`` is the signed distance of each vertex to the reference, NaN
+    where it has no counterpart."""
+
+    name: str
+    fit: BestFit
+    deviation_mm: Float[np.ndarray, " v"]
+    regions: Mapping[str, RegionError]
+    probing_form_mm: float
+    distances_mm: Mapping[str, tuple[float, float]]  # measured, and of the reference
+    warnings: tuple[str, ...]
+
+    @property
+    def size_error_percent(self) -> float:
+        """Returns by how many percent the head is too large; negative if it is too small."""
+        return 100.0 * (self.fit.scale - 1.0)
+
+    @property
+    def distance_rms_mm(self) -> float | None:
+        """Returns the RMS error (mm) of the distances between landmarks; None without any distance."""
+        off = [measured - true for measured, true in self.distances_mm.values()]
+        return float(np.sqrt(np.mean(np.square(off)))) if off else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """Holds the judgement of all captures together.
+
+    ``repeated_mm`` is the mean deviation over the captures at each vertex, ``repeated`` its errors by region.
+    ``repeatability`` has the figures of ``Scatter`` by region; it is empty for a single capture.
+    """
+
+    captures: tuple[Judged, ...]
+    repeated_mm: Float[np.ndarray, " v"]
+    repeated: Mapping[str, RegionError]
+    repeatability: Mapping[str, Mapping[str, float]]
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Tells whether all limits are kept. A figure that could not be judged (no landmarks, a single capture) does
+        not fail."""
+        return all(check.passed is not False for check in self.checks)
+
+
+def judge(measured: Sequence[Measured], reference: Reference, limits: Limits) -> Judgement:
+    """Judges heads of one model and one subject against the reference. Raises InputError if the reference is not of
+    this head."""
+    captures = tuple(judge_one(one, reference) for one in measured)
+    first = measured[0]
+    deviations = np.stack([one.deviation_mm for one in captures])
+    known = np.isfinite(deviations).all(axis=0)
+    repeated_mm = np.where(known, np.where(known, deviations, 0.0).mean(axis=0), np.nan)
+    repeatability: dict[str, dict[str, float]] = {}
+    if len(measured) > 1:
+        heads = np.stack([one.mesh_world.vertices for one in measured])
+        found = scatter(heads, first.mesh_world.faces, first.regions["face"])
+        stated = np.sqrt(np.mean([one.stated_mm**2 for one in measured], axis=0))
+        named = {name: first.regions[name] for name in REGIONS if first.regions[name].any()}
+        repeatability = {name: found.figures(stated, first.areas, kept) for name, kept in named.items()}
+    values = _values(captures, repeatability)
+    repeated = region_errors(repeated_mm, first)
+    return Judgement(captures, repeated_mm, repeated, repeatability, checks(limits, values))
+
+
+def judge_one(measured: Measured, reference: Reference) -> Judged:
+    """Judges one head against the reference. Raises InputError if the reference is not of this head, or its faces look
+    inwards."""
+    fit = best_fit(measured, reference)
+    there = fit.reference_from_world.apply(measured.mesh_world.vertices)
+    hits = reference.index.closest(there)
+    side = np.einsum("nc,nc->n", there - hits.points, hits.normals)
+    deviation = np.where(counted(hits, reference), np.copysign(hits.distances, side), np.nan)
+    face = measured.regions["face"] & np.isfinite(deviation)
+    turned = measured.mesh_world.normals() @ fit.reference_from_world.rotation.T
+    facing = np.average(np.einsum("nc,nc->n", turned, hits.normals)[face] > 0, weights=measured.areas[face])
+    if facing < MIN_FACING:
+        raise InputError(reference.name, ["faces inwards: turn its triangles over, or mirror it back"])
+    regions = region_errors(deviation, measured)
+    form = weighted_range(deviation[face], measured.areas[face], FORM_SHARE)
+    return Judged(measured.name, fit, deviation, regions, form, distance_pairs(measured, reference), measured.warnings)
+
+
+def region_errors(deviation_mm: Float[np.ndarray, " v"], measured: Measured) -> dict[str, RegionError]:
+    """Returns the errors of every region of which the reference covers at least ``MIN_COVERED``."""
+    found = {}
+    known = np.isfinite(deviation_mm)
+    for name in REGIONS:
+        region = measured.regions[name]
+        whole, kept = float(measured.areas[region].sum()), region & known
+        covered = float(measured.areas[kept].sum()) / whole if whole else 0.0
+        if covered >= MIN_COVERED:
+            found[name] = _region_error(deviation_mm[kept], measured.areas[kept], covered)
+    return found
+
+
+def _region_error(deviation_mm: Float[np.ndarray, " n"], areas: Float[np.ndarray, " n"], covered: float) -> RegionError:
+    distance = np.abs(deviation_mm)
+    return RegionError(
+        covered,
+        float(np.average(deviation_mm, weights=areas)),
+        float(np.sqrt(np.average(distance**2, weights=areas))),
+        *weighted_quantiles(distance, areas, (0.5, 0.95)),
+    )
+
+
+def weighted_range(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], share: float) -> float:
+    """Returns the range of the values that holds the given share of the weight; half of the rest is cut off on each
+    side."""
+    low, high = weighted_quantiles(values, weights, (0.5 - share / 2, 0.5 + share / 2))
+    return high - low
+
+
+def weighted_quantiles(
+    values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], shares: Sequence[float]
+) -> list[float]:
+    """Returns the value below which each of the given shares (0 to 1) of the total weight lies, interpolated."""
+    order = np.argsort(values)
+    reached = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
+    return np.interp(shares, reached, values[order]).tolist()
+
+
+def distance_pairs(measured: Measured, reference: Reference) -> dict[str, tuple[float, float]]:
+    """Returns every anthropometric distance (mm) whose landmarks both the head and the reference have: measured on the
+    head, and on the reference."""
+    found = {}
+    for name, (one, other) in DISTANCES.items():
+        if all(mark in marks for mark in (one, other) for marks in (measured.landmarks, reference.landmarks)):
+            lengths = [
+                float(np.linalg.norm(marks[other] - marks[one])) for marks in (measured.landmarks, reference.landmarks)
+            ]
+            found[name] = (lengths[0], lengths[1])
+    return found
+
+
+def _values(captures: Sequence[Judged], repeatability: Mapping[str, Mapping[str, float]]) -> dict[str, float | None]:
+    """Returns the figures of the worst capture, by the names of the limits."""
+    faces = [one.regions.get("face") for one in captures]
+    features = [one.regions[name].rms_mm for one in captures for name in FEATURES if name in one.regions]
+    distances = [rms for one in captures if (rms := one.distance_rms_mm) is not None]
+    return {
+        "face_rms_mm": max((face.rms_mm for face in faces if face), default=None),
+        "features_rms_mm": max(features, default=None),
+        "probing_form_mm": max(one.probing_form_mm for one in captures),
+        "size_error_percent": max(abs(one.size_error_percent) for one in captures),
+        "distance_mm": max(distances, default=None),
+        "repeatability_mm": repeatability["face"]["normal_rms_mm"] if repeatability else None,
+        "least_covered": min(face.covered if face else 0.0 for face in faces),
+    }

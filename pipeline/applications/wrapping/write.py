@@ -1,0 +1,127 @@
+"""Writes a wrapped scan: the template's OBJ with its texture, the residual map, a report, and a picture to look at."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pipeline.applications.wrapping.baking import baked_textures, vertex_colours
+from pipeline.applications.wrapping.wrap import Wrapped, residual_colours, surface_in_head
+from pipeline.results.clay import clay
+from pipeline.results.overlays import contact_sheet
+from pipeline.results.write_template import template_materials, tile_suffix
+from rig.atomic_write import write_atomically
+from rig.formats.meshes.ply import ply_bytes
+from rig.formats.meshes.polygon_obj import polygon_obj_bytes
+from rig.formats.pictures.images import write_image
+from rig.image import ImageRgb
+from rig.mesh import Mesh, vertex_normals
+
+FORMAT = "eigenhead-wrap/1"
+JPEG_QUALITY = 95
+AZIMUTHS_DEG, CLOSE_MM, CLOSE_UP = (0.0, 50.0), 85.0, (640, 480)
+
+
+def write_wrapped(folder: Path, wrapped: Wrapped) -> dict[str, Any]:
+    """Writes wrapped.obj (.mtl, .jpg), residual.ply, residual.npz, wrap.json and wrap.png. Returns the document of
+    wrap.json. Raises OSError."""
+    _write_obj(folder, wrapped)
+    _write_residuals(folder, wrapped)
+    document = document_of(wrapped)
+    write_atomically(folder / "wrap.json", (json.dumps(document, indent=1) + "\n").encode())
+    write_image(folder / "wrap.png", wrap_picture(wrapped))
+    return document
+
+
+def document_of(wrapped: Wrapped) -> dict[str, Any]:
+    """Returns what wrap.json says."""
+    placed, template = wrapped.placed, wrapped.template
+    place = placed.head_from_scan
+    return {
+        "format": FORMAT,
+        "scan": placed.scan.name,
+        "template": {"name": template.name, "sha256": template.source_sha256, "model": template.model_name},
+        "unit": placed.unit,
+        "mm_per_unit": placed.mm_per_unit,
+        "up": placed.up,
+        "front": placed.front,
+        "turned_over": placed.turned_over,
+        "face_views": placed.views,
+        "head_from_scan": {
+            "scale": place.scale, "rotation": place.rotation.tolist(), "translation": place.translation.tolist()
+        },
+        "figures": wrapped.figures(),
+    }  # fmt: skip
+
+
+def _write_obj(folder: Path, wrapped: Wrapped) -> None:
+    template, textures = wrapped.template, baked_textures(wrapped)
+    files = {tile: f"wrapped{tile_suffix(tile)}.jpg" for tile in textures}
+    for tile, image in textures.items():
+        quality = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
+        _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[:, :, ::-1]), quality)
+        write_atomically(folder / files[tile], data.tobytes())
+    mesh, library = template.mesh, None
+    if textures:
+        mesh, materials = template_materials(template, files)
+        library = "wrapped.mtl"
+        write_atomically(folder / library, materials)
+    data = polygon_obj_bytes(
+        mesh,
+        wrapped.vertices,
+        vertex_normals(wrapped.vertices, mesh.triangles()),
+        colours=vertex_colours(wrapped) if wrapped.placed.scan.is_coloured and not textures else None,
+        comments=[f"{wrapped.placed.scan.name} in the vertex order of {template.name} sha256 {template.source_sha256}"],
+        library=library,
+        decimals=_decimals(wrapped.placed.mm_per_unit),
+    )
+    write_atomically(folder / "wrapped.obj", data)
+
+
+def _decimals(mm_per_unit: float) -> int:
+    """Returns the decimals that hold a tenth of a micrometre in the scan's unit."""
+    return 4 + max(0, int(np.ceil(np.log10(mm_per_unit))))
+
+
+def _write_residuals(folder: Path, wrapped: Wrapped) -> None:
+    triangles = wrapped.template.mesh.triangles()
+    colours = residual_colours(wrapped.distance_mm, wrapped.covered)
+    data = ply_bytes(
+        Mesh(wrapped.vertices, triangles),
+        normals=vertex_normals(wrapped.vertices, triangles),
+        colours=colours,
+        quality=wrapped.distance_mm,
+        views=wrapped.covered.astype(np.uint8),
+        comments=["quality: distance of the vertex from the scan, mm", "views: 1 where the scan has a surface"],
+    )
+    write_atomically(folder / "residual.ply", data)
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed, distance_mm=wrapped.distance_mm.astype(np.float32), covered=wrapped.covered.astype(np.uint8)
+    )
+    write_atomically(folder / "residual.npz", packed.getvalue())
+
+
+def wrap_picture(wrapped: Wrapped) -> ImageRgb:
+    """Draws, from the front and the side, the scan in clay, the template on it, and the residuals; below, the face from
+    nearer."""
+    scan, template = surface_in_head(wrapped)
+    colours = residual_colours(wrapped.distance_mm, wrapped.covered)
+    box = (template.vertices.min(axis=0), template.vertices.max(axis=0))
+    middle = wrapped.placed.marks.points.mean(axis=0)
+    close = (middle - CLOSE_MM, middle + CLOSE_MM)
+    meshes = (
+        ("the scan", Mesh(scan.vertices, scan.faces), None),
+        ("in the template's order", Mesh(template.vertices, template.faces), None),
+        ("its distance: yellow 0.5 mm, red 1 mm", Mesh(template.vertices, template.faces), colours),
+    )
+    rows = []
+    for turn in AZIMUTHS_DEG:
+        rows.append([(text, clay(mesh, colours=kind, azimuth_deg=turn, box=box)) for text, mesh, kind in meshes])
+        rows.append([
+            ("", clay(mesh, colours=kind, azimuth_deg=turn, box=close, panel=CLOSE_UP)) for _, mesh, kind in meshes
+        ])  # fmt: skip
+    return contact_sheet(rows)

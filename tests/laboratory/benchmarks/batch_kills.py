@@ -1,0 +1,120 @@
+"""What SIGKILLs leave of a batch; prints one JSON object.
+
+    python -m tests.laboratory.benchmarks.batch_kills pinned [CAPTURES] [KILLS] [PROCESSES]   pinned work: 500 captures, 20 kills
+    python -m tests.laboratory.benchmarks.batch_kills real [CAPTURES] [KILLS] [PROCESSES]     heads of the studio, level span: 60
+
+All processes that are killed have the whole of one folder. ``results``: complete ones at the end; ``bytes_differ``:
+files that are not those of an undisturbed run (but for seconds); ``left_over``: files that an undisturbed run does not
+have; ``begun_twice``: captures that two undisturbed processes side by side both began, of pinned work, where both have
+the whole folder (``1/1``), and where each has its shard (``1/2``, ``2/2``).
+"""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from rig.render.renderer import Renderer
+from tests.support.pinned_batch import everything_in, pinned_captures
+from tests.support.pinned_work import LOG, SECONDS
+from tests.support.services import ROOT
+from tests.support.small_studio import small_studio_captures
+
+PINNED_S = "0.05"
+SEED = 37
+
+
+def command_of(kind: str, shots: Path, out: Path, shard: str) -> list[str]:
+    if kind == "pinned":
+        return [sys.executable, "-m", "tests.support.pinned_batch", str(shots), str(out), "2", shard]
+    options = ["--out", str(out), "--detail", "span", "--surface", "head", "--workers", "2", "--shard", shard]
+    return [sys.executable, "-m", "server.cli", "batch", str(shots), *options]
+
+
+def start(kind: str, shots: Path, out: Path, log: Path | None = None, shard: str = "1/1") -> "subprocess.Popen[bytes]":
+    environment = os.environ | {SECONDS: PINNED_S} | ({} if log is None else {LOG: str(log)})
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(command_of(kind, shots, out, shard), cwd=ROOT, env=environment, stdout=quiet, stderr=quiet)
+
+
+def finish(running: "list[subprocess.Popen[bytes]]") -> float:
+    """Seconds until all have ended, each with status 0."""
+    began = time.monotonic()
+    for process in running:
+        assert process.wait() == 0, process.args
+    return time.monotonic() - began
+
+
+def kill_often(kind: str, shots: Path, out: Path, *, kills: int, processes: int, seconds: float) -> None:
+    """SIGKILL to one process after the other, each started again, spread over the time that the work takes."""
+    rng = random.Random(SEED)
+    running = [start(kind, shots, out) for _ in range(processes)]
+    for number in range(kills):
+        time.sleep(rng.uniform(0.5, 1.5) * seconds / kills)
+        victim = running[number % processes]
+        victim.send_signal(signal.SIGKILL)
+        victim.wait()
+        running[number % processes] = start(kind, shots, out)
+    finish(running)
+
+
+def begun_twice(shots: Path, folder: Path, shards: tuple[str, str]) -> int:
+    """How many captures two processes both began, which between them have begun all."""
+    log = folder / "log"
+    finish([start("pinned", shots, folder / "heads", log, shard) for shard in shards])
+    begun = Counter(line.split()[2] for line in log.read_text().splitlines() if " begins " in line)
+    assert begun.keys() == {path.name for path in shots.iterdir()}
+    return sum(count > 1 for count in begun.values())
+
+
+def figures_of(kind: str, captures: int, kills: int, processes: int, folder: Path) -> dict[str, Any]:
+    shots = folder / "shots"
+    if kind == "pinned":
+        pinned_captures(shots, captures)
+    else:
+        with Renderer.create() as renderer:
+            small_studio_captures(shots, captures, renderer)
+    undisturbed, out = folder / "undisturbed" / "heads", folder / "killed" / "heads"
+    seconds = finish([start(kind, shots, undisturbed)])
+    began = time.monotonic()
+    kill_often(kind, shots, out, kills=kills, processes=processes, seconds=seconds)
+    killed_s = time.monotonic() - began
+    wanted, found = everything_in(undisturbed), everything_in(out)
+    return {
+        "captures": captures,
+        "kills": kills,
+        "processes": processes,
+        "results": len(list(out.glob("*/batch.json"))),
+        "files": len(found),
+        "bytes_differ": sum(found.get(name) != digest for name, digest in wanted.items()),
+        "left_over": len(found.keys() - wanted.keys()),
+        "seconds_undisturbed": round(seconds, 1),
+        "seconds_with_kills": round(killed_s, 1),
+    } | ({"begun_twice": twice_of_all(shots, folder)} if kind == "pinned" else {})
+
+
+def twice_of_all(shots: Path, folder: Path) -> dict[str, int]:
+    found = {}
+    for shards in (("1/1", "1/1"), ("1/2", "2/2")):
+        both = folder / shards[0].replace("/", "-")
+        both.mkdir()
+        found[" and ".join(shards)] = begun_twice(shots, both, shards)
+    return found
+
+
+def main(kind: str, *numbers: str) -> None:
+    captures, kills, processes = [*map(int, numbers), *(500 if kind == "pinned" else 60, 20, 2)[len(numbers) :]]
+    with tempfile.TemporaryDirectory() as folder:
+        figures = figures_of(kind, captures, kills, processes, Path(folder))
+    sys.stdout.write(json.dumps({"figures": figures}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,364 @@
+"""Compares levels of detail: eigenheads alone, with kernel modes, and with photographs, together with a visual hull.
+
+Every figure is of a whole reconstruction from photographs: own masks, own alignment, calibration as given. Distances
+are from the true face region, weighted by area, to the delivered surface, without realignment. Subjects:
+
+- captures with a truth beside them (``<name>`` and ``<name>.truth``), rendered by another program;
+- random heads of another population, with all its modes, photographed in the simulated studio;
+- random heads of the model's own 60 modes in the same studio, which the span contains: what do more modes cost there?
+
+Further figures: each camera left out and predicted from the others, a moved camera and a wrong mask, and how many true
+vertices lie in the posterior's 95 % intervals along the normal.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.contour_fit.fit import Fit
+from pipeline.contour_fit.posterior import vertex_deviation_mm
+from pipeline.contour_fit.rim import find_rim, make_topology, pack_views
+from pipeline.geometry.raster import camera_depths, depth_maps
+from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.geometry.surface_index import SurfaceIndex
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.subdivision import vertex_areas
+from pipeline.multiview.visual_hull import visual_hull
+from pipeline.reconstruct import fit_shape
+from pipeline.segmentation.segment import segment
+from pipeline.settings import Settings, document_from_settings
+from pipeline.stages.alignment import align_head
+from pipeline.stages.context import ReconstructionContext
+from pipeline.stages.faces import find_faces
+from pipeline.stages.recorder import Recorder
+from pipeline.stages.views import find_views
+from pipeline.texturing.vertex_colours import texture
+from rig.camera import Camera
+from rig.capture import Capture
+from rig.formats.captures.capture_folder import read_capture
+from rig.formats.meshes.mesh_file import read_mesh
+from rig.mesh import Mesh
+from rig.progress import Progress, discard_progress
+from rig.render.renderer import Renderer
+from rig.rig import Rig
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import simulate
+from rig.studio.scene.subject import Subject
+from rig.studio.scene.visible import VisiblePoints
+from rig.studio.sensor.faults import Fault
+from rig.studio.sensor.preset import PRESET, Preset
+from tests.laboratory.experiments.outcome import Outcome
+from tests.laboratory.experiments.paper.span import weighted_quantile
+from tests.laboratory.experiments.records import Records, Row
+from tests.laboratory.experiments.surface.visible_surface import read_visible
+
+Level = Literal["span", "kernel", "photo"]
+LEVELS: tuple[Level, ...] = ("span", "kernel", "photo")
+IN_SPAN_MODES, IN_SPAN_SPREAD = 60, 0.8  # section 5.2
+FAULTS = {"bumped": Fault("bumped", "cam03", 0.1), "wrong-mask": Fault("wrong-mask", "cam03")}
+SHOWN_PX = 1.5  # a photograph's own outline is the face's where they are that close; elsewhere it is hair
+FAR_MM = 8.0  # along a normal nothing is looked for beyond
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """Holds a capture whose true surface is known."""
+
+    name: str
+    capture: Capture
+    rig: Rig
+    mesh: Mesh  # world frame
+    face: Bool[np.ndarray, " v"]
+    visible: VisiblePoints
+    landmarks: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)  # world frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """Holds the fit of one level of detail to a capture."""
+
+    fit: Fit
+    model: HeadModel  # with the modes that the fit has
+    level: str
+    seconds: float
+
+    def mesh(self) -> Mesh:
+        """Returns the fitted head on the full level, world frame, mm."""
+        vertices = self.fit.world_from_head.apply(self.model.vertices(self.fit.coefficients))
+        return Mesh(vertices, self.model.levels["full"].faces)
+
+
+def run(
+    models: Mapping[str, HeadModel],
+    captures: Mapping[str, Path],
+    *,
+    renderer: Renderer,
+    report: Progress,
+    others: HeadModel | None = None,
+    draws: int = 20,
+    in_span: int = 10,
+    held_out: bool = True,
+    folder: Path | None = None,
+) -> Outcome:
+    """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
+    ``<subject>_<model>_<level>_<quantity>``.
+
+    Args:
+        models: by the name in the figures; the first one is used for random heads, faults and left-out cameras.
+        captures: folders with a truth beside them.
+        renderer: for the studio.
+        report: progress.
+        others: the population from which random heads are drawn.
+        draws: number of random heads of it.
+        in_span: number of random heads of the first model's span.
+        held_out: whether cameras are left out and predicted.
+        folder: keeps rows, which are not computed again.
+    """
+    records = Records(folder, "detail", _key(models, others))
+    label, model = next(iter(models.items()))
+    jobs: list[Job] = []
+    for name, path in captures.items():
+        for other, with_model in models.items():
+            jobs.append((f"{name}_{other}", partial(known_row, partial(read_known, path), with_model, renderer)))
+        jobs.append((f"{name}_hull", partial(hull_row, partial(read_known, path))))
+    if others is not None:
+        drawn = partial(photographed, others, len(others.modes), 1.0, renderer=renderer)
+        jobs += [(f"draw-{i:02}_{label}", partial(known_row, partial(drawn, i), model, renderer)) for i in range(draws)]
+        for kind, fault in FAULTS.items() if draws else ():
+            jobs.append((f"{kind}_{label}", partial(known_row, partial(drawn, 0, fault=fault), model, renderer)))
+    photographed_in_span = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer)
+    jobs += [
+        (f"inspan-{i:02}_{label}", partial(known_row, partial(photographed_in_span, i), model, renderer))
+        for i in range(in_span)
+    ]
+    for name, path in captures.items() if held_out else ():
+        for camera in read_capture(path)[1].names:
+            compute = partial(held_out_row, path, camera, model, renderer)
+            jobs.append((f"heldout-{name}-{camera}_{label}", compute))
+    rows = []
+    for done, (name, compute) in enumerate(jobs):
+        report(name, done / len(jobs))
+        rows.append({"name": name, **records.row(name, compute)})
+    report("done", 1.0)
+    return {"figures": figures(rows), "rows": rows}
+
+
+Job = tuple[str, Callable[[], Row]]
+
+
+def read_known(folder: Path) -> Known:
+    """Returns a capture folder and the truth beside it. Raises InputError."""
+    capture, rig = read_capture(folder)
+    truth = folder.with_name(folder.name + ".truth")
+    mesh, face = read_mesh(truth / "head.ply"), np.load(truth / "face_mask.npy")
+    return Known(folder.name, capture, rig, mesh, face, read_visible(truth))
+
+
+def photographed(
+    population: HeadModel,
+    modes: int,
+    spread: float,
+    seed: int,
+    *,
+    renderer: Renderer,
+    fault: Fault | None = None,
+    preset: Preset = PRESET,
+) -> Known:
+    """Photographs a random head in the simulated studio. The same seed gives the same head, look and pose, whatever the
+    fault."""
+    rng = np.random.default_rng((9, seed))
+    coefficients = spread * rng.standard_normal(modes)
+    level = population.levels["full"]
+    head = Mesh(population.vertices(coefficients), level.faces)
+    marks = {name: head.vertices[row] for name, row in population.landmarks.items()}
+    subject = Subject(head, marks, level.face_region, f"seed-{seed}")
+    faults = () if fault is None else (fault,)
+    shot = simulate(subject, default_layout(), preset, rng, renderer=renderer, faults=faults)
+    head_world = shot.scene.head
+    places = {name: head_world.vertices[row] for name, row in population.landmarks.items()}
+    return Known(subject.name, shot.capture, shot.rig, head_world, level.face_region, shot.scene.visible, places)
+
+
+def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
+    """Runs every level of detail on one subject. Returns ``{level: {quantity: value}}``."""
+    subject = known()
+    return {
+        level: {
+            "reached": fitted.level,
+            **surface_error(subject, fitted.mesh()),
+            **posterior_cover(subject, fitted),
+            "fit_s": fitted.seconds,
+        }
+        for level, fitted in every_level(subject.capture, subject.rig, model, LEVELS, renderer).items()
+    }
+
+
+def every_level(
+    capture: Capture, rig: Rig, model: HeadModel, levels: tuple[Level, ...], renderer: Renderer
+) -> dict[Level, Fitted]:
+    """Fits every level of detail to a capture; masks and alignment are computed once for all."""
+    context = ReconstructionContext(capture, rig, model, Settings(), renderer)
+    run = Recorder(discard_progress)
+    views = run(find_views, context)
+    faces = run(find_faces, context, views.capture)
+    alignment = run(align_head, context, views, faces)
+    fitted = {}
+    for level in levels:
+        began = time.perf_counter()
+        at_level = replace(context, settings=replace(context.settings, detail=level))
+        _, head = fit_shape(run, at_level, views, alignment)
+        fitted[level] = Fitted(head.fit, head.model, head.detail.level, time.perf_counter() - began)
+    return fitted
+
+
+def hull_row(known: Callable[[], Known]) -> Row:
+    """Computes the visual hull of a capture, and returns its distances (mm) from the true face."""
+    subject = known()
+    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=discard_progress)
+    return {"hull": surface_error(subject, visual_hull(silhouettes, subject.rig))}
+
+
+def surface_error(known: Known, found: Mesh) -> dict[str, float]:
+    """Returns distances (mm) of the true face to the found surface, weighted by area."""
+    distances = SurfaceIndex(found.vertices, found.faces, 1.0).closest(known.mesh.vertices[known.face]).distances
+    areas = vertex_areas(known.mesh.vertices, known.mesh.faces)[known.face]
+    return {
+        "median_mm": weighted_quantile(distances, areas, 0.5),
+        "mean_mm": float(distances @ areas / areas.sum()),
+        "p95_mm": weighted_quantile(distances, areas, 0.95),
+    }
+
+
+def posterior_cover(known: Known, fitted: Fitted) -> dict[str, float]:
+    """Returns the share of the face's vertices whose 95 % interval along the normal holds the true surface."""
+    mesh = fitted.mesh()
+    rows = np.flatnonzero(fitted.model.levels["full"].face_region)[::5]
+    deviation = vertex_deviation_mm(fitted.model, fitted.fit)[rows]
+    across, found = along_normal(known, mesh.vertices[rows], mesh.normals()[rows])
+    inside = np.abs(across[found]) < 1.96 * deviation[found]
+    return {"cover_95": float(inside.mean()), "deviation_mm": float(np.median(deviation))}
+
+
+def along_normal(
+    known: Known, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Returns the signed distance (mm) along each normal to the true face, and where there is one."""
+    kept = known.face[known.mesh.faces].all(axis=1)
+    index = SurfaceIndex(known.mesh.vertices, known.mesh.faces[kept], 1.0)
+    across = np.zeros(len(points))
+    for _ in range(4):
+        place = points + across[:, None] * normals
+        hit = index.closest(place)
+        slope = np.einsum("nc,nc->n", hit.normals, normals)
+        step = np.einsum("nc,nc->n", hit.points - place, hit.normals) / np.maximum(slope, 0.3)
+        across = np.clip(across + step, -FAR_MM, FAR_MM)
+    end = index.closest(points + across[:, None] * normals)
+    return across, (end.distances < 0.1) & (np.abs(across) < FAR_MM)
+
+
+def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) -> Row:
+    """Fits with all cameras but one, and predicts that camera's picture.
+
+    Figures are the RMS distance (px) of the true face's outline to the predicted one, where the photograph shows it and
+    also where hair covers it, and the PSNR over the face. The distance is from the true outline to the predicted one,
+    since the latter continues where shoulders, which no model has, hide the former.
+    """
+    known, settings = read_known(path), Settings()
+    silhouettes = segment(known.capture, known.rig, settings.segmentation, report=discard_progress)
+    rest = known.rig.subset(other for other in known.rig.names if other != camera)
+    views = pack_views(known.rig.subset([camera]), {camera: silhouettes[camera].distance})
+    true = find_rim(make_topology(known.mesh.faces, known.face), known.mesh.vertices, views)
+    shown = np.abs(true.residual) < SHOWN_PX
+    found: Row = {}
+    for level, fitted in every_level(_without(known.capture, camera), rest, model, ("span", "photo"), renderer).items():
+        mesh, full = fitted.mesh(), model.levels["full"]
+        seen = {name: silhouettes[name] for name in rest.names}
+        coloured = texture(
+            mesh, mesh.normals(), known.capture, seen, rest, depth_maps(rest, mesh), settings=settings.texture
+        )
+        ours = find_rim(make_topology(full.faces, full.face_region), mesh.vertices, views, whole_head=True)
+        nearest = KDTree(ours.pixel).query(true.pixel)[1]
+        across = ((true.pixel - ours.pixel[nearest]) * ours.normal[nearest]).sum(axis=1)
+        photograph, mask = known.capture.images[camera], silhouettes[camera].mask
+        psnr = colour_psnr(known.rig[camera], photograph, mesh, coloured.colours, full.face_region, mask)
+        found[level] = {"psnr_db": psnr}
+        if shown.any():  # from above, a face's outline may lie wholly before the shoulders
+            found[level]["contour_rms_px"] = _rms(across[shown], true.length[shown])
+        if len(across):
+            found[level]["contour_rms_with_hair_px"] = _rms(across, true.length)
+    return found
+
+
+def _rms(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> float:
+    return float(np.sqrt((weights @ values**2) / max(float(weights.sum()), 1e-9)))
+
+
+def _without(capture: Capture, camera: str) -> Capture:
+    return replace(
+        capture,
+        images={name: image for name, image in capture.images.items() if name != camera},
+        backgrounds={name: plates for name, plates in capture.backgrounds.items() if name != camera},
+        masks={name: mask for name, mask in capture.masks.items() if name != camera},
+        features={
+            mark: {name: pixel for name, pixel in seen.items() if name != camera}
+            for mark, seen in capture.features.items()
+        },
+    )
+
+
+def colour_psnr(
+    camera: Camera,
+    image: UInt8[np.ndarray, "h w 3"],
+    mesh: Mesh,
+    colours: UInt8[np.ndarray, "v 3"],
+    face: Bool[np.ndarray, " v"],
+    mask: Bool[np.ndarray, "h w"],
+) -> float:
+    """Returns the PSNR (dB) between a photograph and the coloured mesh over the pixels of the face. One gain for each
+    channel is fitted, since cameras differ in exposure, and one that was left out has none."""
+    pixels, depths = camera.project(mesh.vertices), camera_depths(camera, mesh.vertices)
+    _, seen = rasterise(pixels, depths, mesh.faces, *image.shape[:2])
+    drawn = interpolate(seen, pixels, depths, mesh.faces, colours.astype(np.float32))
+    shown = (seen >= 0) & np.all(face[mesh.faces], axis=1)[np.maximum(seen, 0)] & mask
+    ours, theirs = drawn[shown].astype(float), image[shown].astype(float)
+    gain = (ours * theirs).sum(axis=0) / (ours**2).sum(axis=0)
+    return float(10.0 * np.log10(255.0**2 / ((gain * ours - theirs) ** 2).mean()))
+
+
+def figures(rows: list[Row]) -> dict[str, float]:
+    """Summarises the rows: values of each subject, and means and worst values over random heads, heads in the span, and
+    left-out cameras."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        subject, _, label = row["name"].rpartition("_")
+        kind = subject.split("-")[0]
+        group = {"draw": "draws", "inspan": "inspan", "heldout": "heldout"}.get(
+            kind if subject[-1].isdigit() else "", subject
+        )
+        for level, quantities in row.items():
+            if isinstance(quantities, Mapping):
+                for quantity, value in quantities.items():
+                    if isinstance(value, int | float):
+                        values.setdefault(f"{group}_{label}_{level}_{quantity}", []).append(float(value))
+    found = {}
+    for name, of in values.items():
+        found[name] = round(float(np.mean(of)), 4)
+        if len(of) > 1:
+            found[f"{name}_largest"], found[f"{name}_smallest"] = round(max(of), 4), round(min(of), 4)
+    return found
+
+
+def _key(models: Mapping[str, HeadModel], others: HeadModel | None) -> str:
+    """What the rows depend on beside their names."""
+    parts = {name: model.sha256 for name, model in models.items()} | {"others": others.sha256 if others else ""}
+    parts["settings"] = json.dumps(document_from_settings(Settings()), sort_keys=True)
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,186 @@
+"""Measures heads with an expression and the same heads without: the delivered surface, and the expression that is
+reported.
+
+Heads of a model's own population (all modes) in the simulated studio are photographed with a random expression and
+neutral. They are reconstructed with the model and, *before*, with the same model without its expressions. Distances are
+as in ``detail`` (from the true face to the delivered surface, by area). ``vertex`` is how far a vertex of the face is
+from its true position, sliding along the surface included. Weights are compared over the ten largest of each head.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.contour_fit import expression_evidence
+from pipeline.detail import expression_reading
+from pipeline.head_model.expressions import no_expressions, plain_name
+from pipeline.head_model.model import HeadModel
+from pipeline.reconstruct import reconstruct
+from pipeline.settings import OutputSettings, Settings
+from pipeline.stages.context import ReconstructionContext
+from rig.mesh import Mesh
+from rig.render.renderer import Renderer
+from rig.studio.scene.layout import default_layout
+from rig.studio.scene.simulate import SimulatedCapture, simulate
+from rig.studio.scene.subject import Subject
+from rig.studio.sensor.preset import PRESET
+from tests.laboratory.experiments import markdown
+from tests.laboratory.experiments.outcome import Outcome
+from tests.laboratory.experiments.paper.detail import Known, surface_error
+from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+
+SEED, SMILING, SMILES = 22, 0.6, ("mouthSmileLeft", "mouthSmileRight")
+FEW, MANY, WEIGHTS = 3, 7, (0.15, 0.8)
+JAW = 0.4  # of a drawn weight: a mouth that is half open is wide open
+LARGEST = 10
+
+
+def expressions(
+    models: Mapping[str, HeadModel], *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 4,
+    folder: Path | None = None,
+) -> Outcome:  # fmt: skip
+    """Runs this module's experiment. Returns distances by model: ``<model>_posed_median_mm``,
+    ``<model>_neutral_before_median_mm`` and so on.
+
+    Of the expression weights there are the correlation with the true ones (``<model>_weights_correlation`` over the ten
+    largest of each head; ``..._but_eyes`` without lids and gaze; ``..._true`` over those that are not 0; ``..._all``
+    over all that are not 0 or reported for any head), the mean error of the true ones (``<model>_weights_off``;
+    ``<model>_off_<expression>`` of one), and the sum of weights reported for expressions that a head does not have
+    (``<model>_weights_told_of_none``).
+    """
+    code = (*CONTOUR, expression_evidence, expression_reading)
+    kept = {
+        label: Records(folder, f"expressions-{label}", key_of(model.sha256, Settings(), *code))
+        for label, model in models.items()
+    }
+    rows: list[Row] = []
+    for i, kind, (label, model) in product(range(subjects), ("posed", "neutral"), models.items()):
+        report(f"{label} {i} {kind}", (len(rows) + 1) / (2 * subjects * len(models)))
+        row = kept[label].row(f"{label}-{i:02} {kind}", partial(_subject, model, i, kind == "posed", renderer))
+        rows.append({"model": label, "kind": kind, "subject": i} | row)
+    return {"figures": _figures(rows, tuple(models)), "rows": rows, "markdown": _table(rows, tuple(models))}
+
+
+def drawn_weights(rng: np.random.Generator, names: tuple[str, ...]) -> dict[str, float]:
+    """Draws a few expressions at random; more often than not among them a smile about as strong on both sides."""
+    chosen = rng.choice(len(names), rng.integers(FEW, MANY), replace=False)
+    found = {names[k]: float(rng.uniform(*WEIGHTS)) for k in chosen}
+    if rng.random() < SMILING:
+        strength = rng.uniform(0.2, 0.7)
+        for name in names:
+            if plain_name(name) in SMILES:
+                found[name] = float(np.clip(strength + rng.normal(0.0, 0.08), 0.0, 1.0))
+    for name in ("jawOpen", "mouth-open"):
+        if name in found:
+            found[name] *= JAW
+    if "mouthClose" in found:  # of an open jaw: lips that close without one pass through each other
+        found["mouthClose"] = min(found["mouthClose"], 0.5 * found.get("jawOpen", 0.0))
+    return {name: weight for name, weight in found.items() if weight > 0.0}
+
+
+def _subject(model: HeadModel, number: int, posed: bool, renderer: Renderer) -> Row:
+    rng = np.random.default_rng((SEED, number))
+    coefficients = rng.standard_normal(len(model.modes))
+    weights = drawn_weights(rng, model.expressions.names) if posed else {}
+    head, full = model.posed_vertices(coefficients, weights), model.levels["full"]
+    marks = {name: head[row] for name, row in model.landmarks.items()}
+    sitter = Subject(Mesh(head, full.faces), marks, full.face_region, f"seed-{number}")
+    shot = simulate(sitter, default_layout(), PRESET, np.random.default_rng((SEED, number, 1)), renderer=renderer)
+    bare = replace(model, expressions=no_expressions(len(model.mean)), _bases={})
+    return {
+        "truth": weights,
+        "after": _delivered(model, shot, renderer),
+        "before": _delivered(bare, shot, renderer),
+    }
+
+
+def _delivered(model: HeadModel, shot: SimulatedCapture, renderer: Renderer) -> Row:
+    settings = replace(Settings(), outputs=OutputSettings(surface="head"))
+    found = reconstruct(ReconstructionContext(shot.capture, shot.rig, model, settings, renderer))
+    face, scene = model.levels["full"].face_region, shot.scene
+    known = Known(scene.name, shot.capture, shot.rig, scene.head, face, scene.visible)
+    apart = np.linalg.norm(found.mesh_world.vertices - scene.head.vertices, axis=1)[face]
+    return {
+        **surface_error(known, found.mesh_world),
+        "vertex_mm": float(np.median(apart)),
+        "fit_s": found.seconds["fit"],
+        "weights": {each.name: each.weight for each in found.evidence.expression},
+    }
+
+
+def _figures(rows: list[Row], labels: tuple[str, ...]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for label in labels:
+        for kind in ("posed", "neutral"):
+            of = [row for row in rows if (row["model"], row["kind"]) == (label, kind)]
+            for when, infix in (("after", ""), ("before", "before_")):
+                for quantity in ("median_mm", "mean_mm", "p95_mm", "vertex_mm", "fit_s"):
+                    found[f"{label}_{kind}_{infix}{quantity}"] = float(np.mean([row[when][quantity] for row in of]))
+            found[f"{label}_{kind}_weights"] = float(np.mean([sum(row["after"]["weights"].values()) for row in of]))
+        found[f"{label}_weights_correlation"] = _correlation(rows, label)
+        found[f"{label}_weights_correlation_but_eyes"] = _correlation(rows, label, _is_no_eye)
+        found |= {f"{label}_{name}": value for name, value in _weights(rows, label).items()}
+    return {name: round(value, 4) for name, value in found.items()}
+
+
+def _correlation(rows: list[Row], label: str, counts: Callable[[str], bool] = lambda name: True) -> float:
+    """Of found and true weights, the ten largest true ones of every posed head; where it has fewer, the
+    largest others that it is told to have, as far as there are any."""
+    true, ours = [], []
+    for row in rows:
+        if row["model"] == label and row["kind"] == "posed":
+            estimated = {name: weight for name, weight in row["after"]["weights"].items() if counts(name)}
+            names = sorted(filter(counts, row["truth"]), key=lambda name, of=row["truth"]: -of[name])[:LARGEST]
+            others = sorted(set(estimated) - set(names), key=lambda name, of=estimated: -of[name])[
+                : LARGEST - len(names)
+            ]
+            true += [row["truth"].get(name, 0.0) for name in [*names, *others]]
+            ours += [estimated.get(name, 0.0) for name in [*names, *others]]
+    return float(np.corrcoef(true, ours)[0, 1]) if len(true) > 1 else float("nan")
+
+
+def _is_no_eye(name: str) -> bool:
+    """Whether an expression is none of lids and looks, which move the surface least and are told worst."""
+    return not name.startswith("eye") or name.startswith("eyebrow")
+
+
+def _weights(rows: list[Row], label: str) -> dict[str, float]:
+    """Correlation over the true weights and over all that were drawn or told in any head; how far off the true ones
+    are told, all and each. A weight that is not told is 0."""
+    posed = [row for row in rows if (row["model"], row["kind"]) == (label, "posed")]
+    names = sorted({name for row in posed for name in (*row["truth"], *row["after"]["weights"])})
+    true = np.array([[row["truth"].get(name, 0.0) for name in names] for row in posed])
+    estimated = np.array([[row["after"]["weights"].get(name, 0.0) for name in names] for row in posed])
+    there = true > 0.0
+    if np.count_nonzero(there) < 2:
+        return {}
+    each = {
+        name: np.abs(estimated - true)[:, k][there[:, k]].mean() for k, name in enumerate(names) if there[:, k].any()
+    }
+    return {
+        "weights_correlation_true": float(np.corrcoef(true[there], estimated[there])[0, 1]),
+        "weights_correlation_all": float(np.corrcoef(true.ravel(), estimated.ravel())[0, 1]),
+        "weights_off": float(np.abs(estimated - true)[there].mean()),
+        "weights_told_of_none": float(estimated[~there].sum() / len(posed)),
+        **{f"off_{name}": float(value) for name, value in each.items()},
+    }
+
+
+def _table(rows: list[Row], labels: tuple[str, ...]) -> str:
+    header = ("heads", "subjects", "median, mm", "before", "vertices, mm", "before", "fit, s", "before", "weights")
+    figures, lines = _figures(rows, labels), []
+    for label in labels:
+        for kind in ("posed", "neutral"):
+            count = sum((row["model"], row["kind"]) == (label, kind) for row in rows)
+            pairs = [
+                figures[f"{label}_{kind}_{infix}{quantity}"]
+                for quantity in ("median_mm", "vertex_mm", "fit_s")
+                for infix in ("", "before_")
+            ]
+            correlation = f"r = {figures[f'{label}_weights_correlation']:.2f}" if kind == "posed" else "-"
+            lines.append([f"{label}, {kind}", count, *pairs, correlation])
+    return markdown.table(header, lines)

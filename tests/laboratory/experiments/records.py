@@ -1,0 +1,62 @@
+"""Keeps the rows of long experiments as they are computed, so that a stopped run can continue."""
+
+import hashlib
+import inspect
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+from pipeline.contour_fit import (
+    clutter,
+    contour,
+    feature_term,
+    head_problem,
+    noise_model,
+    prior_term,
+    problem,
+    rim,
+    rim_jacobian_kernels,
+    rim_kernels,
+    rim_term,
+)
+from pipeline.estimation import levenberg_marquardt, terms
+from pipeline.geometry import projection_kernels
+from pipeline.imaging import sampling_kernels
+from rig.atomic_write import write_atomically
+from tests.laboratory.experiments.outcome import Row
+
+# What rows of the contour solver depend on, for keys.
+CONTOUR = (
+    *(levenberg_marquardt, terms, contour, problem, head_problem, rim_term, feature_term, prior_term),
+    *(clutter, noise_model, rim, rim_kernels, rim_jacobian_kernels, projection_kernels, sampling_kernels),
+)
+
+
+class Records:
+    """Holds rows by key in one JSON file; without a folder, in memory alone."""
+
+    def __init__(self, folder: Path | None, name: str, key: str) -> None:
+        """``key`` names all that the rows depend on (model, settings, code version): another key starts anew."""
+        self._path = None if folder is None else folder / f"{name}.json"
+        self._key = key
+        self._rows: dict[str, Row] = {}
+        if self._path is not None and self._path.is_file():
+            kept = json.loads(self._path.read_text())
+            self._rows = kept["rows"] if kept.get("key") == key else {}
+
+    def row(self, name: str, compute: Callable[[], Row]) -> Row:
+        """Returns the row of this name; if there is none it is computed and kept."""
+        if name not in self._rows:
+            self._rows[name] = compute()
+            if self._path is not None:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(self._path, json.dumps({"key": self._key, "rows": self._rows}).encode())
+        return self._rows[name]
+
+
+def key_of(*parts: object) -> str:
+    """Returns a key for ``Records``. Modules enter by their source, so that rows of older code are computed anew, and
+    everything else by its text."""
+    texts = [inspect.getsource(part) if isinstance(part, ModuleType) else str(part) for part in parts]
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]

@@ -1,0 +1,104 @@
+"""Measures against bodies whose measures are known in closed form, and against another program's section."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.special import ellipe
+
+from pipeline.applications.clinic import fitting
+from pipeline.applications.clinic.fitting import UprightHead, fitting_measures, hull_perimeter, section
+from tests.support.measured_heads import mannequin
+from tests.support.visits import MOVED, moved, visit
+
+
+def body(vertices: np.ndarray, faces: np.ndarray, **marks: tuple[float, float, float]) -> UprightHead:
+    """A body in RAS axes: x to the right, y to the front, z up."""
+    points = {name: np.array(point) for name, point in marks.items()}
+    return UprightHead(np.asarray(vertices, float), np.asarray(faces), points, np.zeros(len(vertices), bool))
+
+
+def test_the_tape_around_an_ellipsoid_is_its_ellipse() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    side, front, up = 75.0, 95.0, 110.0
+    head = body(ball.vertices * (side, front, up), ball.faces, glabella=(0.0, front, 0.0))
+    found = fitting.head_circumference(head)
+    assert found == pytest.approx(4.0 * front * ellipe(1.0 - (side / front) ** 2), rel=1e-3)
+    assert (
+        fitting.head_circumference(body(ball.vertices * (75, 20, 110), ball.faces, glabella=(0.0, 20.0, 0.0))) is None
+    )
+
+
+def test_a_section_is_that_of_another_program_and_a_tape_spans_hollows() -> None:
+    head, normal, origin = mannequin(), np.array([0.1, 0.95, 0.2]), np.array([0.0, 40.0, 0.0])
+    found = section(head.vertices, head.faces, origin, normal)
+    mesh = trimesh.Trimesh(head.vertices, head.faces, process=False)
+    other = trimesh.intersections.mesh_plane(mesh, normal / np.linalg.norm(normal), origin)
+    points = np.unique(np.round(np.asarray(other).reshape(-1, 3), 6), axis=0)
+    np.testing.assert_allclose(np.unique(np.round(found, 6), axis=0), points, atol=2e-6)
+    star = np.array([(0, 0), (4, 0), (4, 3), (2, 1), (0, 3)], float)
+    assert hull_perimeter(star) == pytest.approx(14.0)
+    assert hull_perimeter(np.zeros((5, 2))) is None
+
+
+def roof(splay_deg: float, frontal_deg: float) -> UprightHead:
+    """A nose of two planes, whose crest runs straight down at y = 0 from nasion at z = 0."""
+    across, down = np.meshgrid(np.linspace(-20.0, 20.0, 41), np.linspace(10.0, -30.0, 41))
+    widening = np.tan(np.radians(frontal_deg)) * -down
+    away = np.maximum(np.abs(across) - np.maximum(widening, 0.0), 0.0)
+    vertices = np.stack([across, -away / np.tan(np.radians(splay_deg)), down], axis=2).reshape(-1, 3)
+    corner = np.arange(40 * 41).reshape(40, 41)[:, :-1].ravel()
+    faces = np.concatenate([np.stack([corner, corner + 1, corner + 41], axis=1),
+                            np.stack([corner + 1, corner + 42, corner + 41], axis=1)])  # fmt: skip
+    corners = {"endocanthion_right": (18.0, -15.0, 0.0), "endocanthion_left": (-18.0, -15.0, 0.0)}
+    return body(vertices, faces, nasion=(0.0, 0.0, 0.0), **corners)
+
+
+@pytest.mark.parametrize("splay_deg", [20.0, 30.0])
+@pytest.mark.parametrize("frontal_deg", [0.0, 15.0])
+def test_a_nose_of_planes_has_its_widths_and_angles(splay_deg: float, frontal_deg: float) -> None:
+    nose = roof(splay_deg, frontal_deg)
+    flat = 2.0 * np.tan(np.radians(frontal_deg)) * fitting.BRIDGE_BELOW_NASION_MM
+    width = flat + 2.0 * fitting.PAD_DEPTH_MM * np.tan(np.radians(splay_deg))
+    assert fitting.bridge_width(nose) == pytest.approx(width, abs=0.35)  # edges of 1 mm round the ridges off
+    assert fitting.splay_angle(nose) == pytest.approx(splay_deg, abs=1.0)
+    assert fitting.frontal_angle(nose) == pytest.approx(frontal_deg, abs=1.0)
+
+
+@pytest.mark.parametrize("tilt_deg", [-6.0, 0.0, 12.0])
+def test_a_face_that_leans_back_below_has_its_angle(tilt_deg: float) -> None:
+    """A board before the head, tilted about the ears' line: its lower edge comes nearer for positive angles."""
+    across, up = np.meshgrid(np.linspace(-60.0, 60.0, 121), np.linspace(-30.0, 30.0, 61))
+    away = np.tan(np.radians(tilt_deg)) * up - 8.0 * np.cos(np.pi * up / 60.0) ** 2  # hollow before the eyes
+    vertices = np.stack([across, away, up], axis=2).reshape(-1, 3)
+    marks = {f"{corner}_{side}": (sign * x, -2.0, 0.0) for side, sign in (("right", 1), ("left", -1))
+             for corner, x in (("exocanthion", 42.0), ("endocanthion", 18.0))}  # fmt: skip
+    assert fitting.frame_angle(body(vertices, np.zeros((0, 3), int), **marks)) == pytest.approx(tilt_deg, abs=0.5)
+
+
+def test_no_rig_changes_a_measure() -> None:
+    first, second = fitting_measures(visit()), fitting_measures(moved(visit(), MOVED))
+    assert set(first) >= {"head_circumference", "frame_angle"}  # edges of 12 mm show no bridge
+    for name, found in first.items():
+        assert second[name].value == pytest.approx(found.value, rel=1e-6)
+    assert 520.0 < first["head_circumference"].value < 640.0
+    assert first["frame_angle"].unit == "deg"
+
+
+def test_a_deviation_of_all_skin_together_is_the_tapes_by_its_turn() -> None:
+    """Twice the stated deviation is twice the measure's. Errors that all go together would move a tape by 2 pi of them,
+    those of far places that do not by less."""
+    sure, unsure = (fitting_measures(visit(std_mm=std))["head_circumference"].std for std in (0.5, 1.0))
+    assert unsure == pytest.approx(2.0 * sure, rel=0.05)
+    assert 0.1 * 2.0 * np.pi < unsure < 2.0 * np.pi
+
+
+def test_a_head_without_a_back_has_no_circumference() -> None:
+    face_only = visit()
+    mesh = face_only.measured.mesh_world
+    head = face_only.measured.head_from_world.apply(mesh.vertices)
+    flat = np.where(head[:, 2:] < -20.0, (1.0, 1.0, 0.0), (1.0, 1.0, 1.0)) * head
+    back = face_only.measured.head_from_world.inverse().apply(flat)
+    cut = replace(face_only, measured=replace(face_only.measured, mesh_world=replace(mesh, vertices=back)))
+    assert "head_circumference" not in fitting_measures(cut)
