@@ -12,7 +12,6 @@ from server.cli import (
     batch,
     cameras,
     clinic,
-    experiments,
     export,
     heads,
     measure,
@@ -32,7 +31,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # importing rich's markdown alone takes half a second
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for room in (service, heads, simulate, batch, export, clinic, measure, wrap, experiments, cameras):
+for room in (service, heads, simulate, batch, export, clinic, measure, wrap, cameras):
     app.add_typer(room.app)
 groups = {"keys": service.keys_app, "rig": rig.rig_app, "model": models.model_app, "template": templates.template_app}
 for name, group in groups.items():
@@ -54,6 +53,16 @@ def of_all(
     ] = False,
 ) -> None:
     """One shot of a calibrated camera rig in, a textured 3D head with its uncertainty out."""
+
+
+@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+def experiments(context: typer.Context) -> None:
+    """Say where the experiments are."""
+    name = context.args[0] if context.args else "NAME"
+    print(
+        f"experiments are in the laboratory of a checkout: python -m tests.laboratory {name} [--json]", file=sys.stderr
+    )
+    raise typer.Exit(2)
 
 
 def main() -> None:

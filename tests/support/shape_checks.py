@@ -21,10 +21,6 @@ from jaxtyping import AbstractArray, jaxtyped
 
 ROOT = Path(__file__).resolve().parents[2]
 
-COMPILED_BESIDE_OTHERS = (
-    "tests/laboratory/experiments/peers/soft_rasteriser.py",
-)  # a loop of its own beside what JAX compiles
-
 # PEP 484: where a float is wanted a whole number will do.
 check_types = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
@@ -38,7 +34,7 @@ def checked_modules() -> list[str]:
 
 
 def _is_compiled(path: Path) -> bool:
-    return path.stem.endswith("_kernels") or path.relative_to(ROOT).as_posix() in COMPILED_BESIDE_OTHERS
+    return path.stem.endswith("_kernels")
 
 
 def checked(decorated: Any) -> Any:

@@ -14,9 +14,8 @@ from rig.camera import Intrinsics
 from rig.capture import Features
 from rig.rig import Rig
 
-WORK_PIXELS = (
-    4_000_000  # 11 pictures with a plate each take 2.5 GB, at 6 Mpx 3.5 GB (tests.laboratory.benchmarks.large_pictures)
-)
+# Eleven pictures with a plate each take 2.5 GB, at 6 Mpx 3.5 GB (tests/laboratory/benchmarks/large_pictures.py).
+WORK_PIXELS = 4_000_000
 NEAR = 0.15  # a scale so near to a half or a quarter becomes it, since JPEG is decoded so at a third of the cost
 HALVINGS_MOST = 3  # JPEG decoders reduce to 1/8 at most
 

@@ -246,7 +246,7 @@ def test_the_fit_reports_uses_what_is_usable_and_may_be_cancelled(
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_simplex_takes_half_of_the_mean_head_s_error(model: HeadModel, renderer: Renderer) -> None:
-    """One planted head, all sixty modes; ``python -m tests.laboratory.benchmarks.simplex_halves`` prints the mean over ten."""
+    """One planted head, all sixty modes; tests/laboratory/benchmarks/simplex_halves.py prints the mean over ten."""
     rig = bench_rig()
     truth = np.clip(np.random.default_rng(0).standard_normal(60), -0.8, 0.8)
     vertices = POSE.apply(model.vertices(truth))

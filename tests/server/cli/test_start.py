@@ -42,7 +42,7 @@ def test_doctor_and_convert_load_little(tmp_path: Path) -> None:
 
 
 def test_the_pipeline_loads_no_package_for_one_function() -> None:
-    code = "import sys; from pipeline import reconstruct; from pipeline.applications.templates import load; print(*sys.modules)"
+    code = "import sys; from pipeline import reconstruct; print(*sys.modules)"
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=python_environment(), capture_output=True, text=True, timeout=60, check=True)
     assert not {"scipy.stats", "scipy.optimize", "scipy.ndimage", "trimesh"} & set(done.stdout.split())
