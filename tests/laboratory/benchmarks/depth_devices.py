@@ -40,10 +40,9 @@ def main() -> None:
     capture, rig = read_capture(arguments.capture)
     with Renderer.create() as renderer, ComputeDevice.create() as device:
         context = ReconstructionContext(capture, rig, load_model(), Settings(), renderer)
-        run = Recorder(lambda stage, share: None)
-        views = run(find_views, context)
-        faces = run(find_faces, context, views.capture)
-        labels, head = fit_shape(run, context, views, run(align_head, context, views, faces))
+        views = find_views(context).product
+        alignment = align_head(context, views, find_faces(context, views.capture).product).product
+        labels, head = fit_shape(Recorder(context), views, alignment)
 
         def measured(chosen: ComputeDevice | None) -> tuple[Depth, float]:
             began = time.perf_counter()

@@ -207,15 +207,13 @@ def every_level(
 ) -> dict[Level, Fitted]:
     """Fits every level of detail to a capture; masks and alignment are computed once for all."""
     context = ReconstructionContext(capture, rig, model, Settings(), renderer)
-    run = Recorder(discard_progress)
-    views = run(find_views, context)
-    faces = run(find_faces, context, views.capture)
-    alignment = run(align_head, context, views, faces)
+    views = find_views(context).product
+    alignment = align_head(context, views, find_faces(context, views.capture).product).product
     fitted = {}
     for level in levels:
         began = time.perf_counter()
         at_level = replace(context, settings=replace(context.settings, detail=level))
-        _, head = fit_shape(run, at_level, views, alignment)
+        _, head = fit_shape(Recorder(at_level), views, alignment)
         fitted[level] = Fitted(head.fit, head.model, head.detail.level, time.perf_counter() - began)
     return fitted
 
