@@ -149,6 +149,7 @@ export default {
   "upload-checksum-wrong": "Die Bytes haben nicht die angekündigte Prüfsumme; noch einmal senden.",
   "checksum-unknown": "Prüfsumme {algorithm} ist unbekannt; bekannt sind sha1, sha256 und md5.",
   "json-wanted-here": "Hierher application/json senden; ein Archiv geht an POST /v1/captures/uploads.",
+  "header-too-large": "Der Kopf einer Anfrage darf {bytes:,} Bytes haben; weniger oder kürzere Felder senden.",
   "json-body-too-large": "Ein JSON-Dokument darf {bytes:,} Bytes haben.",
   "body-no-json": "Was gesendet wurde, ist kein JSON.",
   "imports-not-allowed": "Dieser Dienst importiert von nirgends: Sein Betreiber nennt Server in EIGENHEAD_IMPORT_ORIGINS. Hochladen.",
