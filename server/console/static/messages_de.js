@@ -1105,6 +1105,7 @@ export default {
   "batch-name-wrong": "{where}: {name} kann keinen Ergebnisordner benennen; in der Spalte name einen anderen Namen nennen",
   "batch-name-twice": "{where} haben denselben Namen, {name}: in der Spalte name einen anderen nennen",
   "batch-name-within": "{name} läge im Ergebnis von {outer}: in der Spalte name einen anderen Namen nennen",
+  "batch-share-taken": "ein anderer Prozess arbeitet an Anteil {share} dieses Ordners: sein Ende abwarten, oder die Aufnahmen mit --shard K/N aufteilen.",
   "batch-shard-wrong": "{text} ist kein Anteil wie 2/8: eine Nummer von 1 bis zur Anzahl, die höchstens {most:,} ist",
   "batch-out-within": "{out} liegt in der Aufnahme {capture}; mit --out einen anderen Ort nennen",
   "batch-foreign-files": "{folder} enthält, was kein Ergebnis ist ({names}): es woandershin legen oder mit --out einen anderen Ort nennen",

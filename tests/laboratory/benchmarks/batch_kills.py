@@ -3,10 +3,10 @@
     python -m tests.laboratory.benchmarks.batch_kills pinned [CAPTURES] [KILLS] [PROCESSES]   pinned work: 500 captures, 20 kills
     python -m tests.laboratory.benchmarks.batch_kills real [CAPTURES] [KILLS] [PROCESSES]     heads of the studio, level span: 60
 
-All processes that are killed have the whole of one folder. ``results``: complete ones at the end; ``bytes_differ``:
+Each process that is killed has a share of one folder. ``results``: complete ones at the end; ``bytes_differ``:
 files that are not those of an undisturbed run (but for seconds); ``left_over``: files that an undisturbed run does not
-have; ``begun_twice``: captures that two undisturbed processes side by side both began, of pinned work, where both have
-the whole folder (``1/1``), and where each has its shard (``1/2``, ``2/2``).
+have; ``begun_twice``: captures that two undisturbed processes with a share each (``1/2``, ``2/2``) both began, of
+pinned work.
 """
 
 import json
@@ -55,13 +55,14 @@ def finish(running: "list[subprocess.Popen[bytes]]") -> float:
 def kill_often(kind: str, shots: Path, out: Path, *, kills: int, processes: int, seconds: float) -> None:
     """SIGKILL to one process after the other, each started again, spread over the time that the work takes."""
     rng = random.Random(SEED)
-    running = [start(kind, shots, out) for _ in range(processes)]
+    shares = [f"{number + 1}/{processes}" for number in range(processes)]
+    running = [start(kind, shots, out, shard=share) for share in shares]
     for number in range(kills):
         time.sleep(rng.uniform(0.5, 1.5) * seconds / kills)
         victim = running[number % processes]
         victim.send_signal(signal.SIGKILL)
         victim.wait()
-        running[number % processes] = start(kind, shots, out)
+        running[number % processes] = start(kind, shots, out, shard=shares[number % processes])
     finish(running)
 
 
@@ -97,16 +98,7 @@ def figures_of(kind: str, captures: int, kills: int, processes: int, folder: Pat
         "left_over": len(found.keys() - wanted.keys()),
         "seconds_undisturbed": round(seconds, 1),
         "seconds_with_kills": round(killed_s, 1),
-    } | ({"begun_twice": twice_of_all(shots, folder)} if kind == "pinned" else {})
-
-
-def twice_of_all(shots: Path, folder: Path) -> dict[str, int]:
-    found = {}
-    for shards in (("1/1", "1/1"), ("1/2", "2/2")):
-        both = folder / shards[0].replace("/", "-")
-        both.mkdir()
-        found[" and ".join(shards)] = begun_twice(shots, both, shards)
-    return found
+    } | ({"begun_twice": begun_twice(shots, folder, ("1/2", "2/2"))} if kind == "pinned" else {})
 
 
 def main(kind: str, *numbers: str) -> None:
