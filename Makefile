@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup setup-tests demo serve test test-slow check coverage format bench dependencies reference results pictures docs sbom audit mutants
+.PHONY: setup setup-tests demo serve test test-slow test-laboratory check coverage format bench dependencies reference results pictures docs sbom audit mutants
 BIN := .venv/bin
 # The tests start many processes: with compiled modules kept beside them each starts in half the time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -23,6 +23,9 @@ test: setup  ## the fast tests
 
 test-slow: setup  ## the tests that take more than a few seconds each
 	$(BIN)/pytest -m slow -n 2 --dist loadfile
+
+test-laboratory: setup  ## the tests of experiments, benchmarks and model files, slow ones too: before a release
+	$(BIN)/pytest -m "slow or not slow" -n 2 tests/laboratory/tests
 
 check: ## ruff, pyright, import-linter, biome (JavaScript), dead links of the documents
 	@deploy/setup.sh --docs
@@ -73,4 +76,4 @@ audit: setup ## known faults of the locked packages, asked of osv.dev; fails whe
 
 mutants: setup ## MODULE=rig/geometry.py, or SAMPLE=50 of compiled loops: changes code and tells what no test notices
 	$(UV) sync --locked --quiet --group docs --group mutants
-	$(BIN)/python -m tests.support.$(if $(SAMPLE),mutant_sample $(SAMPLE),mutants $(MODULE))
+	$(BIN)/python -m tests.tools.$(if $(SAMPLE),mutant_sample $(SAMPLE),mutants $(MODULE))

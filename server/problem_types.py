@@ -204,7 +204,6 @@ FAILURE_TYPES = {
     "NoHull": "no-hull",
     "NoLandmarkMap": "no-landmark-map",
     "NoLayout": "no-layout",
-    "NoMakeHuman": "no-make-human",
     "NoPoint": "no-point",
     "NoSubject": "no-subject",
     "NoSurface": "no-surface",
