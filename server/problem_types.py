@@ -131,7 +131,6 @@ PROBLEM_TYPES = {
     "no-hull": "No hull",
     "no-landmark-map": "No landmark map",
     "no-layout": "No layout",
-    "no-make-human": "No make human",
     "no-point": "No point",
     "no-subject": "No subject",
     "no-surface": "No surface",
