@@ -72,6 +72,7 @@ PROBLEM_TYPES = {
     "file-missing": "File missing",
     "file-repeated": "File repeated",
     "forbidden": "Forbidden",
+    "header-too-large": "Header too large",
     "http-error": "Http error",
     "internal-server-error": "Internal server error",
     "invalid-request": "Invalid request",

@@ -102,6 +102,7 @@ TEMPLATES = {
     "upload-checksum-wrong": "The bytes do not have the announced checksum; send them again.",
     "checksum-unknown": "Checksum algorithm {algorithm}; sha1, sha256 and md5 are known.",
     "json-wanted-here": "Send application/json here; an archive goes to POST /v1/captures/uploads.",
+    "header-too-large": "The header of a request may have {bytes:,} bytes; send fewer or shorter fields.",
     "json-body-too-large": "A JSON body may have {bytes:,} bytes.",
     "body-no-json": "The body is no JSON.",
     "imports-not-allowed": "This service imports from nowhere: its operator names servers in EIGENHEAD_IMPORT_ORIGINS. Upload it.",
