@@ -57,7 +57,7 @@ format:
 	@if [ -x $(BIN)/biome ]; then $(BIN)/biome format --write; else echo "format: skipped: no biome for this machine, JavaScript is as it was"; fi
 
 bench: setup ## timings of inner loops
-	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib" tests/laboratory/benchmarks
+	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib -p no:jaxtyping" tests/laboratory/benchmarks
 
 dependencies: setup ## docs/dependencies.md: every locked package with licence and reason
 	$(BIN)/python -m tests.tools.dependencies
