@@ -16,7 +16,7 @@ from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.part_labels import PartLabels
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.vertex_colours import texture
@@ -43,7 +43,6 @@ class Bust:
         return self.surface.mesh_world
 
 
-@stage("bust")
 def fuse_depth(
     context: ReconstructionContext, views: Views, head_world: Mesh, labels: PartLabels, depth: Depth
 ) -> Staged[DepthSurface | None]:
@@ -73,7 +72,6 @@ def fuse_depth(
     return Staged(surface, surface.warnings)
 
 
-@stage("bust")
 def shape_bust(
     context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
 ) -> Staged[BustSurface | None]:
@@ -88,7 +86,6 @@ def shape_bust(
     return Staged(finished(fused, depth.votes, skin, views.silhouettes, context.rig))
 
 
-@stage("bust")
 def colour_bust(
     context: ReconstructionContext, views: Views, surface: BustSurface | None, coloured: Capture
 ) -> Staged[Bust | None]:
@@ -111,7 +108,6 @@ class HairyHead:
     views: UInt8[np.ndarray, " v"]
 
 
-@stage("bust")
 def push_out_hair(context: ReconstructionContext, refined: RefinedHead, bust: Bust | None) -> Staged[HairyHead | None]:
     """Pushes the delivered head out to the bust's hair, if the settings ask for it. Returns None otherwise, and without
     a bust. Warns ``hair-beyond-head`` where the head's vertices do not reach the hair."""

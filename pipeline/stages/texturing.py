@@ -11,7 +11,7 @@ from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo
@@ -45,7 +45,6 @@ class Texturing:
     sets: SetTextures | None = None  # where the capture has texture sets
 
 
-@stage("texture")
 def texture_head(
     context: ReconstructionContext, views: Views, head: HeadFit, refined: RefinedHead, labels: PartLabels
 ) -> Staged[Texturing]:

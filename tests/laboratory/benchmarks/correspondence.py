@@ -1,25 +1,25 @@
 """Correspondence against the truth over the face region, from simulated scans with 1 mm point spacing (section 3.2).
 
-``python -m tests.laboratory.benchmarks.correspondence [--subjects 8] [--json]``. Heads of the default database are scanned (noise
-0.1 mm, landmarks marked to 0.5 mm a axis, holes in hair and ears) and put into correspondence. A reference vertex lies
-somewhere on its own true head; the same place of the mesh on another true head is where it must be there.
+python -m tests.laboratory correspondence --subjects 8
+
+Heads of the default database are scanned (noise 0.1 mm, landmarks marked to 0.5 mm a axis, holes in hair and ears) and
+put into correspondence. A reference vertex lies somewhere on its own true head; the same place of the mesh on another
+true head is where it must be there.
 
 Three rows, because the refinement's prior is a head model and the scanned heads come from one: ``paper`` uses no
 prior; ``held_out`` a prior built from all other subjects of the database; ``in_span`` the shipped model, which has
 seen these very subjects, and so flatters.
 """
 
-import argparse
-import json
-import logging
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from pipeline.applications.model_building.correspondence.correspondence import Correspondence, Matching, correspond
 from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.head_model.model import HeadModel, assemble, load_model
+from pipeline.head_model.model import HeadModel, assemble
 from pipeline.head_model.model_file import read_parts
 from pipeline.head_model.model_names import model_path
 from pipeline.head_model.pca import principal_components
@@ -49,9 +49,8 @@ def errors(found: Correspondence, truths: list[np.ndarray], model: HeadModel) ->
     return np.concatenate(out)
 
 
-def run(subjects: int, seed: int = 5) -> dict[str, float]:
-    """Flat figures: median, 95th percentile and mean of each row, mm."""
-    model = load_model()
+def run(model: HeadModel, *, subjects: int = 8, seed: int = 5) -> dict[str, Any]:
+    """Median, 95th percentile and mean of each row, mm."""
     chosen = np.random.default_rng(seed).permutation(138)[:subjects].tolist()
     truths = [model.vertices(model.scores[k].astype(float)) for k in chosen]
     scanner = Scanner(
@@ -74,13 +73,4 @@ def run(subjects: int, seed: int = 5) -> dict[str, float]:
             f"{name}_p95_mm": round(float(np.quantile(e, 0.95)), 3),
             f"{name}_mean_mm": round(float(e.mean()), 3),
         }
-    return figures
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--subjects", type=int, default=8)
-    parser.add_argument("--seed", type=int, default=5)
-    options = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    logging.info(json.dumps(run(options.subjects, options.seed), indent=1))
+    return {"figures": figures}

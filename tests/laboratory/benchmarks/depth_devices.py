@@ -1,23 +1,21 @@
 """Seconds of the depth stage by compiled loops and by compute shaders, and how far apart their depths are.
 
-python -m tests.laboratory.benchmarks.depth_devices --rounds 3
-EIGENHEAD_THREADS=2 python -m tests.laboratory.benchmarks.depth_devices --capture ../shared/data/captures/draw-b --json
+python -m tests.laboratory depth_devices --rounds 3
+EIGENHEAD_THREADS=2 python -m tests.laboratory depth_devices --capture ../shared/data/captures/draw-b
 
 Both start from the same fit. ``depth`` is the whole stage (highlights taken out, depth maps, parts and points of them).
 The first round, which compiles loops and shaders, is not counted.
 """
 
-import argparse
-import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipeline.compute.threads import thread_count
-from pipeline.head_model.model import load_model
+from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import fit_shape
 from pipeline.settings import Settings
 from pipeline.stages.alignment import align_head
@@ -31,28 +29,25 @@ from rig.render.compute import ComputeDevice
 from rig.render.renderer import Renderer
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--capture", type=Path, default=Path("../shared/data/captures/scan-a"))
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", action="store_true")
-    arguments = parser.parse_args()
-    capture, rig = read_capture(arguments.capture)
-    with Renderer.create() as renderer, ComputeDevice.create() as device:
-        context = ReconstructionContext(capture, rig, load_model(), Settings(), renderer)
-        run = Recorder(lambda stage, share: None)
-        views = run(find_views, context)
-        faces = run(find_faces, context, views.capture)
-        labels, head = fit_shape(run, context, views, run(align_head, context, views, faces))
+def run(
+    model: HeadModel, renderer: Renderer, *, capture: Path = Path("../shared/data/captures/scan-a"), rounds: int = 3
+) -> dict[str, Any]:
+    """Returns the figures of this module."""
+    shot, rig = read_capture(capture)
+    with ComputeDevice.create() as device:
+        context = ReconstructionContext(shot, rig, model, Settings(), renderer)
+        views = find_views(context).product
+        alignment = align_head(context, views, find_faces(context, views.capture).product).product
+        labels, head = fit_shape(Recorder(context), views, alignment)
 
         def measured(chosen: ComputeDevice | None) -> tuple[Depth, float]:
             began = time.perf_counter()
             found = measure_depth(replace(context, device=chosen), views, head, labels).product
             return found, time.perf_counter() - began
 
-        rounds = [(measured(None), measured(device)) for _ in range(1 + arguments.rounds)][1:]
-    (by_loops, _), (by_shaders, _) = rounds[-1]
-    seconds = [float(np.median([each[k][1] for each in rounds])) for k in (0, 1)]
+        taken = [(measured(None), measured(device)) for _ in range(1 + rounds)][1:]
+    (by_loops, _), (by_shaders, _) = taken[-1]
+    seconds = [float(np.median([each[k][1] for each in taken])) for k in (0, 1)]
     found = {
         "device": device.description,
         "threads": thread_count(),
@@ -61,11 +56,7 @@ def main() -> None:
         "speedup": seconds[0] / seconds[1],
         **differences(by_loops, by_shaders),
     }
-    if arguments.json:
-        json.dump(found, sys.stdout)
-        sys.stdout.write("\n")
-    else:
-        sys.stdout.write("".join(f"{name:24}{value}\n" for name, value in found.items()))
+    return {"figures": found}
 
 
 def differences(by_loops: Depth, by_shaders: Depth) -> dict[str, float]:
@@ -78,7 +69,3 @@ def differences(by_loops: Depth, by_shaders: Depth) -> dict[str, float]:
         "p99_apart_mm": float(np.quantile(apart, 0.99)),
         "known_by_one_only_share": one_only / max(sum(np.count_nonzero(a.known) for a, _ in pairs), 1),
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Parts of every pixel against the truth: accuracy by part, and seconds.
 
-python -m tests.laboratory.benchmarks.part_maps CAPTURE ... --styles long curly,beard --json
+python -m tests.laboratory part_maps CAPTURE ... --styles long --styles curly,beard
 
 CAPTURE is a folder with a truth beside it: parts/ (a simulated one) or visible.npz (points, of which those that a
 camera sees are looked up). Each is reconstructed first, as the parts are told on the fitted head. ``--styles``
@@ -8,20 +8,18 @@ simulates a subject for each, seeds counted up from ``--first``. A pixel is give
 half.
 """
 
-import argparse
-import json
-import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from pipeline.geometry.raster import camera_depths
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from pipeline.part_labels.labelling import classify_parts
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import PartSettings, Settings
@@ -30,6 +28,7 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.pictures.images import read_image
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -43,28 +42,28 @@ SPLAT_PX, BEHIND_MM, LEAST_FACING = 4, 6.0, 0.15  # of true points: cells of a d
 Shot = tuple[str, Capture, Rig, dict[str, UInt8[np.ndarray, "h w"]]]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("captures", nargs="*", type=Path)
-    parser.add_argument("--styles", nargs="*", default=[])
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--json", action="store_true")
-    arguments = parser.parse_args()
-    model, found = load_model(), {}
-    with Renderer.create() as renderer:
-        for name, capture, rig, truth in shots(arguments, model, renderer):
-            found[name] = measure(capture, rig, truth, model, renderer)
-            sys.stderr.write(json.dumps({name: found[name]}) + "\n")
-    if arguments.json:
-        json.dump({"figures": found}, sys.stdout)
-        return
-    for name, row in found.items():
-        sys.stdout.write(f"{name:28}" + "".join(f"  {key} {value:.3f}" for key, value in row.items()) + "\n")
+def run(
+    captures: Sequence[Path] = (),
+    *,
+    styles: Sequence[str] = (),
+    first: Annotated[int, "seed of the first style"] = 0,
+    model: HeadModel,
+    renderer: Renderer,
+    report: Progress,
+) -> dict[str, Any]:
+    """Returns recall and precision by part, for each capture and style."""
+    found = {}
+    for name, capture, rig, truth in shots(captures, styles, first, model, renderer):
+        report(name, len(found) / (len(captures) + len(styles)))
+        found[name] = measure(capture, rig, truth, model, renderer)
+    return {"figures": found}
 
 
-def shots(arguments: argparse.Namespace, model: HeadModel, renderer: Renderer) -> Iterator[Shot]:
+def shots(
+    captures: Sequence[Path], styles: Sequence[str], first: int, model: HeadModel, renderer: Renderer
+) -> Iterator[Shot]:
     """Captures with the true parts of their pixels: 1 skin, 2 hair, 3 clothes, 0 not known or background."""
-    for folder in arguments.captures:
+    for folder in captures:
         capture, rig = read_capture(folder)
         truth = folder.with_name(folder.name + ".truth")
         if (truth / "parts").is_dir():
@@ -73,7 +72,7 @@ def shots(arguments: argparse.Namespace, model: HeadModel, renderer: Renderer) -
             points = np.load(truth / "visible.npz")
             parts = {camera.name: seen_parts(camera, points) for camera in rig}
         yield folder.name, capture, rig, parts
-    for seed, style in enumerate(arguments.styles, arguments.first):
+    for seed, style in enumerate(styles, first):
         rng = np.random.default_rng(seed)
         preset = replace(PRESET, hairstyle=tuple(style.split(",")))
         taken = simulate(drawn_subject(model, rng), default_layout(), preset, rng, renderer=renderer)
@@ -127,7 +126,3 @@ def measure(
             row[f"{part}_recall"] = counts[i, i + 1] / counts[i].sum()
             row[f"{part}_precision"] = counts[i, i + 1] / max(counts[:, i + 1].sum(), 1.0)
     return {key: round(float(value), 4) for key, value in row.items()} | {"cpu_s": round(seconds, 2)}
-
-
-if __name__ == "__main__":
-    main()

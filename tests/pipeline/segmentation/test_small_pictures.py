@@ -7,7 +7,7 @@ from pipeline.segmentation.segment import segment_view
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
-from tests.laboratory.benchmarks.plate_masks import Row, compare_view, smaller
+from tests.support.mask_comparison import Row, compare_view, smaller
 from tests.support.shared_data import shared
 
 
