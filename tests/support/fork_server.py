@@ -156,7 +156,8 @@ def _server() -> socket.socket:
             stdin=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
         )
-    atexit.register(process.kill)
+    atexit.register(process.wait)
+    atexit.register(process.kill)  # the last is called first
     return ours
 
 
