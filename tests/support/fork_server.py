@@ -120,6 +120,17 @@ class Popen(ExecPopen):
         self._close_pipe_fds(p2cread, p2cwrite, c2pread, c2pwrite, errread, errwrite)  # type: ignore[attr-defined]
 
 
+def run(command: Sequence[str], timeout_s: float, **options: Any) -> "subprocess.CompletedProcess[str]":
+    """Is ``subprocess.run`` with output captured as text, by the ``Popen`` of this module."""
+    with Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options) as process:
+        try:
+            out, errors = process.communicate(timeout=timeout_s)
+        except BaseException:
+            process.kill()
+            raise
+    return subprocess.CompletedProcess(command, process.returncode, out, errors)
+
+
 def _forked(request: dict[str, Any], files: list[int]) -> int:
     """The pid of a new child of this process. The server's own child forks it and ends, and the kernel gives it to the
     nearest ancestor that takes orphans, which this process is meanwhile."""
@@ -223,8 +234,11 @@ def _await_request(server: socket.socket) -> "tuple[dict[str, Any], list[int]]":
                 time.sleep(0.0005)
             return request, files
         os.waitpid(between, 0)  # from now on the process belongs to whoever asked for it
-        server.send(os.read(told, 32))
-        for file in (told, tell, *files):
+        pid = os.read(told, 32)
+        os.close(tell)
+        os.read(told, 1)  # until the process has closed its end, as the last of what it takes on
+        server.send(pid)
+        for file in (told, *files):
             os.close(file)
 
 
@@ -232,7 +246,6 @@ def _take_on(request: dict[str, Any], files: list[int]) -> None:
     """Takes on what exec would have given to the process."""
     if request["session"]:
         os.setsid()
-    _place_files(dict(zip(request["files"], files, strict=True)))
     os.chdir(request["folder"])
     os.environ.clear()
     os.environ.update(request["environment"])
@@ -241,6 +254,7 @@ def _take_on(request: dict[str, Any], files: list[int]) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, request["mask"])
+    _place_files(dict(zip(request["files"], files, strict=True)))
 
 
 def _place_files(files: dict[int, int]) -> None:
