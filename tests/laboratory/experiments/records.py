@@ -4,6 +4,7 @@ import hashlib
 import inspect
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
@@ -24,6 +25,7 @@ from pipeline.estimation import levenberg_marquardt, terms
 from pipeline.geometry import projection_kernels
 from pipeline.imaging import sampling_kernels
 from rig.atomic_write import write_atomically
+from rig.progress import Progress, discard_progress
 from tests.laboratory.experiments.outcome import Row
 
 # What rows of the contour solver depend on, for keys.
@@ -60,3 +62,15 @@ def key_of(*parts: object) -> str:
     everything else by its text."""
     texts = [inspect.getsource(part) if isinstance(part, ModuleType) else str(part) for part in parts]
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Holds what experiments report their progress to, and the folder that keeps their rows (None: nothing is kept)."""
+
+    report: Progress = discard_progress
+    folder: Path | None = None
+
+    def records(self, name: str, key: str) -> Records:
+        """Returns the kept rows of this name, see ``Records``."""
+        return Records(self.folder, name, key)

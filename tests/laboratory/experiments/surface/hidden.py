@@ -50,7 +50,7 @@ from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, key_of
 
 Level = Literal["span", "kernel", "photo", "fine"]
 HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm down the forehead
@@ -75,11 +75,10 @@ def hidden(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     others: HeadModel | None = None,
     subjects: int = 4,
     realism: tuple[str, ...] = (),
-    folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is
     ``<group>_<level>_<seen|hidden>_<region>_<quantity>`` or ``<group>_<level>_<landmarks|measurements>_within_95``, the
@@ -90,16 +89,14 @@ def hidden(
         model: fitted; heads are drawn from it, too.
         captures: folders with a truth beside them, by name.
         renderer: for the studio.
-        report: called with the subject and the share done.
         others: another population, from which as many heads are drawn.
         subjects: heads of each population.
         realism: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
-        folder: keeps rows, so that a stopped run can continue.
     """
     key = key_of(
         model.sha256, others.sha256 if others else "", Settings(), posterior, span_misfit, photo_refine, measurements
     )
-    records = Records(folder, "hidden", key)
+    records = bench.records("hidden", key)
     seeds = range(FIRST_SEED, FIRST_SEED + subjects)
     jobs: list[tuple[str, str, Callable[[], Known]]] = []
     for suffix, names in (("", ()), ("-real", realism)) if realism else (("", ()),):
@@ -113,9 +110,9 @@ def hidden(
     jobs += [(name, name, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, read) in enumerate(jobs):
-        report(name, done / len(jobs))
+        bench.report(name, done / len(jobs))
         rows.append({"name": name, "group": group, **records.row(name, partial(known_row, read, model, renderer))})
-    report("done", 1.0)
+    bench.report("done", 1.0)
     found = figures(rows)
     return {"figures": found, "rows": rows, "markdown": as_markdown(found)}
 
