@@ -1,4 +1,5 @@
-"""Keeps the rows of long experiments as they are computed, so that a stopped run can continue."""
+"""Defines the result of an experiment, and keeps the rows of long ones as they are computed, so that a stopped run can
+continue."""
 
 import hashlib
 import inspect
@@ -7,6 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any, NotRequired, TypedDict
+
+import numpy as np
 
 from pipeline.contour_fit import (
     clutter,
@@ -26,13 +30,32 @@ from pipeline.geometry import projection_kernels
 from pipeline.imaging import sampling_kernels
 from rig.atomic_write import write_atomically
 from rig.progress import Progress, discard_progress
-from tests.laboratory.experiments.outcome import Row
 
 # What rows of the contour solver depend on, for keys.
 CONTOUR = (
     *(levenberg_marquardt, terms, contour, problem, head_problem, rim_term, feature_term, prior_term),
     *(clutter, noise_model, rim, rim_kernels, rim_jacobian_kernels, projection_kernels, sampling_kernels),
 )
+
+
+Row = dict[str, Any]  # of one subject: each experiment has its own quantities
+
+
+class Outcome(TypedDict):
+    """Holds the result of an experiment.
+
+    ``figures`` is flat and has every number that README and docs quote. ``markdown`` and ``pictures`` go to files; the
+    rest is printed, with ``lines`` instead of the figures for people.
+    """
+
+    figures: dict[str, float]
+    rows: list[Row] | dict[str, list[Row]]
+    markdown: NotRequired[str]
+    lines: NotRequired[list[str]]
+    pictures: NotRequired[dict[str, np.ndarray]]
+    machine: NotRequired[str]
+    planned_directions_deg: NotRequired[list[tuple[int, int]]]
+    wrong: NotRequired[list[int]]
 
 
 class Records:

@@ -28,8 +28,7 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import Bench, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.support.spoilt_captures import LOOSE_PX, close_up, knocked, loosened
 from tests.support.subjects import Planted, off_by, random_subjects, worn_silhouettes
 

@@ -32,16 +32,8 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Bench, Records, Row, key_of
-from tests.support.subjects import (
-    Planted,
-    binary_silhouettes,
-    mean_error_mm,
-    off_by,
-    random_subjects,
-    worn_silhouettes,
-)
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Records, Row, key_of
+from tests.support.subjects import Planted, binary_silhouettes, mean_error_mm, off_by, random_subjects, worn_silhouettes
 
 CALIBRATION_PX = 0.11  # prior of ``off_by``: a head moves by 0.2 px (2D RMS) in each image
 WORST_RATIO = 1.1  # of the fit's error after an exchange to that without
@@ -142,11 +134,7 @@ def _assigned(capture: Capture, rig: Rig) -> ImageAssignment:
 def _planted(kind: str, rig: Rig, rng: np.random.Generator) -> dict[str, str]:
     """For each camera whose file is another's, that other."""
     one, two, three = rng.choice(rig.names, 3, replace=False).tolist()
-    return {
-        "pair": {one: two, two: one},
-        "triple": {one: two, two: three, three: one},
-        "duplicate": {one: two},
-    }[kind]
+    return {"pair": {one: two, two: one}, "triple": {one: two, two: three, three: one}, "duplicate": {one: two}}[kind]
 
 
 def _is_named(kind: str, filed: Mapping[str, str], found: ImageAssignment) -> bool:

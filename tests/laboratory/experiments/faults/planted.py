@@ -28,10 +28,9 @@ from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh, boundary_edges
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, surface_error
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.visible import seen_of
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
@@ -62,7 +61,6 @@ def planted(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int
             picture = None if bench.folder is None else bench.folder / f"planted-{number}-{kind}.jpg"
             row = records.row(f"{number} {kind}", lambda s=spoilt, p=picture: planted_row(s, model, renderer, p))
             rows.append({"subject": number, "fault": kind, **row})
-    bench.report("done", 1.0)
     return {"figures": _figures(rows), "rows": rows}
 
 

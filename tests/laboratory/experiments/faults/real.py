@@ -38,8 +38,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Bench
+from tests.laboratory.experiments.records import Bench, Outcome, Row
 
 USED = 11
 SIDE_DEG = 100.0  # from the front view's direction: the eleven, and the views they are judged by, look from there

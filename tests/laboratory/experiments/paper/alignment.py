@@ -22,8 +22,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, worn_silhouettes
 
 TURN_DEG, OFF_MM = (30.0, 15.0, 15.0), 60.0  # yaw, pitch, roll; any direction

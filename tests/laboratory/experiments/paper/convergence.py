@@ -15,8 +15,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
 
 ARRIVED_MM = 0.3

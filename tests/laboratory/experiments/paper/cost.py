@@ -25,8 +25,7 @@ from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, exact, mean_error_mm, random_subjects, worn_silhouettes
 
 
@@ -44,10 +43,7 @@ SIMPLEX: dict[str, SimplexCost] = {
     "simplex_eq5": {"speaking": "all", "weighted": True},
     "simplex_eq5_face": {"speaking": "face", "weighted": True},
 }
-FORGIVING = {
-    "contour_unforgiving": replace(FittingSettings(), robust_px=UNFORGIVING_PX),
-    "contour": FittingSettings(),
-}
+FORGIVING = {"contour_unforgiving": replace(FittingSettings(), robust_px=UNFORGIVING_PX), "contour": FittingSettings()}
 
 
 def cost(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 3) -> Outcome:

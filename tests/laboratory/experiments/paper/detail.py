@@ -56,9 +56,8 @@ from rig.studio.scene.subject import Subject
 from rig.studio.scene.visible import VisiblePoints
 from rig.studio.sensor.faults import Fault
 from rig.studio.sensor.preset import PRESET, Preset
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Bench, Row
+from tests.laboratory.experiments.records import Bench, Outcome, Row
 from tests.laboratory.experiments.surface.visible_surface import read_visible
 
 Level = Literal["span", "kernel", "photo"]
@@ -142,7 +141,6 @@ def run(
     for done, (name, compute) in enumerate(jobs):
         bench.report(name, done / len(jobs))
         rows.append({"name": name, **records.row(name, compute)})
-    bench.report("done", 1.0)
     return {"figures": figures(rows), "rows": rows}
 
 

@@ -22,8 +22,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
 
 FULL, MIDDLE, COARSE = HierarchyLevel("full", 1.0), HierarchyLevel("p95", 0.5), HierarchyLevel("p99", 0.25)

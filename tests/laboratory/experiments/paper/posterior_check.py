@@ -23,9 +23,8 @@ from pipeline.head_model.model import HeadModel, with_modes
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.limit import CORRELATION_PX, UNROBUST_PX, settings_for, with_noise
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, exact, exact_silhouettes, face_rows, random_subjects
 
 NOISE_PX = 0.3

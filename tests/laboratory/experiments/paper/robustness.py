@@ -38,9 +38,8 @@ from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper import limit
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.spoilt_captures import OVER_EARS, knocked, spoiled
 from tests.support.subjects import (
     Planted,

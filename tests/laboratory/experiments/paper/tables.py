@@ -28,8 +28,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import arrangement, default_layout
 from tests.laboratory.experiments import markdown, pictures
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, binary_silhouettes, exact, subjects_of_section_5_2
 
 STATISTICS = {"min": np.min, "max": np.max, "mean": np.mean, "median": np.median, "std": np.std}
@@ -59,16 +58,7 @@ def table1(
     simplex: Annotated[int, "how many the simplex fits too"] = 100,
 ) -> Outcome:
     """Returns tables 1 and 2 and pictures like figures 4 and 5. ``simplex``: how many the simplex fits too."""
-    rows = _rows(
-        model,
-        default_layout(),
-        "table1",
-        subjects,
-        simplex,
-        renderer=renderer,
-        bench=bench,
-        all_too=True,
-    )
+    rows = _rows(model, default_layout(), "table1", subjects, simplex, renderer=renderer, bench=bench, all_too=True)
     figures: dict[str, float] = {"subjects": len(rows), "simplex_subjects": sum("simplex" in row for row in rows)}
     for method in METHODS:
         done = [row[method] for row in rows if method in row]
@@ -106,16 +96,7 @@ def table2(
     simplex: Annotated[int, "how many the simplex fits too"] = 100,
 ) -> Outcome:
     """Returns table 2 alone, from table 1's rows."""
-    rows = _rows(
-        model,
-        default_layout(),
-        "table1",
-        subjects,
-        simplex,
-        renderer=renderer,
-        bench=bench,
-        all_too=True,
-    )
+    rows = _rows(model, default_layout(), "table1", subjects, simplex, renderer=renderer, bench=bench, all_too=True)
     figures = _correlations(rows)
     return {"figures": {"subjects": len(rows)} | figures, "rows": rows, "markdown": _table2_markdown(figures)}
 

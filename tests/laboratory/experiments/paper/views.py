@@ -24,9 +24,8 @@ from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import ARRANGEMENTS_DEG, rig_from_directions
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.limit import UNROBUST_PX, settings_for
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, exact, face_rows, mean_error_mm, random_subjects, worn_silhouettes
 
 CANDIDATES_DEG = tuple((a, e) for e in range(-40, 41, 20) for a in range(-90, 91, 15))

@@ -50,9 +50,8 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.peers import soft_rasteriser
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, subjects_of_section_5_2
 
 MODES = 60

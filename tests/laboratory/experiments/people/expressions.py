@@ -28,9 +28,8 @@ from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.detail import Known, surface_error
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.drawn_expressions import drawn_weights
 
 SEED = 22
@@ -69,11 +68,7 @@ def _subject(model: HeadModel, number: int, posed: bool, renderer: Renderer) -> 
     sitter = Subject(Mesh(head, full.faces), marks, full.face_region, f"seed-{number}")
     shot = simulate(sitter, default_layout(), PRESET, np.random.default_rng((SEED, number, 1)), renderer=renderer)
     bare = replace(model, expressions=no_expressions(len(model.mean)), _bases={})
-    return {
-        "truth": weights,
-        "after": _delivered(model, shot, renderer),
-        "before": _delivered(bare, shot, renderer),
-    }
+    return {"truth": weights, "after": _delivered(model, shot, renderer), "before": _delivered(bare, shot, renderer)}
 
 
 def _delivered(model: HeadModel, shot: SimulatedCapture, renderer: Renderer) -> Row:

@@ -27,8 +27,7 @@ from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Bench
+from tests.laboratory.experiments.records import Bench, Outcome, Row
 
 Job = Callable[[Capture, Rig], Reconstruction]
 STATES: Mapping[str, float] = {"open": 0.0, "half": 0.5, "closed": 1.0}
@@ -57,7 +56,6 @@ def eyes(
         bench.report(name, done / len(cases))
         row = records.row(name, partial(eye_row, model, number, state, job, renderer))
         rows.append({"name": name, "state": state, **row})
-    bench.report("done", 1.0)
     return {"figures": figures(rows), "rows": rows, "markdown": table(rows), "lines": table(rows).splitlines()}
 
 

@@ -30,8 +30,7 @@ from rig.studio.scene.subject import Subject, with_gaze
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import REALISM, made_real
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.eyeballs import OPEN_TRIANGLES
 
 SEED, SPREAD = 387, 0.8
@@ -52,7 +51,6 @@ def gazes(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: Bench, 
             bench.report(name, len(rows) / (subjects * len(models)))
             records = bench.records(f"gazes-{label}", key_of(model.sha256, *CODE))
             rows.append({"name": name} | records.row(name, partial(_row, model, number, renderer)))
-    bench.report("done", 1.0)
     return {"figures": _figures(rows), "rows": rows, "markdown": _table(rows)}
 
 

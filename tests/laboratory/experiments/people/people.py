@@ -29,12 +29,11 @@ from rig.errors import EigenheadError, InputError
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.span import weighted_quantile
 from tests.laboratory.experiments.people import eye_states, people_subjects, pose_error, view_subsets
 from tests.laboratory.experiments.people.people_subjects import EVIDENCE, Case, Person, capture_cases, studio_cases
 from tests.laboratory.experiments.people.pose_error import PoseError, pose_error_of_surfaces, pose_error_of_vertices
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 EYES = "eyes"
 SPEAKING = (
@@ -93,7 +92,6 @@ def people(
             {"name": case.name, "subject": case.subject, "kind": case.kind, "evidence": case.evidence}
             | records.row(case.name, partial(judge_case, case, model, settings, renderer))
         )
-    bench.report("done", 1.0)
     text = f"{table(rows)}\n{summary_table(rows)}"
     return {"figures": figures(rows), "rows": rows, "markdown": text, "lines": text.splitlines()}
 

@@ -24,8 +24,7 @@ from rig.studio.scene.simulate import simulate
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import Bench, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.speed.scaling import JobCommand, run_job
 from tests.support.subjects import random_subjects
 
@@ -85,7 +84,6 @@ def growth(
             {"name": size.name, "kind": size.kind, "views": size.views, "megapixels": size.megapixels}
             | records.row(size.name, lambda size=size: _measured(size, model, command, renderer))
         )
-    bench.report("done", 1.0)
     figures: dict[str, float] = {}
     for kind, quantity in (("views", "views"), ("pixels", "megapixels")):
         of_kind = [row for row in rows if row["kind"] == kind]

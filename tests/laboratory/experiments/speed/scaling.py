@@ -21,8 +21,7 @@ from pipeline.compute import trace
 from pipeline.compute.threads import THREADS
 from rig.errors import EigenheadError
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import Bench, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.speed import critical_path
 from tests.laboratory.experiments.speed.critical_path import JobWork, work_of
 
@@ -64,7 +63,6 @@ def scaling(captures: Sequence[Path], *, command: JobCommand, bench: Bench, thre
                 lambda count=count, capture=capture: run_job(capture, command, count, bench.folder),
             )
         rows.append(row)
-    bench.report("done", 1.0)
     figures: dict[str, float] = {}
     for row in rows:
         figures |= {(f"{row['name']}_" if len(rows) > 1 else "") + key: value for key, value in _figures(row).items()}

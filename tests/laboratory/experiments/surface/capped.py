@@ -39,10 +39,9 @@ from rig.studio.scene.subject import Subject, random_look
 from rig.studio.scene.tight_cap import TightCap, above_edge_mm
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,20 +88,12 @@ def capped(
         bench.report(name, done / len(jobs))
         made = partial(_row, model, *populations[group], number, worn, renderer=renderer)
         rows.append({"name": name, "group": group, **records.row(name, made)})
-    bench.report("done", 1.0)
     found = figures(rows)
     return {"figures": found, "rows": rows, "markdown": as_markdown(rows)}
 
 
 def _row(
-    model: HeadModel,
-    population: HeadModel,
-    modes: int,
-    spread: float,
-    number: int,
-    worn: Worn,
-    *,
-    renderer: Renderer,
+    model: HeadModel, population: HeadModel, modes: int, spread: float, number: int, worn: Worn, *, renderer: Renderer
 ) -> Row:
     """Returns one head's figures: ``{without|with: {quantity: value}}``."""
     rng = np.random.default_rng((SEED, number))

@@ -22,8 +22,7 @@ from pipeline.results.clay import clay
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SEED, SPREAD = 38, 0.8
 HEADS = 5
@@ -48,7 +47,6 @@ def eyeballs(facekit: HeadModel, *, bench: Bench) -> Outcome:
     for number in range(HEADS):
         bench.report(f"head {number}", number / HEADS)
         rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
-    bench.report("done", 1.0)
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in CROSSING}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
     pictures = {} if bench.folder is None else {"eyes": _picture(facekit)}

@@ -25,10 +25,9 @@ from rig.mesh import Mesh
 from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import read_known
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.templates import foreign
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 

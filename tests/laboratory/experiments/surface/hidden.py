@@ -47,10 +47,9 @@ from rig.studio.scene.visible import PARTS
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import made_real
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 Level = Literal["span", "kernel", "photo", "fine"]
 HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm down the forehead
@@ -112,7 +111,6 @@ def hidden(
     for done, (group, name, read) in enumerate(jobs):
         bench.report(name, done / len(jobs))
         rows.append({"name": name, "group": group, **records.row(name, partial(known_row, read, model, renderer))})
-    bench.report("done", 1.0)
     found = figures(rows)
     return {"figures": found, "rows": rows, "markdown": as_markdown(found)}
 
@@ -142,9 +140,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) 
 
 
 def landmark_figures(
-    true: Mapping[str, Float[np.ndarray, " 3"]],
-    found: Mapping[str, Landmark],
-    lengths: Mapping[str, Measurement],
+    true: Mapping[str, Float[np.ndarray, " 3"]], found: Mapping[str, Landmark], lengths: Mapping[str, Measurement]
 ) -> dict[str, float]:
     """Returns the median error and stated deviation (mm), and the share within 95 % intervals, of landmarks (by
     coordinate) and of measurements; empty if no landmark is known.
@@ -179,10 +175,7 @@ def landmark_figures(
 
 
 def skin_figures(
-    known: Known,
-    head_world: Mesh,
-    deviation_mm: Float[np.ndarray, " v"],
-    regions: Mapping[str, Bool[np.ndarray, " v"]],
+    known: Known, head_world: Mesh, deviation_mm: Float[np.ndarray, " v"], regions: Mapping[str, Bool[np.ndarray, " v"]]
 ) -> dict[str, float]:
     """Returns the median distance (mm), the share within the stated interval, and the median stated deviation (mm) of
     the true skin, by whether it is seen and by region; the region ``all`` is all of them together.

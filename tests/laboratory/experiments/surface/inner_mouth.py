@@ -27,8 +27,7 @@ from pipeline.results.clay import SKIN, clay
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.eyeballs import HEADS, OPEN_TRIANGLES, SEED, SPREAD
 
 SHOWN = (("jawOpen", 0.3), ("jawOpen", 0.7), ("tongueOut", 1.0), ("mouthFunnel", 1.0), ("mouthRollLower", 1.0))
@@ -43,7 +42,6 @@ def inner_mouths(facekit: HeadModel, *, bench: Bench) -> Outcome:
     for number in range(HEADS):
         bench.report(f"head {number}", number / HEADS)
         rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
-    bench.report("done", 1.0)
     names = ("meeting_rest", "meeting_before", "meeting_after")
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in names}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)

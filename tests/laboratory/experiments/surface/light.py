@@ -40,10 +40,9 @@ from rig.studio.scene.lights import LAMPS, Lamp
 from rig.studio.scene.simulate import Scene, build_scene, shoot
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.texture import drawn_texture
 from tests.support.colour_chart_pictures import chart_plate
 from tests.support.colour_difference import difference_2000, lab_from_srgb
@@ -86,7 +85,6 @@ def light(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
         picture = None if bench.folder is None else bench.folder / f"light-{name}.png"
         compute = partial(row_of, model, 400 + number, renderer, settings, picture)
         rows.append({"name": name, **records.row(name, compute)})
-    bench.report("done", 1.0)
     keys = [key for key, value in rows[0].items() if isinstance(value, float)]
     return {"figures": {key: float(np.mean([row[key] for row in rows])) for key in keys}, "rows": rows}
 

@@ -27,8 +27,7 @@ from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import vertex_normals
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import Bench, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SUBJECTS = 20  # heads of each model
 MAX_COEFFICIENT, EXPRESSIONS = 2.5, 5

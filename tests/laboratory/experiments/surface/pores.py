@@ -37,9 +37,8 @@ from rig.geometry import RigidTransform
 from rig.image import ImageRgb
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.pores_scene import CloseUp, photograph_close_up
 from tests.laboratory.experiments.surface.texture import drawn_texture, face_pixels, noise_power
 
@@ -70,7 +69,6 @@ def pores(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
             {"name": f"{skin}-{seed}", "skin": skin}
             | records.row(f"{skin}-{seed}", partial(row_of, model, skin, seed, renderer, settings, picture=picture))
         )
-    bench.report("done", 1.0)
     keys = [key for key, value in rows[0].items() if isinstance(value, float)]
     figures = {
         f"{skin}_{key}": float(np.mean([row[key] for row in rows if row["skin"] == skin]))
@@ -195,10 +193,7 @@ def banded(field: Field, texel_mm: float, shortest_mm: float, longest_mm: float)
 
 
 def fine_gain(
-    shot: CloseUp,
-    found: Reconstruction,
-    fine: UInt8[np.ndarray, "t t 3"],
-    face: Bool[np.ndarray, " v"],
+    shot: CloseUp, found: Reconstruction, fine: UInt8[np.ndarray, "t t 3"], face: Bool[np.ndarray, " v"]
 ) -> Row:
     """Returns by how many dB the error of the finer texture in the kept-back view is smaller, over waves of less than a
     millimetre, and the power of that picture and of the errors (codes squared)."""

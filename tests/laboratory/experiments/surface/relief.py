@@ -31,9 +31,8 @@ from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.people.view_subsets import azimuths_deg
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.local_means import means_within
 
 SMOOTH_MM = 3.0  # radius of the mean that relief departs from
@@ -78,7 +77,6 @@ def relief(model: HeadModel, captures: Mapping[str, Path], *, renderer: Renderer
     for done, (name, path) in enumerate(captures.items()):
         bench.report(name, done / len(captures))
         rows.append({"name": name} | records.row(str(path.resolve()), lambda path=path: _row(path, model, renderer)))
-    bench.report("done", 1.0)
     figures = {f"{row['name']}_{key}": row[key] for row in rows for key in row if key not in ("name", "halves")}
     columns = ("unrepeated_rms_mm", "unrepeated_median_mm", "unrepeated_p95_mm", "repeated_rms_mm", "places")
     header = ("capture", "relief not repeated, RMS, mm", "median", "p95", "repeated, RMS", "places")

@@ -38,8 +38,7 @@ from rig.studio.scene.simulate import Scene, build_scene, shoot
 from rig.studio.scene.subject import Subject, random_look, random_pose
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Bench, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import off_by
 
 SHOTS = 10

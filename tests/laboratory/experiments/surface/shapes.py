@@ -29,8 +29,7 @@ from pipeline.results.clay import clay
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.foreign_meshes import ForeignMesh, decimated_split, dual, shuffled
 
 SEED = 38

@@ -40,10 +40,9 @@ from rig.mesh import Mesh
 from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import Known, every_level, read_known, surface_error
 from tests.laboratory.experiments.peers.openmvs import PeerFailed, programs_in, surface_by_openmvs
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
 POISSON_DEPTH = 9  # of its octree: cells of 1 to 1.5 mm about a bust
@@ -124,7 +123,6 @@ def surfaces(
                 {"name": name, "peer": peer, **records.row(name, partial(peer_row, shown.known, partial(make, shown)))}
             )
         rows += [{"name": name, "peer": peer, "left_out": why} for peer, why in left_out.items()]
-    bench.report("done", 1.0)
     return {"figures": figures(rows), "rows": rows, "markdown": as_markdown(rows)}
 
 

@@ -22,8 +22,7 @@ from pipeline.head_model.model import HeadModel
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SEED = 22
 OWN_SHAPE = 1.0  # standard deviations of the head that the third mesh has

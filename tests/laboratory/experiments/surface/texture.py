@@ -41,10 +41,9 @@ from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SUBJECTS = 10
 KEPT_BACK = 4  # nearest cameras to the front one that take turns
@@ -80,7 +79,6 @@ def texture(
         picture = None if bench.folder is None else bench.folder / f"texture-{name}.png"
         compute = partial(row_of, read, model, renderer, settings, number, picture)
         rows.append({"name": name, "group": group, **records.row(name, compute)})
-    bench.report("done", 1.0)
     return {"figures": _figures(rows), "rows": rows}
 
 

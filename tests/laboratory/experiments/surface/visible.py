@@ -35,7 +35,6 @@ from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS, VisiblePoints
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import made_real
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import (
     IN_SPAN_MODES,
     IN_SPAN_SPREAD,
@@ -46,7 +45,7 @@ from tests.laboratory.experiments.paper.detail import (
 )
 from tests.laboratory.experiments.paper.span import weighted_quantile
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.face_skin import (
     crater_map,
     face_places,
@@ -109,7 +108,6 @@ def visible(
         picture = None if bench.folder is None else bench.folder / f"visible-{name}.png"
         compute = partial(known_row, read, model, renderer, picture)
         rows.append({"name": name, "group": group, **records.row(name, compute)})
-    bench.report("done", 1.0)
     return {"figures": figures(rows), "rows": rows}
 
 

@@ -22,9 +22,8 @@ from pipeline.head_model.model import HeadModel
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.progress import discard_progress
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.span import Truth, read_truth
-from tests.laboratory.experiments.records import Bench, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 
 def wrapping(facekit: HeadModel, truths: Mapping[str, Path], *, bench: Bench) -> Outcome:
