@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from pipeline.applications.model_building.correspondence.scans import Scan, write_landmarks
+from pipeline.applications.model_building.correspondence.scans import Scan
 from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.applications.model_building.training.build import build_model, corresponded_cages
 from pipeline.applications.model_building.training.training import Training, train
@@ -28,6 +28,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.head_model.model_file import read_parts
 from pipeline.head_model.model_names import model_path
 from tests.laboratory.benchmarks.correspondence import without
+from tests.support.landmark_files import write_landmarks
 
 SPACING_MM = 1.12  # 100,000 points
 
