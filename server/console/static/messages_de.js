@@ -93,7 +93,6 @@ export default {
   "job-without-result": "Der Auftrag hat kein Ergebnis (Status: {state:word}).",
   "job-active": "Der Auftrag wartet oder läuft; erst abbrechen.",
   "too-many-jobs": "{count} Aufträge dieses Schlüssels warten oder laufen, mehr dürfen es nicht sein; warten, bis einer endet.",
-  "research-not-carried": "ein installiertes Paket enthält keine Experimente: das Projekt klonen, darin deploy/setup.sh ausführen und dort .venv/bin/eigenhead experiments",
   "capture-missing": "Seine Bilder sind weder im Datenordner noch im Speicher der Aufnahmen: aus einer Sicherung zurückholen oder die Aufnahme entfernen.",
   "result-missing": "Das Ergebnis ist nicht mehr im Datenordner: aus einer Sicherung zurückholen oder den Auftrag neu starten.",
   "worker-starting": "Der Worker wird gestartet.",
