@@ -37,7 +37,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
     warning has a code that ``settings.fail_on`` names, and Cancelled when ``context.progress`` does.
     """
-    if "usdz" in context.settings.outputs.written:
+    if "usdz" in context.settings.outputs.formats:
         check_usd()
     run = Recorder(context)
     with run.stage("segmentation") as stage:

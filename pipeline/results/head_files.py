@@ -48,7 +48,7 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         result: what is written.
         head: the head's mesh in the head frame, mm.
     """
-    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.written, result.texturing.atlas
+    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.formats, result.texturing.atlas
     named = atlas is not None and outputs.ply_texture
     corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
     write_ply(

@@ -158,6 +158,7 @@ TEMPLATES = {
     "field-url-refused": "url: {why}",
     "text-too-long": "{field}: longer than {most} characters",
     "text-with-control-characters": "{field}: has control characters or halves of characters: type it anew",
+    "cursor-in-place-of-offset": "this list is read by 'cursor' since 0.3.0: send what 'next' of the page before said",
     "cursor-of-other-list": "is not what 'next' of this list in this order said: begin without one",
     "board-hold": "Hold the board where several cameras see it whole, and take a shot.",
     "board-turn-to": "No view yet: {cameras}. Turn the board towards them.",

@@ -31,7 +31,6 @@ from pipeline.stages.context import ReconstructionContext
 from pipeline.texturing.head_texture import paint_head
 from pipeline.texturing.layout.model_layout import model_layout
 from pipeline.texturing.layout.uv_unwrap import Layout
-from pipeline.texturing.paper_blend import paper_texture
 from pipeline.texturing.vertex_colours import texture as colour
 from rig.camera import Camera
 from rig.capture import Capture
@@ -44,6 +43,7 @@ from rig.rig import Rig
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.pictures import labelled
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.surface.paper_blend import paper_texture
 
 SUBJECTS = 10
 KEPT_BACK = 4  # nearest cameras to the front one that take turns
