@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup setup-tests demo serve test test-shapes test-slow test-nightly check coverage format bench dependencies reference results pictures docs sbom audit mutants
+.PHONY: setup setup-tests demo serve test test-shapes test-slow test-nightly test-laboratory check coverage format bench dependencies reference results pictures docs sbom audit mutants
 BIN := .venv/bin
 # The tests start many processes: with compiled modules kept beside them each starts in half the time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -31,6 +31,9 @@ test-slow: setup  ## the tests that take more than a second each
 
 test-nightly: setup  ## these, and in full size what they hold in a smaller one
 	$(PYTEST) -m slow
+
+test-laboratory: setup  ## the tests of experiments, benchmarks and model files, slow ones too: before a release
+	$(BIN)/pytest -m "slow or not slow" -n 2 tests/laboratory/tests
 
 check: ## ruff, pyright, import-linter, biome (JavaScript), dead links of the documents
 	@deploy/setup.sh --docs

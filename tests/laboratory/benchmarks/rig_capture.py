@@ -1,15 +1,13 @@
 """How long does a capture take, and does the pipeline reconstruct it?
 
-``python -m tests.laboratory.benchmarks.rig_capture [--captures 5] [--seed 3] [--reconstruct] [--json]``. ``eigenhead simulate
---serve`` runs as a process (eleven streams of 1024 x 768 and a trigger box on a pty), ``eigenhead rig capture`` takes
-one capture after the other, each a process of its own; ``seconds`` are from the warm rig to the complete folder, as the
-command states them. The last capture is reconstructed by ``eigenhead reconstruct`` and compared with the truth.
+python -m tests.laboratory rig_capture --captures 5 --reconstruct
+
+``eigenhead simulate --serve`` runs as a process (eleven streams of 1024 x 768 and a trigger box on a pty), ``eigenhead
+rig capture`` takes one capture after the other, each a process of its own; ``seconds`` are from the warm rig to the
+complete folder, as the command states them. The last capture is reconstructed by ``eigenhead reconstruct`` and compared
+with the truth.
 """
 
-import argparse
-import json
-import sys
-import tempfile
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -18,11 +16,12 @@ from server.services.truth import error_mm
 from tests.support.served_studio import command, served_studio
 
 
-def run(folder: Path, captures: int, seed: int, *, reconstruct: bool) -> dict[str, Any]:
+def run(scratch: Path, *, captures: int = 5, seed: int = 3, reconstruct: bool = False) -> dict[str, Any]:
+    """Returns the figures of this module."""
     seconds, warm_up_s, spreads_ms, skews = [], [], [], 0
-    with served_studio(folder / "studio", "--seed", str(seed)) as studio:
+    with served_studio(scratch / "studio", "--seed", str(seed)) as studio:
         for index in range(captures):
-            taken = command("rig", "capture", "--rig", studio["rig"], "--out", str(folder / f"capture{index}"))
+            taken = command("rig", "capture", "--rig", studio["rig"], "--out", str(scratch / f"capture{index}"))
             seconds.append(taken["seconds"]["capture"])
             warm_up_s.append(taken["seconds"]["warm_up"])
             spreads_ms.append(taken["sync"]["spread_ms"])
@@ -36,24 +35,8 @@ def run(folder: Path, captures: int, seed: int, *, reconstruct: bool) -> dict[st
         "spread_ms": {"median": median(spreads_ms), "max": max(spreads_ms)},
     }
     if reconstruct:
-        report = command("reconstruct", str(folder / f"capture{captures - 1}"), "--out", str(folder / "head"))
-        error = error_mm(truth, folder / "head" / "head.ply")
+        report = command("reconstruct", str(scratch / f"capture{captures - 1}"), "--out", str(scratch / "head"))
+        error = error_mm(truth, scratch / "head" / "head.ply")
         result["error_mm"] = {name: round(value, 3) for name, value in error.items()}
         result["warnings"] = [warning["code"] for warning in report["warnings"]]
-    return result
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Captures of the served studio by the command line.")
-    parser.add_argument("--captures", type=int, default=5)
-    parser.add_argument("--seed", type=int, default=3)
-    parser.add_argument("--reconstruct", action="store_true")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        result = run(Path(folder), options.captures, options.seed, reconstruct=options.reconstruct)
-    sys.stdout.write(json.dumps(result, indent=None if options.json else 1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+    return {"figures": result}

@@ -1,24 +1,21 @@
-"""Figures of the service under load; prints one JSON object.
+"""Figures of the service under load.
 
-    python -m tests.laboratory.benchmarks.service_load soak [JOBS]      many small jobs: memory, descriptors, database size
-    python -m tests.laboratory.benchmarks.service_load clients [COUNT]  uploads at once: failures, seconds, lag of the event loop
-    python -m tests.laboratory.benchmarks.service_load workers [JOBS]   PostgreSQL: one pinned worker against two, by core
-    python -m tests.laboratory.benchmarks.service_load heads [JOBS]     the same with reconstructions of a simulated shot
+python -m tests.laboratory service_load soak 1000      # many small jobs: memory, descriptors, database size
+python -m tests.laboratory service_load clients 50     # uploads at once: failures, seconds, lag of the event loop
+python -m tests.laboratory service_load workers 20     # PostgreSQL: one pinned worker against two, by core
+python -m tests.laboratory service_load heads 10       # the same with reconstructions of a simulated shot
 
 ``soak`` and ``clients`` use small captures and the tests' tiny work: they measure the service, not the pipeline.
 ``workers`` burns real CPU.
 """
 
-import json
 import os
 import re
-import sys
-import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import httpx
 
@@ -150,14 +147,12 @@ def workers(jobs: int, folder: Path, *, work: str = "tests.support.tiny:busy") -
     }
 
 
-def main() -> None:
-    known = {"soak": (soak, 1000), "clients": (clients, 50), "workers": (workers, 20), "heads": (heads, 10)}
-    measure, default = known[sys.argv[1]]
-    count = int(sys.argv[2]) if len(sys.argv) > 2 else default
-    with tempfile.TemporaryDirectory(prefix="eigenhead-load-") as folder:
-        figures = measure(count, Path(folder))
-    sys.stdout.write(json.dumps(figures | {"load_average": os.getloadavg()[0]}) + "\n")
+LOADS = {"soak": (soak, 1000), "clients": (clients, 50), "workers": (workers, 20), "heads": (heads, 10)}
 
 
-if __name__ == "__main__":
-    main()
+def run(
+    what: Literal["soak", "clients", "workers", "heads"], count: int | None = None, *, scratch: Path
+) -> dict[str, Any]:
+    """Returns the figures of one of this module's loads, by so many jobs or clients."""
+    load, default = LOADS[what]
+    return {"figures": load(count or default, scratch) | {"load_average": os.getloadavg()[0]}}

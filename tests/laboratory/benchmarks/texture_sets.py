@@ -1,6 +1,6 @@
-"""What polarised pictures tell of a simulated head, whose scattered and mirrored light are known. From the root:
+"""What polarised pictures tell of a simulated head, whose scattered and mirrored light are known.
 
-python -m tests.laboratory.benchmarks.texture_sets [--seed 7] [--oil 1.0] [--folder OUT]
+python -m tests.laboratory texture_sets --seed 7 --oil 1.0 --out OUT
 
 Prints, over the face: how far the plain texture, that of the parallel and that of the crossed pictures are from the
 truth's scattered light (RMS by the RMS of the truth, dB, an exposure a channel taken out), the same within highlights;
@@ -8,18 +8,16 @@ and of the specular light its correlation with the truth, the ratio of the two, 
 mirrored. OUT gets the maps.
 """
 
-import argparse
-import json
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.head_model.model import load_model
+from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.set_files import write_set_textures
@@ -35,15 +33,16 @@ from server.tasks.subjects import drawn_subject
 DULL, BRIGHT = 0.002, 0.05  # linear, mirrored light of a channel: none, a highlight
 
 
-def figures(seed: int, oil: float, folder: Path | None) -> dict[str, float]:
+def run(
+    model: HeadModel, renderer: Renderer, folder: Path | None, *, seed: int = 7, oil: float = 1.0
+) -> dict[str, Any]:
     """Makes a head of the studio and compares its maps with the truth."""
-    model, rng = load_model(), np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     preset = replace(PRESET, oil=oil, polarised=True)
-    with Renderer.create() as renderer:
-        taken = simulate(drawn_subject(model, rng), default_layout(), preset, rng, renderer=renderer)
-        settings = Settings(outputs=OutputSettings(surface="head"))
-        capture = replace(taken.capture, features={})
-        result = reconstruct(ReconstructionContext(capture, taken.rig, model, settings, renderer))
+    taken = simulate(drawn_subject(model, rng), default_layout(), preset, rng, renderer=renderer)
+    settings = Settings(outputs=OutputSettings(surface="head"))
+    capture = replace(taken.capture, features={})
+    result = reconstruct(ReconstructionContext(capture, taken.rig, model, settings, renderer))
     texturing = result.texturing
     assert texturing.sets is not None
     assert texturing.sets.specular is not None
@@ -65,7 +64,7 @@ def figures(seed: int, oil: float, folder: Path | None) -> dict[str, float]:
     row["specular_correlation"] = float(np.corrcoef(found.mean(axis=1), mirrored.mean(axis=1))[0, 1])
     row["specular_ratio"] = float(np.median(found[bright].mean(axis=1) / mirrored[bright].mean(axis=1)))
     row["specular_where_none"] = float(found[dull].mean())
-    return row | {"negative": texturing.sets.specular.negative}
+    return {"figures": row | {"negative": texturing.sets.specular.negative}}
 
 
 def texels(result: Reconstruction, image: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -114,12 +113,3 @@ def error_db(light: np.ndarray, truth: np.ndarray, part: np.ndarray) -> tuple[fl
     off = light * ((light * truth).sum(axis=0) / (light**2).sum(axis=0)) - truth
     whole, within = (np.sqrt(np.mean(off[of] ** 2) / np.mean(truth[of] ** 2)) for of in (slice(None), part))
     return float(20 * np.log10(whole)), float(20 * np.log10(within))
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=7)
-    parser.add_argument("--oil", type=float, default=1.0)
-    parser.add_argument("--folder", type=Path)
-    chosen = parser.parse_args()
-    sys.stdout.write(json.dumps(figures(chosen.seed, chosen.oil, chosen.folder), indent=1) + "\n")

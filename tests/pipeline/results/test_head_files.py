@@ -18,8 +18,7 @@ from pipeline.results.head_files import write_head
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
-from pipeline.results.write import head_mesh
-from pipeline.results.write_expression import write_expression
+from pipeline.results.write import head_mesh, write_result
 from pipeline.settings import OutputSettings, Settings, settings_from_document
 from pipeline.texturing.albedo import Albedo
 from pipeline.texturing.layout.model_layout import model_layout
@@ -28,6 +27,7 @@ from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.light import Light
 from pipeline.texturing.sets.specular import Specular
 from pipeline.texturing.sets.texture_sets import SetTextures
+from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
@@ -234,8 +234,9 @@ def test_the_khronos_validator_has_nothing_to_say(
     elif kind == "morphs":
         model, name = load_model(), "posed.glb"
         blendshape_rig = build_blendshape_rig(model, result.head.fit.world_from_head, result.mesh_world, ())
-        chosen = replace(result, settings=Settings(outputs=OutputSettings(morphs=True, neutral=True)))
-        write_expression(tmp_path, chosen, blendshape_rig)
+        evidence = replace(result.evidence, blendshape_rig=blendshape_rig)
+        settings = Settings(outputs=OutputSettings(morphs=True, neutral=True))
+        write_result(tmp_path, replace(result, evidence=evidence, settings=settings), Capture({}))
         assert validated(tmp_path / "neutral.glb", gltf_validator) == (0, 0, [])
     else:
         written(result, tmp_path, image=kind)

@@ -127,7 +127,7 @@ def test_the_preset_without_its_plates(measured: tuple[Measured, Measured, list[
 @pytest.mark.xfail(
     strict=True,
     reason="not reached: some views stay beyond 0.8 px, mostly grey coats before grey walls and small real gaps in "
-    "hair (python -m tests.laboratory.benchmarks.studio_masks prints them)",
+    "hair (python -m tests.laboratory studio_masks prints them)",
 )
 def test_the_worst_view_of_the_preset(measured: tuple[Measured, Measured, list[str]]) -> None:
     plates, _, _ = measured

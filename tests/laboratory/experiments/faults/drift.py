@@ -16,11 +16,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from pipeline.head_model.model import HeadModel, with_modes
-from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview import tangency
 from pipeline.view_checks import camera_drift
 from pipeline.view_checks.camera_drift import find_drift
@@ -31,15 +30,13 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.paper.robustness import knocked
 from tests.laboratory.experiments.records import Records, Row, key_of
+from tests.support.spoilt_captures import LOOSE_PX, close_up, knocked, loosened
 from tests.support.subjects import Planted, off_by, random_subjects, worn_silhouettes
 
 TURN_DEG = 0.2
-LOOSE_PX = 2
 CALIBRATION_PX = 0.11  # prior of ``off_by``: a head moves by 0.2 px (2D RMS) in each image
 CUT_VIEWS, CUT_SHARE = 3, 0.3  # of width and height: how far such a view is aimed beside the subject
-CLOSE_UP, CLOSE_UP_SHARE = 2.0, 0.3  # focal length; of the height: how far down the head is, so that its crown is whole
 CONDITIONS = ("turned", "good", "loose", "loose_one", "cut_off", "close_up", "close_up_loose")
 
 
@@ -90,20 +87,6 @@ def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.
 def said_of(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
     """Returns the codes of the warnings about cameras, by camera."""
     return {found.camera: found.code for found in find_drift(silhouettes, rig)}
-
-
-def loosened(silhouettes: Mapping[str, Silhouette]) -> dict[str, Silhouette]:
-    """Returns silhouettes whose masks are dilated by ``LOOSE_PX``."""
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * LOOSE_PX + 1, 2 * LOOSE_PX + 1))
-    masks = {name: cv2.dilate(s.mask.view(np.uint8), disk).view(bool) for name, s in silhouettes.items()}
-    return {name: silhouette_from_mask(mask) for name, mask in masks.items()}
-
-
-def close_up(camera: Camera) -> Camera:
-    """Returns the camera with a lens of ``CLOSE_UP`` times the focal length, aimed higher."""
-    k = camera.intrinsics
-    down = k.cy + CLOSE_UP_SHARE * k.height
-    return replace(camera, intrinsics=replace(k, fx=CLOSE_UP * k.fx, fy=CLOSE_UP * k.fy, cy=down))
 
 
 def aimed_beside(camera: Camera, rng: np.random.Generator) -> Camera:

@@ -104,9 +104,7 @@ def run(
     renderer: Renderer,
     report: Progress,
     others: HeadModel | None = None,
-    draws: int = 20,
-    in_span: int = 10,
-    held_out: bool = True,
+    subjects: int | None = None,
     folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
@@ -118,11 +116,10 @@ def run(
         renderer: for the studio.
         report: progress.
         others: the population from which random heads are drawn.
-        draws: number of random heads of it.
-        in_span: number of random heads of the first model's span.
-        held_out: whether cameras are left out and predicted.
+        subjects: number of random heads of it (20 by default), and of the first model's span (10 by default).
         folder: keeps rows, which are not computed again.
     """
+    draws, in_span = subjects or 20, subjects or 10
     records = Records(folder, "detail", _key(models, others))
     label, model = next(iter(models.items()))
     jobs: list[Job] = []
@@ -133,14 +130,14 @@ def run(
     if others is not None:
         drawn = partial(photographed, others, len(others.modes), 1.0, renderer=renderer)
         jobs += [(f"draw-{i:02}_{label}", partial(known_row, partial(drawn, i), model, renderer)) for i in range(draws)]
-        for kind, fault in FAULTS.items() if draws else ():
+        for kind, fault in FAULTS.items():
             jobs.append((f"{kind}_{label}", partial(known_row, partial(drawn, 0, fault=fault), model, renderer)))
     photographed_in_span = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer)
     jobs += [
         (f"inspan-{i:02}_{label}", partial(known_row, partial(photographed_in_span, i), model, renderer))
         for i in range(in_span)
     ]
-    for name, path in captures.items() if held_out else ():
+    for name, path in captures.items():
         for camera in read_capture(path)[1].names:
             compute = partial(held_out_row, path, camera, model, renderer)
             jobs.append((f"heldout-{name}-{camera}_{label}", compute))

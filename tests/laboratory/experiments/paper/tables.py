@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -19,7 +20,7 @@ from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import xor_cost
 from pipeline.settings import FittingSettings
 from pipeline.simplex import hierarchy as schedule
-from pipeline.simplex import nelder_mead as simplex
+from pipeline.simplex import nelder_mead
 from pipeline.simplex import xor_objective as objective
 from pipeline.simplex.hierarchy import fit_simplex
 from rig.geometry import Similarity
@@ -57,16 +58,16 @@ def table1(
     renderer: Renderer,
     report: Progress,
     subjects: int = 100,
-    simplex_subjects: int = 100,
+    simplex: Annotated[int, "how many the simplex fits too"] = 100,
     folder: Path | None = None,
 ) -> Outcome:
-    """Returns tables 1 and 2 and pictures like figures 4 and 5. ``simplex_subjects``: how many the simplex fits too."""
+    """Returns tables 1 and 2 and pictures like figures 4 and 5. ``simplex``: how many the simplex fits too."""
     rows = _rows(
         model,
         default_layout(),
         "table1",
         subjects,
-        simplex_subjects,
+        simplex,
         renderer=renderer,
         report=report,
         folder=folder,
@@ -106,7 +107,7 @@ def table2(
     renderer: Renderer,
     report: Progress,
     subjects: int = 100,
-    simplex_subjects: int = 100,
+    simplex: Annotated[int, "how many the simplex fits too"] = 100,
     folder: Path | None = None,
 ) -> Outcome:
     """Returns table 2 alone, from table 1's rows."""
@@ -115,7 +116,7 @@ def table2(
         default_layout(),
         "table1",
         subjects,
-        simplex_subjects,
+        simplex,
         renderer=renderer,
         report=report,
         folder=folder,
@@ -131,7 +132,7 @@ def table3(
     renderer: Renderer,
     report: Progress,
     subjects: int = 100,
-    simplex_subjects: int = 25,
+    simplex: Annotated[int, "how many the simplex fits too"] = 25,
     folder: Path | None = None,
 ) -> Outcome:
     """Computes table 3: the accuracy with the four arrangements of cameras of section 5.3."""
@@ -139,7 +140,7 @@ def table3(
     for name in ARRANGEMENTS:
         rig = arrangement(name)
         rows[name] = _rows(
-            model, rig, f"table3-{name}", subjects, simplex_subjects, renderer=renderer, report=report, folder=folder
+            model, rig, f"table3-{name}", subjects, simplex, renderer=renderer, report=report, folder=folder
         )
         for method in ("contour", "simplex"):
             done = [row[method] for row in rows[name] if method in row]
@@ -199,7 +200,7 @@ def _rows(
     rig: Rig,
     name: str,
     subjects: int,
-    simplex_subjects: int,
+    simplex: int,
     *,
     renderer: Renderer,
     report: Progress,
@@ -211,10 +212,10 @@ def _rows(
     key = (model.sha256, FittingSettings())
     ours = Records(folder, name, key_of(*key, *CONTOUR))
     wide = Records(folder, f"{name}-all", key_of(*key, *CONTOUR))
-    theirs = Records(folder, f"{name}-simplex", key_of(*key, objective, schedule, simplex))
+    theirs = Records(folder, f"{name}-simplex", key_of(*key, objective, schedule, nelder_mead))
     everyone, rig = subjects_of_section_5_2(model, 100), exact(rig)
     chosen = [everyone[i] for i in _evenly(len(everyone), subjects)]
-    slow = {chosen[i].name for i in _evenly(len(chosen), min(simplex_subjects, len(chosen)))}
+    slow = {chosen[i].name for i in _evenly(len(chosen), min(simplex, len(chosen)))}
     rows = []
     for i, subject in enumerate(chosen):
         report(f"{name} {subject.name}", i / len(chosen))

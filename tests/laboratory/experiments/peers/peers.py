@@ -23,6 +23,7 @@ from silhouettes to vertices, each solver warmed up, all on the same cores. Need
 # pyright: reportMissingImports=false
 # The peers' packages are a dependency group of their own: `uv sync --group peers`.
 
+import importlib.util
 import os
 import time
 from collections.abc import Callable
@@ -45,6 +46,7 @@ from pipeline.settings import FittingSettings
 from pipeline.simplex import xor_objective as objective
 from pipeline.simplex.hierarchy import HIERARCHY, LIMIT, MU, TOLERANCE
 from pipeline.simplex.xor_objective import SilhouetteObjective
+from rig.errors import EigenheadError
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -92,12 +94,22 @@ class Counted:
 Minimiser = Callable[[Counted, Float[np.ndarray, " m"], int], Float[np.ndarray, " m"]]
 
 
+class MissingPeers(EigenheadError):
+    """Reports that a package of the group ``peers`` is not installed."""
+
+    def __init__(self, package: str) -> None:
+        super().__init__(f"{package} is not installed: run `uv sync --group peers`")
+
+
 def peers(
     model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 10,
     folder: Path | None = None,
 ) -> Outcome:  # fmt: skip
     """Runs this module's experiment. Returns seconds, evaluations and errors of every solver on ``subjects`` of section
-    5.2's hundred, taken at even steps."""
+    5.2's hundred, taken at even steps. Raises MissingPeers."""
+    for package in ("cma", "pybobyqa", "jax"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingPeers(package)
     span, rig = with_modes(model, MODES), exact(default_layout())
     everyone = subjects_of_section_5_2(model, 100)
     chosen = [everyone[i] for i in np.linspace(0, len(everyone) - 1, subjects).round().astype(int)]

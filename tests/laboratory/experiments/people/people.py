@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -58,8 +59,8 @@ def people(
     renderer: Renderer,
     report: Progress,
     subjects: int | None = None,
-    only: Sequence[str] = (),
-    detail: str | None = None,
+    only: Annotated[Sequence[str], "kinds, subjects or evidence; or eyes; may be repeated"] = (),
+    detail: Literal["span", "kernel", "photo", "fine"] | None = None,
     folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,

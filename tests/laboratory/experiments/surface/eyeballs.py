@@ -1,4 +1,4 @@
-"""Eyeballs behind the lids of a mesh with open eyes (``pipeline.applications.templates.eyeballs``): what of them crosses lids.
+"""Counts what of the eyeballs behind the lids of a mesh crosses lids (``pipeline.applications.templates.eyeballs``).
 
 The mesh is ICT-FaceKit's own head, whose eyes are open, with the model's true shapes, on heads of its population. An
 eyeball's triangles that cross a lid are counted at rest and for each of Apple's shapes at half and at full weight, as

@@ -1,4 +1,4 @@
-"""Teeth and a tongue behind the lips of a mesh (``pipeline.applications.templates.inner_mouth``): what of the skin meets them.
+"""Counts skin that meets teeth and tongue of a mesh (``pipeline.applications.templates.inner_mouth``).
 
 The mesh is ICT-FaceKit's own head, whose lips part, with the model's true shapes, on heads of its population. Triangles
 of the skin that meet teeth or tongue are counted at rest and for each of Apple's shapes at half and at full weight, as

@@ -15,10 +15,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 
 from pipeline.geometry.raster import depth_map
-from pipeline.geometry.raster_kernels import rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging import colour_chart
 from pipeline.imaging.masks import box_around
@@ -29,7 +28,6 @@ from pipeline.stages.context import ReconstructionContext
 from pipeline.texturing import albedo, chart_colours, decision
 from pipeline.texturing import light as fitted_light
 from pipeline.texturing.albedo import Albedo
-from pipeline.texturing.layout.uv_unwrap import Layout
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.errors import EigenheadError
@@ -47,13 +45,13 @@ from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
 from tests.laboratory.experiments.pictures import labelled
 from tests.laboratory.experiments.records import Records, key_of
-from tests.laboratory.experiments.surface.chart import chart_plate
-from tests.laboratory.experiments.surface.colour_difference import difference_2000, lab_from_srgb
 from tests.laboratory.experiments.surface.texture import drawn_texture
+from tests.support.colour_chart_pictures import chart_plate
+from tests.support.colour_difference import difference_2000, lab_from_srgb
+from tests.support.face_texels import face_texels, texels
 
 Image = UInt8[np.ndarray, "s s 3"]
 SUBJECTS = 1
-GRID = 512  # texels that are compared: 0.7 mm a texel, beyond what two fits differ by
 PANEL = (540, 780)
 MIN_FACING = 0.3  # cosine: flatter, the patches of a chart run together
 LIGHTS: Mapping[str, tuple[Lamp, ...]] = {
@@ -185,22 +183,6 @@ def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], r
             chart = chart_plate(scene, name, colour_chart.true_colours(), rng, turned_to=front, lamps=lamps)
             plates[name] = (*plates[name], chart)
     return replace(capture, backgrounds=plates)
-
-
-def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, "s s"]:
-    """Tells which texels of the compared size belong to the face: all corners of the texel's triangle are ``seen``, and
-    so around it."""
-    texels, ones = GRID * layout.uv - 0.5, np.ones(len(layout.uv))
-    _, shown = rasterise(texels, ones, layout.faces, GRID, GRID)
-    whole = np.asarray(seen[layout.source[layout.faces]].all(axis=1))
-    inside = ((shown >= 0) & whole[shown]).astype(np.uint8)
-    return cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0
-
-
-def texels(image: Image, where: Bool[np.ndarray, "g g"]) -> UInt8[np.ndarray, "n 3"]:
-    """Returns the colours of an image at the texels ``where``, after it is resized to the compared size."""
-    small = cv2.resize(np.ascontiguousarray(image), (GRID, GRID), interpolation=cv2.INTER_AREA)
-    return np.asarray(small)[where]
 
 
 def levelled(codes: UInt8[np.ndarray, "n 3"], to: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:

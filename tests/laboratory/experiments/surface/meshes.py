@@ -39,7 +39,7 @@ COUNTS = ("turned", "folded", "crossing")
 
 def meshes(
     models: Mapping[str, HeadModel],
-    folders: Sequence[Path],
+    folders: Sequence[Path] = (),
     *,
     report: Progress,
     subjects: int = SUBJECTS,

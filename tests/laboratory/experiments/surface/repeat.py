@@ -6,8 +6,8 @@
 - ``clicked``: as ``noise``, with feature points that an operator clicks anew in each shot; the others have none.
 
 Each shot is reconstructed from its photographs; the heads are laid on each other rigidly over the face
-(``pipeline.applications.verification.repeatability``). Figures are the scatter, the deviation that the results state, and the error
-that every shot repeats: the distance of the mean head from the true surface. The aim is an RMS scatter of at most 0.10
+(``verification.repeatability``). Figures are the scatter, the deviation that the results state, and the error that
+every shot repeats: the distance of the mean head from the true surface. The aim is an RMS scatter of at most 0.10
 mm over the face, ``reposed_rms_mm`` and ``drift_rms_mm``.
 """
 

@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -89,7 +90,7 @@ def surfaces(
     *,
     renderer: Renderer,
     report: Progress,
-    openmvs: Path | None = None,
+    openmvs: Annotated[Path | None, "the folder of that peer's programs"] = None,
     folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from scipy.optimize import rosen
 
-from rig.errors import EigenheadError
 from rig.mesh import Mesh
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown, records
 from tests.laboratory.experiments.paper import views
-from tests.laboratory.experiments.paper.robustness import WRONG_RADII_PX, WRONG_SHARE, spoiled
 from tests.laboratory.experiments.paper.tables import correlation
 from tests.laboratory.experiments.peers import peers, soft_rasteriser
 from tests.laboratory.experiments.pictures import heads
 from tests.laboratory.experiments.records import Records, key_of
-from tests.laboratory.experiments.runner import EXPERIMENTS, Options, UnknownExperiment, run_experiment
+from tests.laboratory.runner import run
+from tests.laboratory.table import EXPERIMENTS
 from tests.support.scenes import ellipsoid
 from tests.support.shared_data import shared
+from tests.support.spoilt_captures import WRONG_RADII_PX, WRONG_SHARE, spoiled
 from tests.support.subjects import off_by, stated
 
 
@@ -165,19 +165,6 @@ def test_heads_stand_side_by_side() -> None:
     assert (picture[2, 715] == (245, 245, 245)).all()
 
 
-def test_an_unknown_experiment_is_refused_by_name() -> None:
-    with pytest.raises(UnknownExperiment, match="no experiment is called"):
-        run_experiment("table9", model="default", subjects=1, shared=Path(), folder=None, report=lambda s, f: None)
-    assert issubclass(UnknownExperiment, EigenheadError)
-
-
-CONTRACT = ("table1", "table2", "table3", "cost", "levels", "peers", "limit", "robustness", "views", "span", "detail")
-
-
-def test_every_name_of_the_contract_is_there() -> None:
-    assert set(CONTRACT) <= set(EXPERIMENTS)
-
-
 @pytest.mark.slow
 @pytest.mark.gl
 @pytest.mark.parametrize(
@@ -189,10 +176,8 @@ def test_every_name_of_the_contract_is_there() -> None:
     ],
 )
 def test_a_short_run_leaves_rows_a_table_and_figures(tmp_path: Path, name: str, figure: str, most: float) -> None:
-    found = run_experiment(
-        name, model="default", subjects=2, shared=tmp_path, folder=tmp_path, report=lambda s, f: None,
-        options=Options(simplex=0),
-    )  # fmt: skip
+    options = ["--simplex", "0"] if name == "table1" else []
+    found, _ = run(name, EXPERIMENTS[name], ["--subjects", "2", "--out", str(tmp_path), *options])
     assert 0.0 < found["figures"][figure] < most
     assert all(np.isfinite(value) for value in found["figures"].values())
     assert (tmp_path / f"{name}.md").read_text().startswith("| ")
@@ -208,9 +193,8 @@ def test_a_short_run_leaves_rows_a_table_and_figures(tmp_path: Path, name: str, 
 @pytest.mark.gl
 def test_intervals_are_counted_at_every_level_for_both_populations(tmp_path: Path) -> None:
     data = shared("data/ict-facekit").parent
-    found = run_experiment(
-        "hidden", model="default", subjects=1, shared=data, folder=tmp_path, report=lambda s, f: None
-    )["figures"]
+    options = ["--subjects", "1", "--shared", str(data), "--out", str(tmp_path)]
+    found = run("hidden", EXPERIMENTS["hidden"], options)[0]["figures"]
     for level in ("span", "kernel", "photo", "fine"):
         assert 0.5 < found[f"all_{level}_seen_all_within_95"] <= 1.0
     assert found["studio_fine_seen_face_median_mm"] < 0.2

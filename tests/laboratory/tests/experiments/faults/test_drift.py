@@ -6,7 +6,8 @@ import pytest
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
 from rig.studio.scene.layout import default_layout
-from tests.laboratory.experiments.faults.drift import CLOSE_UP, LOOSE_PX, close_up, drift, loosened
+from tests.laboratory.experiments.faults.drift import drift
+from tests.support.spoilt_captures import CLOSE_UP, LOOSE_PX, close_up, loosened
 
 WHOEVER = {"good": 0, "loose": 0, "cut_off": 0, "close_up": 0, "close_up_loose": 0}
 

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.head_model.model import load_model
-from tests.laboratory.experiments.people.expressions import (
-    JAW,
-    WEIGHTS,
-    _correlation,
-    _is_no_eye,
-    _weights,
-    drawn_weights,
-)
+from tests.laboratory.experiments.people.expressions import _correlation, _is_no_eye, _weights
+from tests.support.drawn_expressions import JAW, WEIGHTS, drawn_weights
 
 
 def test_draws_are_faces_that_people_make() -> None:
