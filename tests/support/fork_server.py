@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-MODULES = ("server.cli", "server.tasks.child")
+MODULES = ("server.cli", "server.tasks.child", "tests.support.pinned_batch")
 IMPORTED = (
     "server.cli.main",
     "uvicorn",
@@ -46,6 +46,7 @@ IMPORTED = (
     "server.worker.worker",
     "server.tasks.child",
     "pipeline.reconstruct",
+    "tests.support.pinned_batch",
     "tests.support.tiny",
 )
 CONSOLE = (
