@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup setup-tests demo serve test test-shapes test-slow test-nightly check coverage format bench dependencies reference results pictures docs sbom audit mutants
+.PHONY: setup setup-tests demo serve test test-shapes test-slow test-nightly test-laboratory check coverage format bench dependencies reference results pictures docs sbom audit mutants
 BIN := .venv/bin
 # The tests start many processes: with compiled modules kept beside them each starts in half the time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -32,6 +32,9 @@ test-slow: setup  ## the tests that take more than a second each
 test-nightly: setup  ## these, and in full size what they hold in a smaller one
 	$(PYTEST) -m slow
 
+test-laboratory: setup  ## the tests of experiments, benchmarks and model files, slow ones too: before a release
+	$(BIN)/pytest -m "slow or not slow" -n 2 tests/laboratory/tests
+
 check: ## ruff, pyright, import-linter, biome (JavaScript), dead links of the documents
 	@deploy/setup.sh --docs
 	$(BIN)/ruff check .
@@ -54,7 +57,7 @@ format:
 	@if [ -x $(BIN)/biome ]; then $(BIN)/biome format --write; else echo "format: skipped: no biome for this machine, JavaScript is as it was"; fi
 
 bench: setup ## timings of inner loops
-	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib" tests/laboratory/benchmarks
+	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib -p no:jaxtyping" tests/laboratory/benchmarks
 
 dependencies: setup ## docs/dependencies.md: every locked package with licence and reason
 	$(BIN)/python -m tests.tools.dependencies

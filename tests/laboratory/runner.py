@@ -51,9 +51,9 @@ def run(name: str, record: Record, words: Sequence[str]) -> tuple[dict[str, Any]
     """Runs a record with the words of a command line. Returns its result and whether JSON is wanted. Its table and
     pictures are written to the folder of ``--out``. Raises EigenheadError; ends the process for wrong usage."""
     function = record.load()
-    given = vars(parser_of(name, record, function).parse_args(words))
-    as_json = given.pop("json")
-    values = {key: value for key, value in given.items() if value not in (None, [])}
+    words_read = vars(parser_of(name, record, function).parse_args(words))
+    as_json = words_read.pop("json")
+    values = {key: value for key, value in words_read.items() if value not in (None, [])}
     found = call(function, record.takes, **values)
     pictures, text = found.pop("pictures", {}), found.pop("markdown", None)
     out = values.get("out")

@@ -52,9 +52,6 @@ class Silent:
     def report(self, name: str, share: float) -> None:
         assert 0 <= share <= 1
 
-    def leave(self, name: str) -> None:
-        self.events.append(("leave", name))
-
     def end(self, outcome: Outcome) -> None:
         self.events.append((outcome.state, outcome.name))
 
@@ -69,7 +66,7 @@ def run_pinned(folder: Path, out: Path, *, workers: int = 2, shard: Shard = WHOL
     target = BatchFolder(out)
     share_tasks = [task for task in tasks if shard.takes(task.capture.name)]
     options = {"observer": Silent(), "variables": {}, "work": work, **options}
-    run = BatchRun(target, share_tasks, workers=workers, **options)
+    run = BatchRun(target, share_tasks, workers=workers, shard=shard, **options)
     return run.run(lambda: write_summary(target, tasks))
 
 

@@ -45,7 +45,6 @@ TEMPLATES = {
     "job-without-result": "The job is {state:word}; it has no result.",
     "job-active": "The job is queued or running; cancel it first.",
     "too-many-jobs": "{count} jobs are queued or running for this key, which is the most; wait for one to end.",
-    "research-not-carried": "an installed package carries no experiments: clone the project, run deploy/setup.sh in it, and there .venv/bin/eigenhead experiments",
     "capture-missing": "Its pictures are neither in the data folder nor in the store of captures: restore them from a "
     "backup, or remove the capture.",
     "result-missing": "Its result is not in the data folder any more: restore it from a backup, or restart the job.",
@@ -102,6 +101,7 @@ TEMPLATES = {
     "upload-checksum-wrong": "The bytes do not have the announced checksum; send them again.",
     "checksum-unknown": "Checksum algorithm {algorithm}; sha1, sha256 and md5 are known.",
     "json-wanted-here": "Send application/json here; an archive goes to POST /v1/captures/uploads.",
+    "header-too-large": "The header of a request may have {bytes:,} bytes; send fewer or shorter fields.",
     "json-body-too-large": "A JSON body may have {bytes:,} bytes.",
     "body-no-json": "The body is no JSON.",
     "imports-not-allowed": "This service imports from nowhere: its operator names servers in EIGENHEAD_IMPORT_ORIGINS. Upload it.",

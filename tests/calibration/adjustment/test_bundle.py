@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.adjustment import cholesky as dense
 from calibration.adjustment.bundle import HUBER, BundleSolution, Free, bundle_problem
 from calibration.adjustment.corner_term import CornerTerm
 from calibration.adjustment.gauge import (
@@ -78,15 +77,6 @@ def test_views_add_their_blocks_to_the_normal_equations() -> None:
     np.testing.assert_allclose(equations.matrix / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-12)
     slope = np.einsum("n,nap,na->p", weight, rows, here.residual)
     np.testing.assert_allclose(equations.gradient / scale, slope / scale, atol=1e-9)
-
-
-def test_dense_solves_what_numpy_solves() -> None:
-    rng = np.random.default_rng(5)
-    half = rng.normal(size=(40, 60))
-    matrix, right = half @ half.T, rng.normal(size=(40, 3))
-    np.testing.assert_allclose(dense.solve(dense.factor(matrix), right), np.linalg.solve(matrix, right), atol=1e-10)
-    with pytest.raises(dense.NotPositiveDefinite):
-        dense.factor(-matrix)
 
 
 def test_jacobians_of_pose_and_lens_are_finite_differences() -> None:

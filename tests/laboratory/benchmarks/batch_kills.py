@@ -3,10 +3,10 @@
 python -m tests.laboratory batch_kills pinned 500 20
 python -m tests.laboratory batch_kills real 60 20
 
-All processes that are killed have the whole of one folder. ``results``: complete ones at the end; ``bytes_differ``:
+Each process that is killed has a share of one folder. ``results``: complete ones at the end; ``bytes_differ``:
 files that are not those of an undisturbed run (but for seconds); ``left_over``: files that an undisturbed run does not
-have; ``begun_twice``: captures that two undisturbed processes side by side both began, of pinned work, where both have
-the whole folder (``1/1``), and where each has its shard (``1/2``, ``2/2``).
+have; ``begun_twice``: captures that two undisturbed processes with a share each (``1/2``, ``2/2``) both began, of
+pinned work.
 """
 
 import os
@@ -53,13 +53,14 @@ def finish(running: "list[subprocess.Popen[bytes]]") -> float:
 def kill_often(kind: str, shots: Path, out: Path, *, kills: int, processes: int, seconds: float) -> None:
     """SIGKILL to one process after the other, each started again, spread over the time that the work takes."""
     rng = random.Random(SEED)
-    running = [start(kind, shots, out) for _ in range(processes)]
+    shares = [f"{number + 1}/{processes}" for number in range(processes)]
+    running = [start(kind, shots, out, shard=share) for share in shares]
     for number in range(kills):
         time.sleep(rng.uniform(0.5, 1.5) * seconds / kills)
         victim = running[number % processes]
         victim.send_signal(signal.SIGKILL)
         victim.wait()
-        running[number % processes] = start(kind, shots, out)
+        running[number % processes] = start(kind, shots, out, shard=shares[number % processes])
     finish(running)
 
 
@@ -99,13 +100,5 @@ def run(
         "seconds_undisturbed": round(seconds, 1),
         "seconds_with_kills": round(killed_s, 1),
     }
-    return {"figures": figures | ({"begun_twice": twice_of_all(shots, scratch)} if kind == "pinned" else {})}
-
-
-def twice_of_all(shots: Path, folder: Path) -> dict[str, int]:
-    found = {}
-    for shards in (("1/1", "1/1"), ("1/2", "2/2")):
-        both = folder / shards[0].replace("/", "-")
-        both.mkdir()
-        found[" and ".join(shards)] = begun_twice(shots, both, shards)
-    return found
+    twice = {"begun_twice": begun_twice(shots, scratch, ("1/2", "2/2"))} if kind == "pinned" else {}
+    return {"figures": figures | twice}

@@ -117,12 +117,12 @@ def test_every_record_has_a_function_whose_inputs_can_be_made(name: str) -> None
 def test_options_come_from_the_signature() -> None:
     record = Record("tests:measure", "Measures.", {"height": heights})
     parser = parser_of("measure", record, measure)
-    given = vars(parser.parse_args(["two", "a", "b", "--only", "x", "--only", "y", "--bare", "--top-mm", "5"]))
-    assert given.pop("json") is False
-    assert given["folders"] == [Path("a"), Path("b")]
-    assert "table" not in given
-    assert "height" not in given
-    found = call(measure, record.takes, **{key: value for key, value in given.items() if value is not None})
+    values = vars(parser.parse_args(["two", "a", "b", "--only", "x", "--only", "y", "--bare", "--top-mm", "5"]))
+    assert values.pop("json") is False
+    assert values["folders"] == [Path("a"), Path("b")]
+    assert "table" not in values
+    assert "height" not in values
+    found = call(measure, record.takes, **{key: value for key, value in values.items() if value is not None})
     assert found["figures"] == {"height": 10, "of": {"only": ["x", "y"]}}
     assert (found["what"], found["bare"]) == ("two", True)
     assert lines_of(found) == [f"{'height':<40} 10", f"{'of only':<40} " + json.dumps(["x", "y"])]

@@ -94,7 +94,7 @@ def test_the_median_view_of_the_preset(measured: tuple[np.ndarray, np.ndarray]) 
 @pytest.mark.xfail(
     strict=True,
     reason="not reached: some views stay beyond 0.8 px, mostly grey coats before grey walls and small real gaps in "
-    "hair (python -m tests.laboratory.benchmarks.studio_masks prints them)",
+    "hair (python -m tests.laboratory studio_masks prints them)",
 )
 def test_the_worst_view_of_the_preset(measured: tuple[np.ndarray, np.ndarray]) -> None:
     overlap, off = measured

@@ -73,6 +73,17 @@ def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path) -> None:
     assert done.stdout == ""
 
 
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [([], "NAME"), (["limit", "--subjects", "3", "--json"], "limit"), (["--json", "real"], "real")],
+)
+def test_experiments_are_in_the_laboratory(arguments: list[str], name: str) -> None:
+    done = run("experiments", *arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"python -m tests.laboratory {name} [--json]" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "capture")
     (folder / "images" / "cam01.png").unlink()
