@@ -244,8 +244,9 @@ def _await_request(server: socket.socket) -> "tuple[dict[str, Any], list[int]]":
         request = pickle.loads(message)
         if request["environment"].get("EIGENHEAD_CONSOLE") == "true" and "serve" in request["arguments"]:
             _import(CONSOLE)
-        if len([*Path("/proc/self/task").iterdir()]) != 1:
-            server.send(b"the fork server has more than one thread")
+        threads = [(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()]
+        if len(threads) != 1:
+            server.send(f"the fork server has more than one thread: {', '.join(threads)}".encode())
             os._exit(1)
         told, tell = os.pipe()
         between = os.fork()
