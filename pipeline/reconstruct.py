@@ -1,5 +1,7 @@
 """Reconstructs a textured head from a capture (section 4): the order of the stages, for every caller."""
 
+from dataclasses import replace
+
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.stages.alignment import Alignment, align_head
@@ -52,6 +54,8 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
     bust = run(colour_bust, context, views, surface.product, texturing.capture)
     hair = run(push_out_hair, context, refined, bust)
+    if any(warning.code == "pose-doubtful" for warning in run.warnings):  # of a refusal that was overruled, too
+        pose = replace(pose, doubtful=True)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(
