@@ -685,6 +685,8 @@ export default {
   "outlines-loose": "die meisten Umrisse widersprechen einander mehr, als diese Kameras erklären: in den Überlagerungen nach einem Schatten an der Wand sehen oder nach Haar, das in manchen Masken fehlt; sind die Masken eng, neu kalibrieren",
   "no-face": "in den Fotos wurde kein Gesicht gefunden, obwohl {views} Kameras vor dem Kopf stehen, wie er angepasst wurde: Seine Lage kommt allein aus Umrissen. Überlagerungen ansehen; wo sie falsch ist, Merkmale setzen oder --front angeben",
   "pose-doubtful": "{finding}",
+  "refusal-overruled": "ohne --anyway wäre diese Aufnahme abgelehnt worden, und der Kopf ist vielleicht falsch: {refusal}",
+  "outline-size-but-face": "{size}, und das Gesicht in den Fotos hat die Größe eines Kopfes: Die Masken zeigen einen Teil des Kopfes oder mehr als ihn; sehen Sie sich die Overlays an",
   "pose-rival": "eine andere Lage erklärt die Umrisse fast ebenso gut (ihre Kosten sind {share:.1%} höher): Überlagerungen ansehen; Merkmale setzen, --front oder mehr Ansichten geben",
   "pose-one-view": "nur {camera} zeigt das Gesicht: wie es gedreht ist, ist nur auf etwa zehn Grad bekannt: Merkmale angeben oder Ansichten von vorn hinzufügen",
   "pose-one-sided": "es wurde kein Gesicht gefunden, und die Kameras blicken fast von einer Seite: Konturen sagen kaum, wie der Kopf geneigt ist: Merkmale oder Ansichten von der Seite geben",
