@@ -152,7 +152,7 @@ def _add(parser: argparse.ArgumentParser, parameter: inspect.Parameter, lists_en
         action = argparse.BooleanOptionalAction if default else "store_true"
         parser.add_argument(flag, action=action, help=settings["help"])
     elif several:
-        repeated = {"action": "extend", "nargs": "+"} if lists_end else {"action": "append"}
+        repeated: dict[str, Any] = {"action": "extend", "nargs": "+"} if lists_end else {"action": "append"}
         parser.add_argument(flag, **(settings | repeated))
     else:
         parser.add_argument(flag, **settings)
