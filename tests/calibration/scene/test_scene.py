@@ -27,10 +27,12 @@ def test_the_rig_is_in_millimetres_and_in_the_world_frame() -> None:
     assert (found.front, found.left_out, found.warnings) == ("cam02", {}, ())
 
 
+@pytest.mark.slow
 def test_it_is_repeatable() -> None:
     assert solve().document() == solved().document()
 
 
+@pytest.mark.slow
 def test_shots_of_a_rig_share_its_cameras(tmp_path: Path) -> None:
     """Another texture in each shot: nothing of one is in the other, and both place the same cameras."""
     found = calibrate_scene(write_photographs(tmp_path, wedge_rig(), {"first": 0, "second": 1}), one_lens=True)
@@ -39,6 +41,7 @@ def test_shots_of_a_rig_share_its_cameras(tmp_path: Path) -> None:
     assert found.figures()["rms_px"] < 0.3
 
 
+@pytest.mark.slow
 def test_views_that_do_not_join_are_named(tmp_path: Path) -> None:
     photos = write_photographs(tmp_path, wedge_rig().subset(["cam00", "cam01", "cam02"]))
     write_image(photos / "dark.png", np.full((HEIGHT, WIDTH), 20, np.uint8))
