@@ -20,7 +20,7 @@ from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.results.set_files import write_set_textures
+from pipeline.results.head_files import write_set_textures
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.colour_space import linear_from_srgb
