@@ -14,8 +14,7 @@ import trimesh
 
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import load_model
-from pipeline.results.head_files import write_head
-from pipeline.results.printable import printable
+from pipeline.results.head_files import printable, write_head
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.write import head_mesh, write_result
