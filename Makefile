@@ -23,8 +23,8 @@ serve: setup ## the service with its data in out/data
 test: setup  ## the fast tests
 	$(PYTEST)
 
-test-shapes: setup  ## the fast tests of rooms below the server, each call held to its annotated types and shapes
-	$(PYTEST) --shapes tests/calibration tests/pipeline tests/rig tests/test_shape_checks.py
+test-shapes: setup  ## calls of the rooms below the server, held to their annotated types and shapes; SHAPES=all: every parameter set
+	$(PYTEST) --shapes $(or $(SHAPES),once) tests/calibration tests/pipeline tests/rig tests/test_shape_checks.py
 
 test-slow: setup  ## the tests that take more than a second each
 	$(PYTEST) -m "slow and not nightly"
