@@ -31,7 +31,6 @@ WHEEL_PACKAGE = "eigenhead"
 PACKAGES = ("rig", "pipeline", "calibration", "server")
 LOOPS = "EIGENHEAD_WHEEL_LOOPS"
 COMPILE_S = 1800.0  # the longest that compiling may take
-RESEARCH = Path("pipeline", "research")  # experiments are run from a checkout
 NOT_CARRIED = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
 
 _MODULE_NAME = re.compile(rf"({'|'.join(PACKAGES)})((\.\w+)*)\.?(:\w*)?")
@@ -73,14 +72,13 @@ class WheelImports(BuildHookInterface):
 
 
 def carry_packages(root: Path, target: Path) -> None:
-    """Copies the four packages from the checkout `root` into `target`, with their imports moved, and without research.
+    """Copies the four packages from the checkout `root` into `target`, with their imports moved.
 
     Raises:
         ImportCannotMove: see the module.
     """
     for name in PACKAGES:
         shutil.copytree(root / name, target / name, ignore=NOT_CARRIED)
-    shutil.rmtree(target / RESEARCH)
     for path in sorted(target.rglob("*.py")):
         if path != target / "__init__.py" and path != target / "__main__.py":
             place = path.relative_to(target)

@@ -56,6 +56,28 @@ def test_import_linter_fires_on_a_planted_violation(copy: Path, module: str, lin
     assert contract in broken[0]
 
 
+def test_the_product_imports_no_test_and_tests_do_without_the_laboratory() -> None:
+    """The laboratory is run by hand: what a test needs of it belongs in tests/support."""
+    forbidden = {path: "tests" for room in ROOMS for path in (ROOT / room).rglob("*.py")}
+    forbidden |= {path: "tests.laboratory" for path in (ROOT / "tests").rglob("*.py")}
+    beside = (ROOT / "tests" / "laboratory", ROOT / "tests" / "tools")
+    found = {
+        f"{path.relative_to(ROOT)}: {module}"
+        for path, package in forbidden.items()
+        if not any(folder in path.parents for folder in beside)
+        for module in imported_modules(path)
+        if f"{module}.".startswith(f"{package}.")
+    }
+    assert found == set()
+
+
+def imported_modules(path: Path) -> set[str]:
+    nodes = [*ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
+    froms = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    names = {f"{node.module}.{alias.name}" for node in froms for alias in node.names}
+    return names | {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+
+
 def test_init_files_hold_a_docstring_and_nothing_else() -> None:
     for path in (path for room in ROOMS for path in (ROOT / room).rglob("__init__.py")):
         statements = ast.parse(path.read_text(encoding="utf-8")).body

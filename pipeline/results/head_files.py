@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.results.metadata import asset_extras, ply_comments
+from pipeline.results.metadata import QUALITY, asset_extras, ply_comments
 from pipeline.results.printable import printable
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.set_files import strength_png, write_set_textures
@@ -48,7 +48,7 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         result: what is written.
         head: the head's mesh in the head frame, mm.
     """
-    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.written, result.texturing.atlas
+    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.formats, result.texturing.atlas
     named = atlas is not None and outputs.ply_texture
     corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
     write_ply(
@@ -59,7 +59,7 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         quality=result.refined.deviation_mm.astype(np.float32),
         views=result.texturing.vertices.views,
         corner_uv=corner_uv,
-        comments=[*ply_comments(result), *(["TextureFile head.png"] if named else [])],
+        comments=[*ply_comments(result), QUALITY, *(["TextureFile head.png"] if named else [])],
     )
     if atlas is not None and (named or "obj" in formats):
         write_atomically(folder / "head.png", encoded(atlas, "png"))

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.templates.header import TemplateHeader
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import BlendshapeRig, Found
 from pipeline.evidence.pose import PoseEvidence
@@ -32,7 +31,6 @@ from pipeline.results.report_types import (
     SimilarityReport,
     SkinReport,
     SpecularReport,
-    TemplateReport,
     TextureReport,
     ViewReport,
 )
@@ -54,11 +52,8 @@ from rig.messages.message import documents_of, texts_of
 ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 1 in each channel"
 
 
-def report_document(
-    result: Reconstruction, template: TemplateHeader | None = None, flame: Mapping[str, float] | None = None
-) -> Report:
-    """Returns the report as JSON types. Every number is finite; unknown ones are None. ``template`` is the template in
-    whose vertex order the head was also written, ``flame`` the figures of its FLAME model's fit."""
+def report_document(result: Reconstruction) -> Report:
+    """Returns the report as JSON types. Every number is finite; unknown ones are None."""
     head, evidence, refined = result.head, result.evidence, result.refined
     document: Report = {
         "format": FORMAT,
@@ -82,7 +77,7 @@ def report_document(
         "coefficients": _shape_coefficients(head),
         "expression": [_expression(found) for found in evidence.expression],
         "morphs": None if evidence.blendshape_rig is None else _morphs(evidence.blendshape_rig),
-        "template": None if template is None else _template(template, flame),
+        "template": None,
         "world_from_head": similarity_document(head.fit.world_from_head),
         "landmarks": {
             name: {"position": _numbers(mark.position_mm), "std": _optional_numbers(mark.std_mm)}
@@ -176,18 +171,6 @@ def _expression(found: Found) -> ExpressionReport:
 def _morphs(blendshape_rig: BlendshapeRig) -> MorphsReport:
     used = {name: weight for name, weight in blendshape_rig.weights.items() if weight}
     return {"weights": used, "without_counterpart": list(blendshape_rig.missing)}
-
-
-def _template(template: TemplateHeader, flame: Mapping[str, float] | None) -> TemplateReport:
-    figures: TemplateReport = {
-        "name": template.name,
-        "source": template.source,
-        "sha256": template.source_sha256,
-        "registration": dict(template.figures),
-    }
-    if flame is not None:
-        figures["flame"] = dict(flame)
-    return figures
 
 
 def similarity_document(transform: Similarity) -> SimilarityReport:

@@ -45,7 +45,6 @@ TEMPLATES = {
     "job-without-result": "The job is {state:word}; it has no result.",
     "job-active": "The job is queued or running; cancel it first.",
     "too-many-jobs": "{count} jobs are queued or running for this key, which is the most; wait for one to end.",
-    "research-not-carried": "an installed package carries no experiments: clone the project, run deploy/setup.sh in it, and there .venv/bin/eigenhead experiments",
     "capture-missing": "Its pictures are neither in the data folder nor in the store of captures: restore them from a "
     "backup, or remove the capture.",
     "result-missing": "Its result is not in the data folder any more: restore it from a backup, or restart the job.",
@@ -163,6 +162,7 @@ TEMPLATES = {
     "field-url-refused": "url: {why}",
     "text-too-long": "{field}: longer than {most} characters",
     "text-with-control-characters": "{field}: has control characters or halves of characters: type it anew",
+    "cursor-in-place-of-offset": "this list is read by 'cursor' since 0.3.0: send what 'next' of the page before said",
     "cursor-of-other-list": "is not what 'next' of this list in this order said: begin without one",
     "board-hold": "Hold the board where several cameras see it whole, and take a shot.",
     "board-turn-to": "No view yet: {cameras}. Turn the board towards them.",

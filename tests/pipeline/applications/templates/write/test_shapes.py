@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.applications.templates.write.writers import template_writers
 from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.expression import BlendshapeRig, build_blendshape_rig
 from pipeline.faces.irises import Iris, UnseenEye
@@ -45,7 +46,7 @@ def result() -> Reconstruction:
 def written(result: Reconstruction, folder: Path, *, morphs: bool, lips_part: bool = False) -> set[str]:
     outputs = OutputSettings(surface="head", formats=("ply", "obj"), template="low", morphs=morphs, neutral=not morphs)
     chosen = replace(result, settings=Settings(outputs=outputs))
-    write_result(folder, chosen, Capture({}), ready_template(load_model(), lips_part=lips_part))
+    write_result(folder, chosen, Capture({}), template_writers(ready_template(load_model(), lips_part=lips_part)))
     return {path.name for path in folder.iterdir()}
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.applications.model_building.training.model_metrics import of_draws
-from pipeline.head_model.model import load_model, with_modes
+from pipeline.head_model.model import load_model
 from rig.errors import InputError
 from tests.laboratory.experiments.paper.span import floor, random_draws, read_truth, run, weighted_quantile
 from tests.support.shared_data import shared
@@ -19,14 +18,6 @@ def test_weighted_quantile_is_the_plain_one_for_equal_weights() -> None:
 def test_a_folder_without_truth_is_named(tmp_path) -> None:
     with pytest.raises(InputError, match="face_mask"):
         read_truth(tmp_path)
-
-
-def test_draws_of_two_modes_are_spanned_by_two_modes_and_lie_closer_the_more_there_are() -> None:
-    """Heads in a plane: the others' first two components hold each of them, to single precision."""
-    plane = with_modes(load_model(), 2)
-    few, many = (of_draws(plane, heads=count, used=2, draws=40) for count in (10, 80))
-    assert few["generalisation_mm"] < 1e-3
-    assert 0 < many["specificity_mm"] < few["specificity_mm"]
 
 
 @pytest.mark.slow

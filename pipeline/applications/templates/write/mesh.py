@@ -1,5 +1,5 @@
 """Writes ``head-NAME.obj`` of a result: the head in a template's vertex order, polygons, groups and texture
-coordinates.
+coordinates; and ``head_hair-NAME.obj``, the head pushed out to its hair.
 
 World frame, mm, as head.ply and head.obj. If both the result has a texture and the template texture coordinates, the
 skin is textured (head-NAME.mtl, head-NAME.jpg, and one more file for each further tile); else the vertices are
@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from pipeline.applications.templates.template_file import Template
+from pipeline.applications.templates.write.texture import Tile, corner_tiles, skin_polygons, template_textures
 from pipeline.results.head_files import ENCODINGS
 from pipeline.results.metadata import ply_comments
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.texturing.template_texture import Tile, corner_tiles, skin_polygons, template_textures
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.obj import MATERIAL
 from rig.formats.meshes.polygon_obj import PolygonMesh, polygon_obj_bytes
@@ -45,19 +45,36 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
         mesh, materials = template_materials(template, files)
         library = f"{name}.mtl"
         write_atomically(folder / library, materials)
-    comments = [
-        *(line for line in ply_comments(result) if not line.startswith("quality")),
-        f"template {template.name} sha256 {template.source_sha256}",
-    ]
     data = polygon_obj_bytes(
         mesh,
         vertices,
         vertex_normals(vertices, mesh.triangles()),
         colours=None if textures else template_colours(result, template),
-        comments=comments,
+        comments=_comments(result, template),
         library=library,
     )
     write_atomically(folder / f"{name}.obj", data)
+
+
+def write_template_hair(folder: Path, result: Reconstruction, template: Template) -> None:
+    """Writes the template on the head with its hair, if the result has hair: its vertices keep their places on the
+    model's triangles. Raises OSError."""
+    hair, faces = result.hair, result.mesh_world.faces
+    if hair is None:
+        return
+    vertices = template.surface_binding.on(hair.shell.vertices_world, faces)
+    data = polygon_obj_bytes(
+        template.mesh,
+        vertices,
+        vertex_normals(vertices, template.mesh.triangles()),
+        colours=_carry_colours(hair.colours, faces, template),
+        comments=_comments(result, template),
+    )
+    write_atomically(folder / f"head_hair-{template.name}.obj", data)
+
+
+def _comments(result: Reconstruction, template: Template) -> list[str]:
+    return [*ply_comments(result), f"template {template.name} sha256 {template.source_sha256}"]
 
 
 def tile_suffix(tile: Tile) -> str:
@@ -67,10 +84,10 @@ def tile_suffix(tile: Tile) -> str:
 
 def template_colours(result: Reconstruction, template: Template) -> UInt8[np.ndarray, "t 3"]:
     """Returns the colours of the template's vertices: the head's on the skin, grey elsewhere."""
-    return carried_colours(result.texturing.vertices.colours, result.mesh_world.faces, template)
+    return _carry_colours(result.texturing.vertices.colours, result.mesh_world.faces, template)
 
 
-def carried_colours(
+def _carry_colours(
     colours: UInt8[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], template: Template
 ) -> UInt8[np.ndarray, "t 3"]:
     """Returns the colours of the template's vertices from those of the model's: grey where it has no skin."""

@@ -11,17 +11,24 @@ import numpy as np
 from pipeline.applications.templates.flame_fit import FlameFit, fit_flame
 from pipeline.applications.templates.template_file import Template
 from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.report_types import AddedReport, TemplateReport
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.flame_param import FILE, encoded, flame_param
 
 DEEP = 0.1  # how much a vertex off the skin counts
 
 
-def write_flame(folder: Path, result: Reconstruction, template: Template) -> dict[str, float] | None:
-    """Fits the template's FLAME model to the head and writes its parameters. Returns the figures of the fit; None if
-    the template has no such model. Raises OSError."""
+def write_flame(folder: Path, result: Reconstruction, template: Template) -> AddedReport:
+    """Fits the template's FLAME model, if it has one, to the head and writes its parameters. Returns what the report
+    says of the template, with the figures of the fit. Raises OSError."""
+    report: TemplateReport = {
+        "name": template.name,
+        "source": template.source,
+        "sha256": template.source_sha256,
+        "registration": dict(template.figures),
+    }
     if template.flame is None:
-        return None
+        return {"template": report}
     head, skin = result.mesh_world, template.surface_binding.skin
     weights = np.full(len(template.surface_binding.rest), DEEP)
     weights[skin] = 1.0
@@ -29,10 +36,11 @@ def write_flame(folder: Path, result: Reconstruction, template: Template) -> dic
     of = fit.parameters
     file = flame_param(of.shape, of.expression, of.pose, of.translation, fit.offsets)
     write_atomically(folder / FILE, encoded(file))
-    return flame_figures(fit, skin)
+    report["flame"] = _flame_figures(fit, skin)
+    return {"template": report}
 
 
-def flame_figures(fit: FlameFit, skin: np.ndarray) -> dict[str, float]:
+def _flame_figures(fit: FlameFit, skin: np.ndarray) -> dict[str, float]:
     """Returns how far the skin of the fitted model lies from the head without ``static_offset``, mm, and how unlike the
     mean its parameters are (RMS, in standard deviations)."""
     off_mm = 1000.0 * fit.distances[skin]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.applications.templates.flame_file import read_flame
+from pipeline.applications.templates.write.writers import template_writers
 from pipeline.contour_fit.fit import Fit
 from pipeline.head_model.model import load_model
 from pipeline.results.write import write_result
@@ -27,7 +28,7 @@ def test_the_parameters_make_the_written_head(tmp_path: Path) -> None:
     template = flame_template(read_flame(write_archive(tmp_path / "flame.npz", arrays)), model)
     result = made_up_result(head, Fit("contour", np.zeros(5), PLACE, 42, "the cost no longer falls"))
     outputs = OutputSettings(surface="head", formats=("ply",), template="flame")
-    write_result(tmp_path, replace(result, settings=Settings(outputs=outputs)), Capture({}), template)
+    write_result(tmp_path, replace(result, settings=Settings(outputs=outputs)), Capture({}), template_writers(template))
     with np.load(tmp_path / "flame_param.npz") as file:
         parameters = dict(file)
     assert {name: array.shape for name, array in parameters.items()} == {

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.laboratory.experiments.surface.colour_difference import difference_2000, lab_from_srgb
+from tests.support.colour_difference import difference_2000, lab_from_srgb
 
 # Sharma, Wu and Dalal (2005), table 1: two colours and their difference.
 PAIRS = """

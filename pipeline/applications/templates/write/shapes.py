@@ -20,6 +20,7 @@ from pipeline.applications.templates.animated import AnimatedMesh, animated_mesh
 from pipeline.applications.templates.eyeballs import AHEAD, turn_to
 from pipeline.applications.templates.inner_mouth import WITH_JAW
 from pipeline.applications.templates.template_file import Template
+from pipeline.applications.templates.write.mesh import template_colours
 from pipeline.evidence.expression import BlendshapeRig
 from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.head_model.visemes import VISEMES
@@ -37,19 +38,16 @@ FORMAT = "eigenhead-shapes/1"
 JAW = "jaw"
 
 
-def write_template_shapes(
-    folder: Path,
-    result: Reconstruction,
-    template: Template,
-    blendshape_rig: BlendshapeRig,
-    colours: UInt8[np.ndarray, "t 3"],
-) -> None:
-    """Writes the template's mesh with morph targets and pivots, and the same as arrays. ``colours``: of its vertices.
-    Raises OSError."""
+def write_template_shapes(folder: Path, result: Reconstruction, template: Template) -> None:
+    """Writes the template's mesh with morph targets and pivots, and the same as arrays, if the settings ask for morphs
+    and the model has shapes. Raises OSError."""
+    blendshape_rig = result.evidence.blendshape_rig
+    if blendshape_rig is None or not result.settings.outputs.morphs:
+        return
     place, model = result.head.fit.world_from_head, result.head.model
     head_from_world = RigidTransform(place.rotation, place.translation).inverse()
     vertices = head_from_world.apply(blendshape_rig.neutral_world.vertices)
-    triangles = template.mesh.triangles()
+    triangles, colours = template.mesh.triangles(), template_colours(result, template)
     animated = animated_mesh(
         template.surface_binding,
         triangles,
