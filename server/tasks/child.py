@@ -217,10 +217,16 @@ def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Mess
         return "failed", type(error).__name__, error.message, "", messages, ""
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return "failed", "disk-full", compose("disk-full"), "", (), ""
-    if isinstance(error, MemoryError):
+    if _lacks_memory(error):
         return "failed", "out-of-memory", compose("out-of-memory"), "", (), ""
     trace = "".join(traceback.format_exception(error))
     return "failed", "bug", verbatim(f"{type(error).__name__}: {error}"[:500]), "", (), trace
+
+
+def _lacks_memory(error: BaseException) -> bool:
+    """Tells whether memory was refused: by Python, by OpenCV (its StsNoMem is -4), or for a thread's stack."""
+    no_thread = isinstance(error, RuntimeError) and "start new thread" in str(error)
+    return isinstance(error, MemoryError) or getattr(error, "code", None) == -4 or no_thread
 
 
 def serve(connection: Connection) -> None:

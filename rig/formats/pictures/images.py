@@ -33,6 +33,7 @@ IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM")
 
 PictureKind = Literal["colour", "grey", "mask"]
 JPEG = b"\xff\xd8\xff"
+NO_MEMORY = -4  # cv::Error::StsNoMem
 START_OF_SCAN = 0xDA
 WITHOUT_LENGTH = frozenset((0x00, 0x01, 0xC8, *range(0xD0, 0xDA), *range(0xF0, 0xFE)))  # segments of a marker alone
 SEGMENTS_MOST, METADATA_BYTES = 1000, 16 << 20  # in front of a JPEG's pixels; depth maps of telephones have 5 MB
@@ -201,6 +202,8 @@ def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
     except Image.DecompressionBombError as error:
         raise InputError(where, [compose("picture-huge", most=PIXELS_MOST)]) from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, cv2.error) as error:
+        if isinstance(error, cv2.error) and error.code == NO_MEMORY:
+            raise MemoryError from error
         raise InputError(where, [said]) from error
 
 

@@ -101,7 +101,7 @@ TEMPLATES = {
     "upload-checksum-wrong": "The bytes do not have the announced checksum; send them again.",
     "checksum-unknown": "Checksum algorithm {algorithm}; sha1, sha256 and md5 are known.",
     "json-wanted-here": "Send application/json here; an archive goes to POST /v1/captures/uploads.",
-    "check-out-of-memory": "The check of this upload needs more memory than it may take: send smaller pictures, or raise EIGENHEAD_CHECK_BYTES.",
+    "check-out-of-memory": "The check of this upload needed more memory than EIGENHEAD_CHECK_BYTES, or a damaged file made its reader crash: send whole, smaller pictures.",
     "check-too-long": "The check of this upload was ended after {seconds:g} s: send fewer or smaller pictures, or raise EIGENHEAD_CHECK_S.",
     "client-gone": "The check was ended because its client had closed the connection.",
     "too-many-checks": "{most} uploads of this key are being checked or wait for it: send more once some of them have ended.",
