@@ -260,6 +260,7 @@ class Settings:
     # it; pores: so, too, and maps of the skin's relief
     front: str | None = None  # the camera that the subject faces; None: guessed from the camera fan
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures
+    anyway: bool = False  # refusals that leave any head possible become warnings, and the pose counts as doubtful
     unexplained_outlines: Literal["refuse", "warn"] = "refuse"  # of a head that explains hardly any of them
     device: Literal["auto", "cpu", "gl"] = "auto"  # what compares photographs; auto: a GPU where there is one and the
     # processor is small; gl: any OpenGL

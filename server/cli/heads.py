@@ -7,6 +7,7 @@ from typing import Annotated, get_args, get_type_hints
 import typer
 
 from server.cli.answers import (
+    Anyway,
     Data,
     Json,
     answer,
@@ -118,6 +119,7 @@ def reconstruct(
         typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
     ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
+    anyway: Anyway = False,
     detail: Annotated[
         str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
     ] = None,
@@ -152,7 +154,8 @@ def reconstruct(
     outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
     outputs |= {name: word for name, word in words.items() if word}
-    options = {"outputs": outputs or None, "texture": {"chart": True} if chart else None}
+    options: dict[str, bool | dict[str, object] | None] = {"outputs": outputs or None, "anyway": anyway or None}
+    options["texture"] = {"chart": True} if chart else None
     worn = {"colour": cap, "thickness_mm": cap_thickness}
     options["cap"] = {name: value for name, value in worn.items() if value is not None} or None
     document = settings_document(settings, method=method, front=front, detail=detail, device=device, **options)

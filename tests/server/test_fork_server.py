@@ -20,7 +20,7 @@ CLI = [sys.executable, "-m", "server.cli"]
     [(["--version"], 0), (["keys", "list", "--json"], 0), (["--colour"], 2), (["reconstruct", "/nowhere"], 2)],
 )
 def test_it_says_and_ends_as_one_that_was_execd(words: list[str], status: int, tmp_path: Path) -> None:
-    told = []
+    outcomes = []
     for start in (Popen, ExecPopen):
         with start(
             [*CLI, *words],
@@ -29,9 +29,9 @@ def test_it_says_and_ends_as_one_that_was_execd(words: list[str], status: int, t
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         ) as process:
-            told.append((*process.communicate(timeout=60), process.returncode))
-    assert told[0] == told[1]
-    assert told[0][2] == status
+            outcomes.append((*process.communicate(timeout=60), process.returncode))
+    assert outcomes[0] == outcomes[1]
+    assert outcomes[0][2] == status
 
 
 def test_it_is_a_child_with_a_session_variables_and_files_of_its_own(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-MODULES = ("server.cli", "server.tasks.child")
+MODULES = ("server.cli", "server.tasks.child", "tests.support.pinned_batch")
 IMPORTED = (
     "server.cli.main",
     "uvicorn",
@@ -46,6 +46,7 @@ IMPORTED = (
     "server.worker.worker",
     "server.tasks.child",
     "pipeline.reconstruct",
+    "tests.support.pinned_batch",
     "tests.support.tiny",
 )
 CONSOLE = (
@@ -66,6 +67,8 @@ MESSAGE_BYTES = 1 << 18  # a packet of a Unix socket, the environment in it
 _one_request = threading.Lock()
 _inherited: "socket.socket | None" = None  # of a forked process: the way to the server that starts its children
 
+_status: object = None  # of a forked process that has run its module
+
 
 def _forkable(command: object, environment: dict[str, str]) -> "tuple[str, list[str]] | None":
     """Module and arguments of a command that a fork can stand for, else None."""
@@ -79,7 +82,8 @@ def _forkable(command: object, environment: dict[str, str]) -> "tuple[str, list[
         return None
     path = [folder for folder in environment.get("PYTHONPATH", "").split(os.pathsep) if folder]
     same = _start_variables(environment) == _start_variables(dict(os.environ))
-    if not same or "COVERAGE_PROCESS_START" in environment or any(folder != str(ROOT) for folder in path):
+    measured = any(name.startswith("COVERAGE_PROCESS") for name in environment)
+    if not same or measured or any(folder != str(ROOT) for folder in path):
         return None
     return words[1], words[2:]
 
@@ -174,8 +178,8 @@ def _server() -> socket.socket:
 
 def serve(number: int) -> None:
     """Imports the product, then forks for each request that comes by the socket with this file number."""
-    for module in IMPORTED:
-        importlib.import_module(module)
+    atexit.register(_end_without_teardown)  # first, so that it is called last
+    _import(IMPORTED)
     server = socket.socket(fileno=number)
     while True:
         _ignore_signals(signal.SIG_IGN)  # of a terminal: the server ends with the process that asks it
@@ -197,7 +201,31 @@ def serve(number: int) -> None:
         _place_files(dict.fromkeys((0, 1, 2), nothing) | {server.fileno(): server.fileno()})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that the module was imported before
-        runpy.run_module(request["module"], run_name="__main__", alter_sys=True)
+        global _status
+        try:
+            runpy.run_module(request["module"], run_name="__main__", alter_sys=True)
+            _status = 0
+        except SystemExit as end:
+            _status = end.code or 0
+            raise
+
+
+def _end_without_teardown() -> None:
+    """Ends a forked process after its threads and exit functions. Teardown of modules would copy all the memory that it
+    shares with the server, 0.15 s of CPU time. What fails here is left to the interpreter's own end."""
+    with contextlib.suppress(Exception):
+        if isinstance(_status, int):
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(_status)
+
+
+def _import(modules: Sequence[str]) -> None:
+    if not sys.modules.keys() >= set(modules):
+        for module in modules:
+            importlib.import_module(module)
+        gc.collect()
+        gc.freeze()  # so that a collection does not copy the pages which all processes share
 
 
 def _ignore_signals(handler: Any) -> None:
@@ -215,13 +243,11 @@ def _await_request(server: socket.socket) -> "tuple[dict[str, Any], list[int]]":
             os._exit(0)
         request = pickle.loads(message)
         if request["environment"].get("EIGENHEAD_CONSOLE") == "true" and "serve" in request["arguments"]:
-            for module in CONSOLE:
-                importlib.import_module(module)
-        if len([*Path("/proc/self/task").iterdir()]) != 1:
-            server.send(b"the fork server has more than one thread")
+            _import(CONSOLE)
+        threads = [(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()]
+        if len(threads) != 1:
+            server.send(f"the fork server has more than one thread: {', '.join(threads)}".encode())
             os._exit(1)
-        gc.collect()
-        gc.freeze()  # so that a collection does not copy the pages which all processes share
         told, tell = os.pipe()
         between = os.fork()
         if between == 0:

@@ -181,6 +181,8 @@ TEMPLATES = {
     "outlines-loose": "most outlines contradict each other by more than these cameras explain: look at the overlays for a shadow on the wall, or hair that some masks miss; where the masks are tight, calibrate again",
     "no-face": "no face was found in the photographs, though {views} cameras stand before the head as it was fitted: its pose comes from outlines alone. Look at the overlays; give feature points or --front where it is wrong",
     "pose-doubtful": "{finding}",
+    "refusal-overruled": "without --anyway this capture would have been refused, and the head may be wrong: {refusal}",
+    "outline-size-but-face": "{size}, and the face in the photographs has a head's size: masks show a part of the head or more than it, so look at the overlays",
     "pose-rival": "another pose explains the outlines almost as well (its cost is {share:.1%} higher): look at the overlays; give feature points, --front or more views",
     "pose-one-view": "{camera} alone shows the face: how it is turned is known to some ten degrees only: give feature points, or add views from the front",
     "pose-one-sided": "no face was found, and the cameras look from nearly one side: outlines hardly tell how the head nods: give feature points, or views from the side",

@@ -28,7 +28,7 @@ from rig.render.renderer import Renderer
 from rig.studio.sensor.faults import fault_from_text
 from rig.studio.sensor.preset import PRESET
 from tests.pipeline.segmentation.test_segment import true_mask
-from tests.pipeline.segmentation.test_segment_studio import RESOLUTION_PX, coverage, iou, rms, take
+from tests.pipeline.segmentation.test_segment_studio import RESOLUTION_PX, coverage, iou, photograph, rms, segmented
 from tests.support.shared_data import shared
 
 WORST_PX, LEAST_IOU = 0.8, 0.995
@@ -49,7 +49,8 @@ def run(
     rows = []
     for seed, planted in itertools.product(range(first, first + captures), faults):
         report(f"capture {seed}", (seed - first) / captures)
-        taken, silhouettes = take(seed, renderer, *planted)
+        taken = photograph(seed, renderer, *planted)
+        silhouettes = segmented(taken)
         if bare:
             shot = Capture(taken.capture.images)
             silhouettes = segment(shot, taken.rig, SegmentationSettings(), report=discard_progress)

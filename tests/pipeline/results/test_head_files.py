@@ -46,7 +46,9 @@ def result() -> Reconstruction:
     return textured_result(mesh, Atlas(model_layout(model).layout, image))
 
 
-def with_reduced_layout(result: Reconstruction) -> Reconstruction:
+@pytest.fixture(scope="module")
+def reduced_result(result: Reconstruction) -> Reconstruction:
+    """Its layout is reduced once, in half a minute of a free core."""
     texturing = result.texturing
     assert texturing.atlas is not None
     reduced = reduced_layout(load_model(), texturing.atlas.layout)
@@ -207,10 +209,9 @@ def test_outputs_of_versions_before_0_3_are_refused_by_name(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)  # the layout is reduced once, in half a minute of a free core
-def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(result: Reconstruction, tmp_path: Path) -> None:
-    assert result.texturing.atlas is not None
-    mapped = with_reduced_layout(result)
+@pytest.mark.timeout(900)
+def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(reduced_result: Reconstruction, tmp_path: Path) -> None:
+    mapped = reduced_result
     written(mapped, tmp_path)
     document, payload = opened_glb(tmp_path / "head.glb")
     primitive, head = document["meshes"][0]["primitives"][0], head_mesh(mapped)
@@ -227,12 +228,12 @@ def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(result: Reconstr
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("kind", ["jpeg", "png", "webp", "normal map", "morphs"])
 def test_the_khronos_validator_has_nothing_to_say(
-    kind: str, result: Reconstruction, tmp_path: Path, gltf_validator: Path
+    kind: str, result: Reconstruction, tmp_path: Path, gltf_validator: Path, request: pytest.FixtureRequest
 ) -> None:
     assert result.texturing.atlas is not None
     name = "head.glb"
     if kind == "normal map":
-        written(with_sets(with_reduced_layout(result)), tmp_path, image="webp")
+        written(with_sets(request.getfixturevalue("reduced_result")), tmp_path, image="webp")
     elif kind == "morphs":
         model, name = load_model(), "posed.glb"
         blendshape_rig = build_blendshape_rig(model, result.head.fit.world_from_head, result.mesh_world, ())
