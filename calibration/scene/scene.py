@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
+from calibration.adjustment.world import in_world_frame
 from calibration.result import CalibrationRefused
 from calibration.scene.covariance import uncertainty
 from calibration.scene.matching import Matches, match_photographs
@@ -19,9 +20,9 @@ from calibration.scene.photographs import find_masks, find_photographs
 from calibration.scene.result import SceneCalibration
 from calibration.scene.scale import HEAD_SHARE, Scale, find_scale
 from calibration.scene.structure import Structure, solve_structure, why_not
-from calibration.scene.upright import in_guessed_frame
 from calibration.silhouette_refinement.single import VIEWS_LEAST, refine_one
 from pipeline.head_model.model import load_model
+from pipeline.multiview.upright import quarter_turns
 from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
@@ -29,9 +30,31 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
 from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.serials import with_serials
+from rig.geometry import RigidTransform
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
+
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # about the optical axis
+
+
+def in_guessed_frame(rig: Rig, front: str | None) -> Rig:
+    """Returns the rig in a guessed world frame, as ``in_world_frame`` would choose it with all cameras upright. Cameras
+    held on their side or upside down are turned for the guess alone."""
+    turns = [np.linalg.matrix_power(QUARTER, int(count)) for count in quarter_turns(rig)]
+    upright = Rig(
+        tuple(
+            replace(camera, camera_from_world=RigidTransform(turn, np.zeros(3)) @ camera.camera_from_world)
+            for camera, turn in zip(rig, turns, strict=True)
+        )
+    )
+    return Rig(
+        tuple(
+            replace(camera, camera_from_world=RigidTransform(turn.T, np.zeros(3)) @ camera.camera_from_world)
+            for camera, turn in zip(in_world_frame(upright, front), turns, strict=True)
+        )
+    )
+
 
 JOINED_LEAST = 0.5  # share of the views; where fewer join, there are two scenes or none
 MISFIT_MOST = (

@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.geometry.closest_point``, and a search among the triangles of nearby vertices."""
+"""Compiled loops of ``pipeline.geometry.surface_index``, and a search among the triangles of nearby vertices."""
 
 from typing import NamedTuple
 

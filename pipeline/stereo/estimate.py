@@ -11,10 +11,10 @@ and computes their information (``refinement``; Goesele et al., *Multi-view ster
 The result does not depend on the order of work: each view is refined by itself, and all are compared at the end.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from pipeline.compute.trace import traced
 from pipeline.imaging.silhouette import Silhouette
@@ -26,15 +26,49 @@ from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.depth_range import find_depth_ranges
 from pipeline.stereo.field import Field
 from pipeline.stereo.matcher import matching_on
-from pipeline.stereo.neighbours import choose_neighbours
 from pipeline.stereo.refinement import Pass, doubled, refined
 from pipeline.stereo.search import find_search_level, first_fields
 from pipeline.stereo.stack import stack_crops
-from pipeline.stereo.window import square_pattern
+from rig.camera import Camera
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.compute import ComputeDevice
 from rig.rig import Rig
+
+
+def choose_neighbours(
+    cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"], settings: DenseSettings
+) -> list[Int[np.ndarray, " _"]]:
+    """Returns, for each camera, the indices of the cameras to match it with, by increasing angle between their lines of
+    sight; empty if there are none.
+
+    Args:
+        cameras: of all views.
+        at_world: about the middle of the subject (mm), where the lines of sight meet.
+        settings: limits of the angle and of the number.
+    """
+    towards = np.stack([camera.centre_world - at_world for camera in cameras])
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
+    angle = np.degrees(np.arccos(np.clip(towards @ towards.T, -1.0, 1.0)))
+    chosen = []
+    for row in angle:
+        order = [k for k in np.argsort(row, kind="stable") if settings.angle_least_deg < row[k]]
+        kept = [
+            k
+            for place, k in enumerate(order)
+            if row[k] < settings.angle_most_deg
+            or (place < settings.neighbours_least and row[k] < settings.angle_widest_deg)
+        ]
+        chosen.append(np.array(kept[: settings.neighbours_most], dtype=np.int64))
+    return chosen
+
+
+def square_pattern(radius_px: int) -> Float32[np.ndarray, "2 s"]:
+    """Returns the offsets (across and down, px) of every pixel in a square about its middle."""
+    side = np.arange(-radius_px, radius_px + 1, dtype=np.float32)
+    down, across = np.meshgrid(side, side, indexing="ij")
+    return np.stack([across.ravel(), down.ravel()])
+
 
 COARSEST_LEVEL = 3  # level of the search's bounds: an eighth of the photographs' size
 # By how often the size was doubled since the search. Surface of so few pixels as a speck has is a chance match where

@@ -1,13 +1,64 @@
-"""Defines the one type of everything that the program reports to somebody: warnings, faults, refusals, failures."""
+"""Defines the one type of everything that the program reports to somebody: warnings, faults, refusals, failures.
+
+A code is stable; its template (``rig/messages/english``) may be reworded at any time: ``{name}`` is replaced by a
+parameter, ``{name:.1f}`` by a number, "one | several" are the forms for a count. Format specifications are those of
+Python that the console's ``messages.js`` knows, too (``SPECIFICATIONS``). ``word`` marks a value that is translated,
+such as the state of a job, unlike a name.
+
+A new message needs: its code and template in a module of ``rig/messages/english``, its German in
+``server/console/static/messages_de.js``, and ``compose(code, ...)`` where it is used. Tests hold the three together.
+"""
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType, ModuleType
 from typing import Any, NotRequired, Protocol, TypedDict, Union, runtime_checkable
 
-from rig.messages.catalogue import CATALOGUE
-from rig.messages.templates import fields_of, render
+from rig.messages.english import batch, calibration, cameras, formats, general, pipeline, rig, server
 from rig.text import printable
+
+FIELD = re.compile(r"\{(\w+)(?::([^{}]+))?\}")
+SPECIFICATIONS = re.compile(r"word|g|,|[+]?\.\d[f%g]")
+FORMS = " | "
+
+
+def fields_of(template: str) -> dict[str, str]:
+    """Returns the format specification of every field: "" without one, ``count`` if the template has forms for it."""
+    fields = {name: specification or "" for name, specification in FIELD.findall(template)}
+    return {"count": "", **fields} if FORMS in template else fields
+
+
+def render(template: str, parameters: Mapping[str, Any]) -> str:
+    """Fills a template in. Raises KeyError for a field without a parameter."""
+    forms = template.split(FORMS)
+    form = forms[0] if len(forms) == 1 or parameters["count"] == 1 else forms[-1]
+    return FIELD.sub(lambda field: _written(parameters[field[1]], field[2] or ""), form)
+
+
+def _written(value: object, specification: str) -> str:
+    """Lists have commas between names, and semicolons between sentences."""
+    if isinstance(value, tuple):
+        between = ", " if all(isinstance(item, str | int | float) for item in value) else "; "
+        return between.join(_written(item, specification) for item in value)
+    if isinstance(value, int | float) and specification != "word":
+        return format(value, specification)
+    return str(value)
+
+
+AREAS: tuple[ModuleType, ...] = (batch, calibration, cameras, formats, general, pipeline, rig, server)
+
+
+def _all() -> dict[str, str]:
+    templates: dict[str, str] = {}
+    for area in AREAS:
+        assert not templates.keys() & area.TEMPLATES.keys(), "a code stands in two areas"
+        templates |= area.TEMPLATES
+    return templates
+
+
+CATALOGUE: Mapping[str, str] = MappingProxyType(_all())
 
 Parameter = Union[str, int, float, "Message", tuple[Any, ...]]  # a list is of parameters, too
 Raw = Union[str, int, float, "Scalar", "Message", Iterable[Any]]

@@ -23,9 +23,9 @@ from rig.geometry import Similarity, rigid_fit, rotation_from_vector
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from rig.studio.scene.backdrop import backdrop
 from rig.studio.scene.layout import rig_from_directions
 from rig.studio.scene.lights import LAMPS, Lamp
+from rig.studio.scene.simulate import backdrop
 from rig.studio.scene.subject import Subject, dress, random_look
 from rig.studio.sensor.sensor import Sensor, expose, focus
 from tests.support.drawn_expressions import drawn_weights

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.scene.upright import QUARTER, in_guessed_frame, quarter_turns
+from calibration.scene.scene import QUARTER, in_guessed_frame, quarter_turns
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

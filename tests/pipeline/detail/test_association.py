@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.detail.association import associate
-from pipeline.geometry.closest_point import closest_on_triangles_naive
+from pipeline.geometry.surface_index import closest_on_triangles_naive
 from rig.mesh import vertex_normals
 from tests.support.subdivided_spheres import subdivided_sphere
 

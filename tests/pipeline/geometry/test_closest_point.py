@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry.closest_point import closest_candidates, closest_candidates_naive, closest_on_triangles_naive
+from pipeline.geometry.surface_index import closest_candidates, closest_candidates_naive, closest_on_triangles_naive
 
 
 def random_triangles(seed: int, count: int = 40) -> tuple[np.ndarray, np.ndarray]:

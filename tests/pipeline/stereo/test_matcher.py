@@ -9,12 +9,10 @@ from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import Crop, make_crops
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.depth_range import DepthRange, find_depth_ranges
-from pipeline.stereo.estimate import COARSEST_LEVEL, estimate_depth
+from pipeline.stereo.estimate import COARSEST_LEVEL, choose_neighbours, estimate_depth, square_pattern
 from pipeline.stereo.matcher import GROUP, SHADERS, Matcher, Planes, matching_on
-from pipeline.stereo.neighbours import choose_neighbours
 from pipeline.stereo.search import label_strides
 from pipeline.stereo.stack import Stack, stack_crops
-from pipeline.stereo.window import square_pattern
 from rig.camera import Distortion
 from rig.progress import discard_progress
 from rig.render.compute import ComputeDevice

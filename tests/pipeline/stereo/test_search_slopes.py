@@ -6,11 +6,10 @@ import pytest
 from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import make_crops
 from pipeline.stereo.depth_range import DepthRange
+from pipeline.stereo.estimate import choose_neighbours, square_pattern
 from pipeline.stereo.matcher import Matching
-from pipeline.stereo.neighbours import choose_neighbours
 from pipeline.stereo.search import first_fields, slopes_around
 from pipeline.stereo.stack import stack_crops
-from pipeline.stereo.window import square_pattern
 from rig.camera import Camera
 from tests.pipeline.stereo import ray_scene
 from tests.pipeline.stereo.ray_scene import Ball, fan, first_hit, shoot

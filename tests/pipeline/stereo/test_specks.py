@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.stereo.specks import take_specks_off
+from pipeline.stereo.refinement import take_specks_off
 
 PIXEL_MM, MOST_PX = 2.0, 30
 

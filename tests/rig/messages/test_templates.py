@@ -2,8 +2,7 @@
 
 import pytest
 
-from rig.messages.catalogue import CATALOGUE
-from rig.messages.templates import FIELD, SPECIFICATIONS, fields_of, render
+from rig.messages.message import CATALOGUE, FIELD, SPECIFICATIONS, fields_of, render
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from rig.errors import InputError
 from rig.mesh import face_normals
 from rig.studio.scene.anatomy import anatomy
 from rig.studio.scene.layout import default_layout
-from rig.studio.scene.scattering import scattered
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.skin_texture import DRY, oily_zones
+from rig.studio.scene.subject import scattered
 from rig.studio.sensor.preset import CLEAN, PRESET
 from rig.studio.sensor.realism import REALISM, made_real, realism_names
 from rig.studio.sensor.sensor import Sensor, compressed, expose, through_mosaic

@@ -7,8 +7,8 @@ import pytest
 
 from rig.errors import Cancelled, EigenheadError, InputError
 from rig.messages.message import compose
-from server.batch.failures import failure_of
 from server.batch.folder import Origin
+from server.batch.run import failure_of
 from server.tasks.child import WorkFailed
 
 ORIGIN = Origin("", "", "", "")

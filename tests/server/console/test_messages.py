@@ -7,9 +7,7 @@ from typing import Any
 import pytest
 
 from rig.messages import message
-from rig.messages.catalogue import CATALOGUE
-from rig.messages.message import Message, compose, verbatim
-from rig.messages.templates import FIELD, FORMS, fields_of
+from rig.messages.message import CATALOGUE, FIELD, FORMS, Message, compose, fields_of, verbatim
 from tests.support.console_words import CONSOLE, german
 from tests.support.node import evaluate
 

@@ -9,7 +9,7 @@ and mouth are closed with triangles between existing vertices, so that the head 
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 from scipy.spatial.distance import cdist
 
 from pipeline.applications.model_building.correspondence.surface_fit import fit_surface
-from pipeline.applications.model_building.sources.foreign import CannotImport, Foreign, read_obj
 from pipeline.applications.model_building.training.training import Training, above_neck, face_region, finish
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.geometry.warp import landmark_warp
@@ -27,10 +26,51 @@ from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.model_file import ModelParts, read_parts, rounded
 from pipeline.head_model.pca import Components, orthogonalised
 from pipeline.head_model.subdivision import boundary_loops, close_loop, vertex_areas
-from rig.errors import how_to_install
+from rig.errors import EigenheadError, how_to_install
 from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import vertex_normals
 from rig.progress import Progress
+
+
+class CannotImport(EigenheadError):
+    """Reports a file or folder that contains no readable head model."""
+
+    def __init__(self, path: Path | str, why: str) -> None:
+        super().__init__(
+            f"{path} cannot be imported as a head model: {why}. Readable are ICT-FaceKit (its repository or compact "
+            "npz), statismo or Basel HDF5 files, and npz files with mean, modes, faces and landmarks (docs/models.md)"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Foreign:
+    """Holds a model as its file describes it, in mm and the axes of the head frame (x to the subject's left, y up, z
+    out of the face)."""
+
+    name: str
+    licence: str
+    source: str
+    notice: str
+    mean: Float[np.ndarray, "V 3"]
+    modes: Float[np.ndarray, "M V 3"]  # mm per standard deviation; need not be orthogonal
+    faces: Int[np.ndarray, "F 3"]
+    landmarks: Mapping[str, int]  # those that are known
+    subjects: Mapping[str, int]
+    expressions: Expressions | None = None  # displacements in mm
+
+
+def read_obj(path: Path, *, polygons: bool = True) -> tuple[Float[np.ndarray, "V 3"], list[list[int]]]:
+    """Returns vertices and polygons in the order of the file. trimesh would merge and reorder the vertices to which
+    published indices refer."""
+    vertices, faces = [], []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            if line.startswith("v "):
+                vertices.append(line.split()[1:4])
+            elif polygons and line.startswith("f "):
+                faces.append([int(corner.split("/")[0]) - 1 for corner in line.split()[1:]])
+    return np.array(vertices, float), faces
+
 
 ICT_NAME = "ict-facekit"
 ICT_LICENCE = "MIT"
