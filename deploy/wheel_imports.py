@@ -7,7 +7,7 @@ imports so that they say where the module then is (`from rig.camera import Camer
 like that (a module named in a string, `import rig.camera`) ends the build with its file and line.
 
 With EIGENHEAD_WHEEL_LOOPS=1 the wheel also carries the loops of a job compiled, for
-`pipeline.compute.jit.PORTABLE_CPU`, and the Python and Numba of the environment that builds (`uv build --wheel
+`rig.jit.PORTABLE_CPU`, and the Python and Numba of the environment that builds (`uv build --wheel
 --no-build-isolation`); with others they are not found, and compiled as from any other wheel.
 
 The package `eigenhead` itself is written here, for the wheel and for the checkout's own environment: the names of
@@ -95,7 +95,7 @@ def carry_loops(package: Path) -> None:
         environment = os.environ | {"PYTHONPATH": str(package.parent), "EIGENHEAD_CACHE": cache}
         command = [sys.executable, "-P", "-m", WHEEL_PACKAGE, "prepare"]
         subprocess.run(command, env=environment, check=True, timeout=COMPILE_S)
-        shutil.copytree(Path(cache) / "kernels", package / "pipeline" / "compute" / "compiled_loops")
+        shutil.copytree(Path(cache) / "kernels", package / "rig" / "compiled_loops")
     for left in package.rglob("__pycache__"):
         shutil.rmtree(left)
 

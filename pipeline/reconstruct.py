@@ -1,5 +1,7 @@
 """Reconstructs a textured head from a capture (section 4): the order of the stages, for every caller."""
 
+from dataclasses import replace
+
 from pipeline.evidence.plausibility import refuse
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.stages.alignment import Alignment, align_head
@@ -37,7 +39,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
     warning has a code that ``settings.fail_on`` names, and Cancelled when ``context.progress`` does.
     """
-    if "usdz" in context.settings.outputs.written:
+    if "usdz" in context.settings.outputs.formats:
         check_usd()
     run = Recorder(context)
     with run.stage("segmentation") as stage:
@@ -66,6 +68,8 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     with run.stage("bust") as stage:
         bust = stage.keep(colour_bust(stage.context, views, surface.product, texturing.capture))
         hair = stage.keep(push_out_hair(stage.context, refined, bust))
+    if any(warning.code == "pose-doubtful" for warning in run.warnings):  # of a refusal that was overruled, too
+        pose = replace(pose, doubtful=True)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(

@@ -10,19 +10,22 @@ from jaxtyping import Float
 
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import BlendshapeRig, Found
+from pipeline.evidence.gaze import angles_deg
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.faces.detection import FaceDetection
+from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.faces.subject import SubjectFaces
 from pipeline.imaging.silhouette import Silhouette, ViewQuality
 from pipeline.part_labels.votes import PART_NAMES
-from pipeline.results.eye_report import eyes_document
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report_types import (
     FORMAT,
     BustReport,
     CameraReport,
     ExpressionReport,
+    EyeReport,
     FaceReport,
+    GazeReport,
     HairReport,
     MorphsReport,
     PoseReport,
@@ -292,3 +295,39 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def eyes_document(eyes: Mapping[str, Iris | UnseenEye], world_from_head: Similarity) -> dict[str, EyeReport]:
+    """Describes the eyes by side."""
+    return {side: _eye(eye, world_from_head) for side, eye in eyes.items()}
+
+
+def _eye(eye: Iris | UnseenEye, world_from_head: Similarity) -> EyeReport:
+    if isinstance(eye, UnseenEye):
+        return {
+            "seen": False,
+            "cause": eye.cause,
+            "iris": None,
+            "radius": None,
+            "gaze": None,
+            "std_deg": None,
+            "rig": None,
+            "face": None,
+            "views": [],
+        }
+    return {
+        "seen": True,
+        "cause": None,
+        "iris": {"position": eye.centre.tolist(), "std": eye.centre_std_mm.tolist()},
+        "radius": {"value": eye.radius_mm, "std": float(np.sqrt(eye.covariance[6, 6]))},
+        "gaze": eye.gaze.tolist(),
+        "std_deg": eye.gaze_std_deg,
+        "rig": _direction(eye.gaze),
+        "face": _direction(world_from_head.rotation.T @ eye.gaze),
+        "views": list(eye.views),
+    }
+
+
+def _direction(gaze: Float[np.ndarray, " 3"]) -> GazeReport:
+    azimuth, elevation = angles_deg(gaze)
+    return {"azimuth_deg": azimuth, "elevation_deg": elevation}

@@ -1,16 +1,17 @@
 """Determines pose and scale of the head before its shape is known (section 4.2)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pipeline.alignment.face_alignment import align_to_face, frontmost_camera
 from pipeline.alignment.feature_checks import features_beside_face
-from pipeline.alignment.landmarks import WrongFeatures, feature_alignment
-from pipeline.alignment.silhouette_search import moved_to_hull, search_alignment
+from pipeline.alignment.landmarks import TooFewFeatures, WrongFeatures, feature_alignment
+from pipeline.alignment.silhouette_search import NoSubject, moved_to_hull, search_alignment, upright_axes
 from pipeline.contour_fit.problem import LandmarkObservations
 from pipeline.faces.landmark_map import landmark_map
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.model_basis import model_basis
+from pipeline.multiview.upright import guessed_up
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.faces import Faces
@@ -51,22 +52,40 @@ def front_camera(rig: Rig, settings: Settings) -> str:
 
 def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> Staged[Alignment]:
     """Aligns the mean head to the capture's feature points; without these, to the subject's face in the photographs;
-    and without a face, to the silhouettes. Raises TooFewFeatures, WrongFeatures, NoSubject."""
+    and without a face, to the silhouettes. Refuses with TooFewFeatures, WrongFeatures, NoSubject."""
     model, rig, settings = model_basis(context.model, context.settings), context.rig, context.settings
     face = None if faces.subject is None else faces.subject.matched
     if views.capture.features and face is not None:
         places = landmark_map(context.model)
         beside = features_beside_face(views.capture.features, face, rig, context.model, places)
         if beside is not None:
-            raise WrongFeatures(beside)
+            return _without_features(context, views, faces, WrongFeatures(beside))
     if views.capture.features or face is None:
-        return align_to_views(model, views, rig, settings, progress=context.progress)
+        try:
+            return align_to_views(model, views, rig, settings, progress=context.progress)
+        except (TooFewFeatures, WrongFeatures) as refusal:
+            return _without_features(context, views, faces, refusal)
+        except NoSubject as refusal:
+            front = front_camera(rig, settings)
+            axes = upright_axes(guessed_up(rig), rig[front].centre_world - rig.centre_world())
+            pose = Similarity(1.0, axes, rig.centre_world())
+            return Staged(Alignment(pose, front, "silhouettes"), [context.guards.refuse(refusal)])
     found = align_to_face(model, face, landmark_map(context.model))
     pose = found.world_from_head
     if len(face.detections) == 1:  # one view does not tell the distance
         pose = moved_to_hull(pose, rig[next(iter(face.detections))], model, views.silhouettes, rig)
     front = settings.front or frontmost_camera(pose.rotation[:, 2], pose.translation, rig)
     return Staged(Alignment(pose, front, "landmarks", found.landmarks))
+
+
+def _without_features(
+    context: ReconstructionContext, views: Views, faces: Faces, refusal: EigenheadError
+) -> Staged[Alignment]:
+    """Refuses the feature points, or aligns the head without them."""
+    overruled = context.guards.refuse(refusal)
+    bare = replace(views, capture=replace(views.capture, features={}))
+    found = align_head(context, bare, faces)
+    return Staged(found.product, [overruled, *found.warnings])
 
 
 def align_to_views(

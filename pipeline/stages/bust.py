@@ -11,7 +11,6 @@ from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.silent_hair import find_silent_hair
 from pipeline.fusion.skin import measured_skin
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import normals_of, vertex_normals
 from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
@@ -21,7 +20,7 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
-from rig.mesh import Mesh
+from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose
 
 
@@ -93,7 +92,7 @@ def colour_bust(
     if surface is None:
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, surface.mesh_world
-    normals, depths = normals_of(mesh), depth_maps(rig, mesh)
+    normals, depths = mesh.normals(), depth_maps(rig, mesh)
     colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
     return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 

@@ -8,6 +8,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import segment
 from pipeline.settings import Settings
+from pipeline.view_checks.guards import Guards
 from rig.capture import Capture, ReadImage
 from rig.progress import Progress, discard_progress
 from rig.render.compute import ComputeDevice
@@ -42,6 +43,11 @@ class ReconstructionContext:
     segment: Segment = field(default=segment)
     device: ComputeDevice | None = None
     read_original: ReadImage | None = None
+
+    @property
+    def guards(self) -> Guards:
+        """Returns what every check refuses through."""
+        return Guards(self.settings.anyway)
 
     def within_stage(self, name: str) -> "ReconstructionContext":
         """Returns the context with all progress reported under the stage ``name``, whatever name the called code

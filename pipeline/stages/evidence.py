@@ -73,8 +73,8 @@ def judge_head(
 ) -> Staged[Evidence]:
     """Measures the delivered head, and warns if it is not plausible.
 
-    Raises UnexplainedOutlines if the head explains hardly any outline and no face in the photographs confirms its pose.
-    The settings can allow that, for subjects with long hair all around, whose outlines are all hair.
+    Refuses with UnexplainedOutlines if the head explains hardly any outline and no face in the photographs confirms its
+    pose. The settings can allow that, for subjects with long hair all around, whose outlines are all hair.
     """
     fit, model, rig, outputs = head.fit, head.model, context.rig, context.settings.outputs
     before = start_masks(model, alignment.world_from_head, rig)
@@ -100,7 +100,7 @@ def judge_head(
     pixels_mm = {camera.name: pixel_mm(camera, fit.world_from_head.translation) for camera in rig}
     unexplained = None if pose.is_on_face else unexplained_outlines(cameras, pixels_mm)
     if unexplained is not None and context.settings.unexplained_outlines == "refuse":
-        raise UnexplainedOutlines(unexplained)
+        warnings.append(context.guards.refuse(UnexplainedOutlines(unexplained)))
     unseen = unseen_face(texturing.vertices.views, model.levels["full"].face_region)
     warnings += [warning for warning in (unexplained, unseen) if warning is not None]
     closed_eyes = confirmed_closed(shut_eyes(model, made) | closed_eyes, faces.eye_openings)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.geometry.normals import normals_of
 from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
@@ -50,7 +49,7 @@ def texture_head(
 ) -> Staged[Texturing]:
     """Colours the delivered head from the photographs, and paints its textures and maps."""
     settings, rig, model, mesh = context.settings, context.rig, head.model, refined.mesh_world
-    normals, depths, face = normals_of(mesh), depth_maps(rig, mesh), model.levels["full"].face_region
+    normals, depths, face = mesh.normals(), depth_maps(rig, mesh), model.levels["full"].face_region
     layout, layout_warnings = find_layout(model, settings)
     chart, chart_warnings = chart_colours(views.capture, rig) if settings.texture.chart else (None, [])
     capture = views.capture if chart is None else with_true_colours(views.capture, chart)

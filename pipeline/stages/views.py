@@ -26,14 +26,14 @@ class Views:
 
 
 def find_views(context: ReconstructionContext) -> Staged[Views]:
-    """Finds the silhouettes of the capture and decides which views take part. Raises TooFewViews, ExchangedPictures,
-    WrongRig."""
+    """Finds the silhouettes of the capture and decides which views take part. Refuses with TooFewViews,
+    ExchangedPictures, WrongRig, WrongScale."""
     settings, rig = context.settings, context.rig
 
     def segmented(capture: Capture) -> dict[str, Silhouette]:
         return context.segment(capture, rig, settings.segmentation, report=context.progress)
 
-    found = usable_views(context.capture, rig, segmented, exchanged=settings.exchanged_pictures)
+    found = usable_views(context.capture, rig, segmented, exchanged=settings.exchanged_pictures, guards=context.guards)
     return Staged(Views(found.capture, found.silhouettes, found.pictures), found.warnings)
 
 

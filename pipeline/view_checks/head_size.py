@@ -1,20 +1,26 @@
-"""Checks the size of the head that the outlines show, before a fit, from silhouettes and cameras alone.
+"""Checks the size of the head that the outlines show, before a fit, from silhouettes, cameras and the subject's face.
 
 Cameras from another program have an arbitrary unit if no length was given. A model fitted to a head three times too
 large lies inside the face, and every outline counts as clutter. Each outline has a diameter that needs no model: going
 down from the crown, an outline is wider than twice the distance from the crown until it is as wide as a round head's
 diameter. At the distance of the subject that is 150 to 290 mm for people, hair included.
 
-Enters: silhouettes and the rig. Leaves: the diameter, and the message about it.
+Up is the face's; without a face it is the pictures', or the rig's if its cameras hang on their side, whichever lets
+more outlines meet in one head. A mask may end anywhere and touch any border, so that no border says what is down. A
+face of a human's size contradicts every outline: then nothing is refused.
+
+Enters: silhouettes, the rig and the face. Leaves: the diameter, and the message about it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.multiview.upright import guessed_up
+from pipeline.view_checks.guards import STRICT, FaceEvidence, Guards
 from pipeline.warnings import ReportWarning
 from rig.camera import Camera
 from rig.errors import EigenheadError
@@ -26,31 +32,54 @@ WARNED_MM = (145.0, 270.0)  # bald heads of adults have 161 and more, hair 40 mm
 REFUSED_MM = (122.0, 350.0)  # a bald child of three has 130, hair 60 mm thick 310 at most; twice a bald head has 322
 STRAND_SHARE = 0.06  # of a mask's size (root of its area): a centimetre of a head, which loose strands do not fill
 MIN_VIEWS = 3  # whose crown is in the picture
+MIN_MEETING = 0.5  # of these views: where most do not meet in one head, they measure none
+
+Discs = Mapping[str, tuple[Float[np.ndarray, " 2"], float]]  # by camera: middle and diameter (px)
 
 
-def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig) -> float | None:
-    """Returns the median over the views of the head's diameter (mm); None if too few views show the crown.
+def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig, face: FaceEvidence | None = None) -> float | None:
+    """Returns the median of the head's diameter (mm) over the views whose outlines meet in one head; None if these are
+    too few, or fewer than half.
 
     Args:
         silhouettes: by camera; unusable ones are ignored.
         rig: the cameras as calibrated.
+        face: says which way is up and where the head is, if it is known.
     """
-    seen: list[tuple[Camera, Float[np.ndarray, " 2"], float]] = []
-    for camera in rig:
-        silhouette = silhouettes.get(camera.name)
-        if silhouette is None or not silhouette.quality.usable:
-            continue
-        crown = crown_disc(silhouette.mask)
-        if crown is not None:
-            seen.append((camera, *crown))
-    if len(seen) < MIN_VIEWS:
-        return None
-    middle = _crossing([camera for camera, _, _ in seen], np.array([pixel for _, pixel, _ in seen]))
-    depths = np.array([float(camera.camera_from_world.apply(middle)[2]) for camera, _, _ in seen])
-    focal = np.array([camera.intrinsics.fx for camera, _, _ in seen])
-    diameters = np.array([diameter for _, _, diameter in seen]) * depths / focal
-    ahead = diameters[depths > 0]
-    return float(np.median(ahead)) if len(ahead) >= MIN_VIEWS else None
+    solid = {
+        name: _without_strands(silhouettes[name].mask)
+        for name in rig.names
+        if name in silhouettes and silhouettes[name].quality.usable
+    }
+    pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
+    ups = (pictures_up, guessed_up(rig)) if face is None else (face.up_world,)
+    diameters = max((_diameters_mm(solid, rig, up, face) for up in ups), key=len)
+    return float(np.median(diameters)) if len(diameters) >= MIN_VIEWS else None
+
+
+def _diameters_mm(
+    solid: Mapping[str, Bool[np.ndarray, "_ _"]],
+    rig: Rig,
+    up_world: Float[np.ndarray, " 3"],
+    face: FaceEvidence | None,
+) -> list[float]:
+    """Returns the head's diameter (mm) in each view whose disc lies where the others, or the face, say that the head
+    is; none if these are less than ``MIN_MEETING`` of the views that show a crown."""
+    found = {name: crown_disc(mask, turns_to_upright(rig[name], up_world)) for name, mask in solid.items()}
+    discs = {name: disc for name, disc in found.items() if disc is not None}
+    point = _middle(discs, rig) if face is None else face.centre_world
+    if point is None or not discs:
+        return []
+    on = dict(zip(discs, _on_discs(point[None], discs, rig)[0], strict=True))
+    meeting = [name for name in discs if on[name]]
+    if len(meeting) < MIN_MEETING * len(discs):
+        return []
+    return [discs[name][1] * _mm_per_px(rig[name], point) for name in meeting]
+
+
+def _mm_per_px(camera: Camera, point_world: Float[np.ndarray, " 3"]) -> float:
+    """Returns the width (mm) of a pixel in the plane of a point parallel to the picture."""
+    return float(camera.camera_from_world.apply(point_world)[2]) / camera.intrinsics.fx
 
 
 class WrongScale(EigenheadError):
@@ -63,18 +92,36 @@ class WrongScale(EigenheadError):
 
 
 def judge_head_size(
-    silhouettes: Mapping[str, Silhouette], rig: Rig, *, masks_given: bool = False
+    silhouettes: Mapping[str, Silhouette],
+    rig: Rig,
+    find_face: Callable[[], FaceEvidence | None] = lambda: None,
+    *,
+    guards: Guards = STRICT,
+    masks_given: bool = False,
 ) -> list[ReportWarning]:
-    """Returns a warning if the outlined head is unusually large or small. Raises WrongScale if its size is impossible.
-    With ``masks_given``, the masks are the operator's and may show only a part of the head."""
+    """Returns a warning if the outlined head is unusually large or small. Refuses with WrongScale if its size is
+    impossible and no face of a human's size contradicts that.
+
+    Args:
+        silhouettes: by camera; unusable ones are ignored.
+        rig: the cameras as calibrated.
+        find_face: finds the subject's face; called only if the outlines are suspicious.
+        guards: what is refused.
+        masks_given: whether the masks are the operator's and may show only a part of the head.
+    """
     diameter = head_diameter_mm(silhouettes, rig)
-    if diameter is None:
+    if diameter is None or WARNED_MM[0] < diameter < WARNED_MM[1]:
         return []
-    if not REFUSED_MM[0] < diameter < REFUSED_MM[1]:
-        raise WrongScale(diameter, masks_given=masks_given)
-    if not WARNED_MM[0] < diameter < WARNED_MM[1]:
+    face = find_face()
+    if face is not None:
+        diameter = head_diameter_mm(silhouettes, rig, face)
+        if diameter is None or WARNED_MM[0] < diameter < WARNED_MM[1]:
+            return []
+    if REFUSED_MM[0] < diameter < REFUSED_MM[1]:
         return [compose("scale-implausible", finding=_outline_size(diameter))]
-    return []
+    if face is None:
+        return [guards.refuse(WrongScale(diameter, masks_given=masks_given))]
+    return [compose("scale-implausible", finding=compose("outline-size-but-face", size=_size_message(diameter)))]
 
 
 def _outline_size(diameter_mm: float) -> Message:
@@ -89,10 +136,10 @@ def _size_message(diameter_mm: float) -> Message:
     return compose("head-times-as-large", ratio=ratio, diameter_mm=diameter_mm)
 
 
-def crown_disc(mask: Bool[np.ndarray, "h w"]) -> tuple[Float[np.ndarray, " 2"], float] | None:
-    """Returns the middle (px) and diameter (px) of the head in a mask; None if its crown is not inside the picture."""
-    turns = _turns_to_upright(mask)
-    upright = np.rot90(_without_strands(mask), turns)
+def crown_disc(mask: Bool[np.ndarray, "h w"], turns: int) -> tuple[Float[np.ndarray, " 2"], float] | None:
+    """Returns the middle (px) and diameter (px) of the head in a mask that is upright after ``turns`` quarter turns
+    (anticlockwise); None if its crown is not inside the picture."""
+    upright = np.rot90(mask, turns)
     rows = np.flatnonzero(upright.any(axis=1))
     if not len(rows) or rows[0] == 0:
         return None
@@ -120,19 +167,32 @@ def _without_strands(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, disc).view(bool)
 
 
-def _turns_to_upright(mask: Bool[np.ndarray, "h w"]) -> int:
-    """Returns the number of quarter turns (anticlockwise) after which the body leaves the picture through the
-    bottom."""
-    touched = [mask[-1].sum(), mask[:, 0].sum(), mask[0].sum(), mask[:, -1].sum()]  # bottom, left, top, right
-    return int(np.argmax(touched)) if max(touched) else 0
+def turns_to_upright(camera: Camera, up_world: Float[np.ndarray, " 3"]) -> int:
+    """Returns the number of quarter turns (anticlockwise) after which up is up in the camera's picture."""
+    right, down = (camera.camera_from_world.rotation @ up_world)[:2]
+    return int(np.argmax([-down, right, down, -right]))  # up is at the top, right, bottom and left
 
 
-def _crossing(cameras: list[Camera], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " 3"]:
-    """Returns the point (world, mm) nearest to the rays through one pixel of each camera, by least squares."""
-    normal, right = 1e-9 * np.eye(3), np.zeros(3)
-    for camera, pixel in zip(cameras, pixels, strict=True):
-        ray = camera.rays_world(pixel[None])[0]
-        across = np.eye(3) - np.outer(ray, ray)
-        normal += across
-        right += across @ camera.centre_world
-    return np.linalg.solve(normal, right)
+def _middle(discs: Discs, rig: Rig) -> Float[np.ndarray, " 3"] | None:
+    """Returns the point (world) on which most discs lie: the best of those where two rays pass each other, and then the
+    one nearest to the rays through all discs that it lies on. One view with a wrong outline must not move it."""
+    if len(discs) < MIN_VIEWS:
+        return None
+    cameras = [rig[name] for name in discs]
+    rays = np.stack([c.rays_world(disc[0][None])[0] for c, disc in zip(cameras, discs.values(), strict=True)])
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    right = np.einsum("nij,nj->ni", across, np.stack([camera.centre_world for camera in cameras]))
+    one, other = np.triu_indices(len(cameras), 1)
+    crossings = np.linalg.solve(across[one] + across[other] + 1e-9 * np.eye(3), (right[one] + right[other])[..., None])
+    meeting = _on_discs(crossings[..., 0], discs, rig)
+    best = meeting[int(np.argmax(meeting.sum(axis=1)))]
+    return np.linalg.solve(across[best].sum(axis=0), right[best].sum(axis=0)) if best.sum() >= MIN_VIEWS else None
+
+
+def _on_discs(points: Float[np.ndarray, "n 3"], discs: Discs, rig: Rig) -> Bool[np.ndarray, "n v"]:
+    """Tells for each point which cameras it is ahead of and, in their pictures, on the disc of."""
+    on = []
+    for name, (middle, diameter) in discs.items():
+        off = np.linalg.norm(rig[name].project(points) - middle, axis=1)  # NaN behind a camera, which is not less
+        on.append(off < diameter / 2)
+    return np.stack(on, axis=1)

@@ -19,11 +19,13 @@ from pipeline.multiview.triangulation import NoPoint, triangulate
 from pipeline.view_checks.camera_assignment import (
     FITTING_MISFIT,
     MIN_CAMERAS,
+    NOTHING,
     Assignment,
     find_assignment,
     own_misfit,
     ring_messages,
 )
+from pipeline.view_checks.guards import STRICT, Guards
 from pipeline.view_checks.mask_edges import masks_alone_exchanged, turned_masks
 from pipeline.view_checks.rig_agreement import loose_outlines, wrong_rig
 from pipeline.warnings import ReportWarning
@@ -79,7 +81,12 @@ class WrongRig(EigenheadError):
 
 
 def assign_images(
-    capture: Capture, rig: Rig, segmented: Segmentation, *, exchanged: Literal["repair", "refuse"]
+    capture: Capture,
+    rig: Rig,
+    segmented: Segmentation,
+    *,
+    exchanged: Literal["repair", "refuse"],
+    guards: Guards = STRICT,
 ) -> ImageAssignment:
     """Segments a capture, and files exchanged pictures and plates under the right cameras.
 
@@ -88,30 +95,43 @@ def assign_images(
         rig: the cameras as calibrated.
         segmented: computes the silhouettes of a capture; called again after every change.
         exchanged: whether to repair or refuse an exchange that is beyond doubt.
+        guards: what is refused.
 
-    Raises:
-        ExchangedPictures: an exchange that may not be repaired, or is not certain enough.
+    Refuses with:
+        ExchangedPictures: an exchange that may not be repaired, or is not certain enough and the face confirms no
+            picture of it as filed.
         SamePictures: fewer than three pictures are different.
-        WrongRig: most cameras contradict the others, and no exchange explains it.
+        WrongRig: most cameras contradict the others, no exchange explains it, and the face does not hold the rig.
     """
+    overruled: list[ReportWarning] = []
     plates = misplaced_plates(capture, rig)
     if plates and exchanged == "refuse":
-        raise ExchangedPictures(ring_messages(plates, compose("what-plates")), doubtful=False)
+        exchange = ring_messages(plates, compose("what-plates"))
+        overruled.append(guards.refuse(ExchangedPictures(exchange, doubtful=False)))
     capture = reassign_images(capture, plates=plates) if plates else capture
     silhouettes = segmented(capture)
     duplicates = duplicate_views(capture, silhouettes, rig)
     if len(silhouettes) - len(duplicates) < MIN_CAMERAS <= len(silhouettes):
-        raise SamePictures(duplicates, len(silhouettes))
+        guards.refuse(SamePictures(duplicates, len(silhouettes)))
     distinct = {name: silhouette for name, silhouette in silhouettes.items() if name not in duplicates}
     assignment = find_assignment(distinct, rig)
+    if assignment.pictures and not assignment.overwhelming:
+        face = guards.find_face(capture.images, rig)
+        if face is not None and not assignment.pictures.keys().isdisjoint(face.views):
+            assignment = NOTHING
     masks = assignment.pictures if _masks_alone(capture, silhouettes, assignment) else {}
     what = compose("what-masks") if masks else compose("what-pictures")
     if assignment.pictures and (exchanged == "refuse" or not assignment.overwhelming):
         found = ring_messages(assignment.pictures, what)
-        raise ExchangedPictures(found, doubtful=not assignment.overwhelming)
+        overruled.append(guards.refuse(ExchangedPictures(found, doubtful=not assignment.overwhelming)))
     wrong = None if assignment.pictures else wrong_rig(distinct, rig)
     if wrong:
-        raise WrongRig(turned_masks(capture.images, silhouettes, capture.masks) or wrong)
+        face = guards.find_face(capture.images, rig)
+        if face is None or not face.holds_the_rig:
+            wrong = turned_masks(capture.images, silhouettes, capture.masks) or wrong
+            overruled.append(guards.refuse(WrongRig(wrong)))
+        elif wrong.code == "other-lenses":
+            overruled.append(compose("lens-doubtful", finding=wrong))
     pictures = {} if masks else assignment.pictures
     if masks:
         capture = reassign_images(capture, masks=masks)
@@ -120,7 +140,7 @@ def assign_images(
         capture = _filed_back(capture, pictures, rig)
         silhouettes = segmented(capture)
         plates = _composed(plates, pictures)
-    warnings = _warnings(pictures, masks, plates, duplicates)
+    warnings = (*overruled, *_warnings(pictures, masks, plates, duplicates))
     if not assignment.pictures and loose_outlines(distinct, rig):
         warnings = (*warnings, compose("outlines-loose"))
     return ImageAssignment(capture, _left_out(silhouettes, duplicates), pictures, plates, warnings)

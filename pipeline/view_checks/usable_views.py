@@ -7,10 +7,12 @@ does nothing else.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.view_checks.camera_drift import find_drift
+from pipeline.view_checks.guards import STRICT, Guards
 from pipeline.view_checks.head_size import judge_head_size
 from pipeline.view_checks.image_assignment import assign_images
 from pipeline.view_checks.mask_edges import masks_off_edges
@@ -24,6 +26,8 @@ from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 MIN_VIEWS = 3
+MIN_VIEWS_OF_FACE = 2  # of three or more cameras, where the face holds the pose
+MIN_AREA = 0.01  # of a picture: a smaller mask is no subject even if everything is to be tried
 
 
 class TooFewViews(EigenheadError):
@@ -72,6 +76,7 @@ def usable_views(
     segmented: Callable[[Capture], dict[str, Silhouette]],
     *,
     exchanged: Literal["repair", "refuse"],
+    guards: Guards = STRICT,
 ) -> UsableViews:
     """Segments a capture, files exchanged pictures right, and marks views that contradict the others as not usable.
 
@@ -80,27 +85,41 @@ def usable_views(
         rig: the cameras as calibrated.
         segmented: computes the silhouettes of a capture.
         exchanged: whether to repair or refuse an exchange of pictures that is beyond doubt.
+        guards: what is refused.
 
-    Raises:
+    Refuses with:
         ExchangedPictures, WrongRig: as of ``assign_images``.
         WrongScale: as of ``judge_head_size``.
-        TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are usable.
+        TooFewViews: fewer than ``MIN_VIEWS`` silhouettes are usable, or, of a subject whose face is found, fewer than
+            ``MIN_VIEWS_OF_FACE``.
     """
-    assigned = assign_images(capture, rig, segmented, exchanged=exchanged)
+    assigned = assign_images(capture, rig, segmented, exchanged=exchanged, guards=guards)
+    find_face = cache(lambda: guards.find_face(assigned.capture.images, rig))
+    overruled: list[ReportWarning] = []
     doubted = [name for name, s in assigned.silhouettes.items() if s.quality.warnings or not s.quality.usable]
     silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted)
-    if sum(silhouette.quality.usable for silhouette in silhouettes.values()) < MIN_VIEWS:
-        raise TooFewViews(silhouettes, capture)
+    usable = sum(silhouette.quality.usable for silhouette in silhouettes.values())
+    by_face = MIN_VIEWS_OF_FACE <= usable < MIN_VIEWS <= len(silhouettes) and find_face() is not None
+    if usable < MIN_VIEWS and not by_face:
+        overruled.append(guards.refuse(TooFewViews(silhouettes, capture)))
+        silhouettes = {name: _tried(silhouette) for name, silhouette in silhouettes.items()}
     silhouettes, moved = without_moved_cameras(silhouettes, rig)
     unexplained = silhouettes
     silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys())
     moved_warnings = [warning for name, warning in moved.items() if silhouettes[name] is unexplained[name]]
-    size = judge_head_size(silhouettes, rig, masks_given=bool(assigned.capture.masks))
+    masks_given = bool(assigned.capture.masks)
+    size = judge_head_size(silhouettes, rig, find_face, guards=guards, masks_given=masks_given)
     given_masks = [name for name in rig.names if name in assigned.capture.masks]
     beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
     of_views = (*view_warnings(silhouettes), *moved_warnings)
-    warnings = (*assigned.warnings, *of_views, *size, *beside, *capture.remarks)
+    warnings = (*assigned.warnings, *overruled, *of_views, *size, *beside, *capture.remarks)
     return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
+
+
+def _tried(silhouette: Silhouette) -> Silhouette:
+    """Returns the silhouette as a usable one if it shows anything."""
+    usable = silhouette.quality.usable or float(silhouette.mask.mean()) > MIN_AREA
+    return replace(silhouette, quality=replace(silhouette.quality, usable=usable))
 
 
 def without_moved_cameras(

@@ -53,6 +53,9 @@ def _use_data(folder: Path | None) -> Path | None:
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+Anyway = Annotated[
+    bool, typer.Option("--anyway", help="Make a head, with a warning, where a check would refuse the capture.")
+]
 Data = Annotated[
     Path | None,
     typer.Option(

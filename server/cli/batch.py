@@ -9,6 +9,7 @@ import typer
 from rig.errors import EigenheadError, InputError, how_to_install
 from rig.messages.message import compose
 from server.cli.answers import (
+    Anyway,
     Data,
     Json,
     answer,
@@ -79,6 +80,7 @@ def batch(
             callback=format_names,
         ),
     ] = None,
+    anyway: Anyway = False,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
     json_out: Json = False,
@@ -92,7 +94,8 @@ def batch(
     share = _share(shard)
     outputs = {"surface": surface, "formats": formats.split(",") if formats else None}
     requested = {name: value for name, value in outputs.items() if value}
-    document = settings_document(settings, method=method, detail=detail, outputs=requested or None)
+    options = {"outputs": requested or None, "anyway": anyway or None}
+    document = settings_document(settings, method=method, detail=detail, **options)
     with wrong_usage("FOLDER|LIST"):
         found = _captures_in(captures, out)
     with wrong_usage("settings"):

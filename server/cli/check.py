@@ -138,6 +138,7 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
     from pipeline.texturing.chart_colours import chart_colours
+    from pipeline.view_checks.guards import Guards
     from pipeline.view_checks.lens_distortion import judge_distortion
     from pipeline.view_checks.usable_views import usable_views
 
@@ -147,7 +148,7 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
     def segmented(capture: Capture) -> dict[str, "Silhouette"]:
         return segment(capture, rig, chosen.segmentation, report=report)
 
-    views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures)
+    views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
     lenses = judge_distortion(views.capture.images, views.silhouettes, rig)
     warnings = [*views.warnings, *lenses, *(chart_colours(shot, rig)[1] if chosen.texture.chart else ())]
     return documents_of(warnings)

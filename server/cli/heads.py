@@ -7,6 +7,7 @@ from typing import Annotated, get_args, get_type_hints
 import typer
 
 from server.cli.answers import (
+    Anyway,
     Data,
     Json,
     answer,
@@ -118,6 +119,7 @@ def reconstruct(
         typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
     ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
+    anyway: Anyway = False,
     detail: Annotated[
         str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
     ] = None,
@@ -125,15 +127,11 @@ def reconstruct(
     formats: Formats = None,
     albedo: Annotated[
         bool,
-        typer.Option("--albedo", "--delight", help="Also texture/albedo.png: the texture with its light taken off."),
+        typer.Option("--albedo", help="Also texture/albedo.png: the texture with its light taken off."),
     ] = False,
     cap: CapColour = None,
     cap_thickness: CapThickness = None,
     chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in clean plates.")] = False,
-    obj: Annotated[
-        bool, typer.Option("--obj", hidden=True)
-    ] = False,  # from earlier versions; a warning says what replaced it
-    atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
     normal_map: Annotated[
         bool, typer.Option("--normal-map", help="head.glb of few triangles, with a normal map of what they leave out.")
     ] = False,
@@ -151,12 +149,13 @@ def reconstruct(
     from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
-    switches = {"obj": obj, "atlas": atlas, "delight": albedo, "normal_map": normal_map}
+    switches = {"delight": albedo, "normal_map": normal_map}
     switches |= {"neutral": neutral, "morphs": morphs, "slicer": slicer}
     outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
     outputs |= {name: word for name, word in words.items() if word}
-    options = {"outputs": outputs or None, "texture": {"chart": True} if chart else None}
+    options: dict[str, bool | dict[str, object] | None] = {"outputs": outputs or None, "anyway": anyway or None}
+    options["texture"] = {"chart": True} if chart else None
     worn = {"colour": cap, "thickness_mm": cap_thickness}
     options["cap"] = {name: value for name, value in worn.items() if value is not None} or None
     document = settings_document(settings, method=method, front=front, detail=detail, device=device, **options)

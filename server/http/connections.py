@@ -47,7 +47,7 @@ class BoundedConnection(HttpToolsProtocol):
 
     @property
     def waits(self) -> bool:
-        """Whether the connection is waiting for a header, with no request to be answered."""
+        """Returns whether the connection is waiting for a header, with no request to be answered."""
         return self._in_header and (self.cycle is None or self.cycle.response_complete)
 
     def drop(self) -> None:

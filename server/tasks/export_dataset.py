@@ -54,6 +54,7 @@ def export_folder(
     """
     from pipeline.results.view_dataset import ViewDataset, write_view_dataset
     from pipeline.settings import OutputSettings
+    from pipeline.view_checks.guards import Guards
     from pipeline.view_checks.usable_views import usable_views
     from server.tasks.photographs import keep_masks, photographs_alone, read_or_calibrate
     from server.tasks.prepare import prepare_kernels
@@ -71,7 +72,7 @@ def export_folder(
         raise InputError(str(result), say_once(faults, rig.names))
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
     segmented = partial(keep_masks, kept, rig=rig, settings=chosen.segmentation, report=report)
-    views = usable_views(capture, rig, segmented, exchanged=chosen.exchanged_pictures)
+    views = usable_views(capture, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
     dataset = ViewDataset(views.capture, rig, views.silhouettes, head, flame)
     report("write", 0.0)
     for name in DATASET_FILES:

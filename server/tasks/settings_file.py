@@ -27,7 +27,7 @@ def reason_of(error: OSError | ValueError | RecursionError) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
-def settings_document(path: Path | None, **options: str | Mapping[str, object] | None) -> dict[str, object]:
+def settings_document(path: Path | None, **options: str | bool | Mapping[str, object] | None) -> dict[str, object]:
     """Returns the settings of a TOML or JSON file, or none without a file, overridden by ``options``. Tables in both
     are merged. Raises InputError if the file cannot be read."""
     return merged_settings({} if path is None else read_settings_file(path), options)

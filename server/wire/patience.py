@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import anyio
+from starlette.types import Receive
 
 from rig.messages.message import compose
 from server.wire.problems import Problem
@@ -35,3 +36,9 @@ async def within(seconds: float) -> AsyncIterator[None]:
     except TimeoutError as error:
         detail = compose("body-silent", seconds=seconds)
         raise Problem(408, "body-silent", detail, headers={"Connection": "close"}) from error
+
+
+async def await_hang_up(receive: Receive) -> None:
+    """Returns once the client of a request whose body was read has closed the connection."""
+    while (await receive())["type"] != "http.disconnect":
+        pass

@@ -11,12 +11,14 @@ import typer
 
 from pipeline.head_model.model import HeadModel, load_model
 from rig.errors import InputError
+from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import made_real, realism_names
 from server.cli.answers import progress_bar, wrong_usage
 from server.processes import python_command, python_environment
 from tests.laboratory.experiments.paper import span
+from tests.laboratory.experiments.records import Bench
 from tests.laboratory.experiments.shared_data import SHARED, Shared, facekit, truths
 from tests.laboratory.experiments.speed.growth import Size, sizes
 from tests.laboratory.experiments.speed.scaling import JobCommand
@@ -41,6 +43,11 @@ def folder(*, out: Annotated[Path | None, "keeps rows, the table and pictures th
     return out
 
 
+def bench(report: Progress, folder: Path | None) -> Bench:
+    """Returns the progress bar and the folder of ``--out``."""
+    return Bench(report, folder)
+
+
 @contextmanager
 def scratch() -> Iterator[Path]:
     """Yields a folder that is removed afterwards."""
@@ -54,7 +61,7 @@ def command() -> JobCommand:
 
 
 INPUTS = {
-    **{"model": model, "models": models, "facekit": facekit, "others": facekit, "folder": folder},
+    **{"model": model, "models": models, "facekit": facekit, "others": facekit, "folder": folder, "bench": bench},
     **{"scratch": scratch, "command": command, "renderer": Renderer.create, "report": progress_bar},
 }
 

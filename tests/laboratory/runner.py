@@ -24,7 +24,6 @@ from tests.laboratory.inputs import INPUTS
 
 Makers = Mapping[str, Callable[..., Any]]
 SCALARS = (int, float, str, bool, Path)
-COMMON = ("model", "subjects", "shared", "out")  # options of every experiment, whether it needs them or not
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +97,7 @@ def parser_of(name: str, record: Record, function: Callable[..., Any]) -> argpar
     )
     found = dict(_parameters(function, {**INPUTS, **record.takes}))
     if record.function.startswith("experiments."):
-        common = dict(_parameters(_common, INPUTS))
-        found = {key: found.get(key, common[key]) for key in COMMON} | found
+        found = dict(_parameters(_common, INPUTS)) | found
     lists_end = not any(parameter.kind is not parameter.KEYWORD_ONLY for parameter in found.values())
     for parameter in found.values():
         _add(parser, parameter, lists_end)
@@ -108,7 +106,7 @@ def parser_of(name: str, record: Record, function: Callable[..., Any]) -> argpar
 
 
 def _common(model: object, facekit: object, folder: object, *, subjects: int | None = None) -> None:
-    """Has the parameters of ``COMMON``."""
+    """Has the options of every experiment, whether it needs them or not: --model, --shared, --out, --subjects."""
 
 
 def _parameters(function: Callable[..., Any], makers: Makers) -> Iterator[tuple[str, inspect.Parameter]]:
@@ -154,7 +152,7 @@ def _add(parser: argparse.ArgumentParser, parameter: inspect.Parameter, lists_en
         action = argparse.BooleanOptionalAction if default else "store_true"
         parser.add_argument(flag, action=action, help=settings["help"])
     elif several:
-        repeated = {"action": "extend", "nargs": "+"} if lists_end else {"action": "append"}
+        repeated: dict[str, Any] = {"action": "extend", "nargs": "+"} if lists_end else {"action": "append"}
         parser.add_argument(flag, **(settings | repeated))
     else:
         parser.add_argument(flag, **settings)

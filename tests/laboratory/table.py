@@ -117,10 +117,7 @@ BENCHMARKS = {
     "image_stages": Record("benchmarks.image_stages:run", "Times the stages of a job."),
     "large_pictures": Record("benchmarks.large_pictures:run", "Writes, or times, a capture of 24 Mpx pictures."),
     "long_lists": Record("benchmarks.long_lists:run", "Times lists of a hundred thousand captures."),
-    "rig_capture": Record("benchmarks.rig_capture:run", "Times captures of the served studio."),
     "scene_calibration": Record("benchmarks.scene_calibration:run", "Judges calibration from photographs alone."),
-    "service_load": Record("benchmarks.service_load:run", "Loads the service with jobs, clients or workers."),
     "side_by_side": Record("benchmarks.side_by_side:run", "Compares two checkouts on the same captures."),
     "studio_masks": Record("benchmarks.studio_masks:run", "Compares masks of the studio with the truth."),
-    "texture_sets": Record("benchmarks.texture_sets:run", "Compares maps of polarised pictures with the truth."),
 }

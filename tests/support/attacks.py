@@ -5,14 +5,18 @@ import socket
 import statistics
 import threading
 import time
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
 
-from tests.support.services import RunningService
+from server.services.keys import Keys
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+from tests.support.services import RunningService, packed, small_capture
 
 ATTACKER, WITNESS = "127.0.0.3", "127.0.0.2"  # addresses of loopback: the bounds are by address
 EVERY_S = 0.05
@@ -147,3 +151,32 @@ def _resident_mb(pid: int) -> float:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
         return int(next(line for line in lines if line.startswith("VmRSS:")).split()[1]) / 1000
     return 0.0
+
+
+def jpeg_with_metadata(jpeg: bytes, megabytes: int, segment: int = 65_533) -> bytes:
+    """A JPEG with so much EXIF before its pixels, in segments of ``segment`` bytes."""
+    payload = b"Exif\0\0" + bytes(segment - 8)
+    part = b"\xff\xe1" + segment.to_bytes(2, "big") + payload
+    return jpeg[:2] + part * (megabytes * 1_000_000 // len(part)) + jpeg[2:]
+
+
+def png_of_chunks(png: bytes, count: int) -> bytes:
+    """A PNG with ``count`` empty chunks before its pixels: each takes its reader some microseconds."""
+    at = 8 + 25  # after signature and header
+    chunk = bytes(4) + b"teSt" + zlib.crc32(b"teSt").to_bytes(4, "big")
+    return png[:at] + chunk * count + png[at:]
+
+
+def spoiled_capture(folder: Path, change: Callable[[Path], None]) -> bytes:
+    """An archive of a small capture after ``change``, which gets the capture's folder."""
+    change(small_capture(folder))
+    return packed(folder)
+
+
+def add_keys(service: RunningService, *scopes: str) -> list[str]:
+    """New keys of a running service, each with the named scopes (with commas between)."""
+    engine = open_database(ServiceSettings(data=service.data))
+    try:
+        return [Keys(engine).add(f"key {number}", tuple(each.split(","))) for number, each in enumerate(scopes)]
+    finally:
+        engine.dispose()

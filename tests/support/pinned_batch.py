@@ -11,8 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet
-
 from server.batch.captures import find_captures
 from server.batch.folder import BatchFolder
 from server.batch.plan import BatchTask, plan_batch
@@ -81,6 +79,8 @@ def _without_seconds(path: Path) -> bytes:
         report = json.loads(path.read_text())
         return json.dumps({key: value for key, value in report.items() if key != "seconds"}).encode()
     if path.name == "heads.parquet":
+        import pyarrow.parquet  # it starts a thread, and a process that forks must have none
+
         rows = pyarrow.parquet.read_table(path).drop_columns("seconds").to_pylist()
         return json.dumps(rows).encode()
     if path.name == "heads.csv":

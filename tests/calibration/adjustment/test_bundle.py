@@ -124,7 +124,10 @@ def bound(source: Session) -> np.ndarray:
     return image_sigma(source.rig, full[: 15 * count, : 15 * count].reshape(count, 15, count, 15))
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.nightly), pytest.param(2, marks=pytest.mark.nightly)]
+)
 def test_eleven_cameras_reach_the_cramer_rao_bound(seed: int) -> None:
     """Errors, over all cameras, within 1.5 times the bound: the RMS of about 150 determined directions scatters by 6 %,
     so 1.5 is far outside chance, and what Huber's cost loses (5 %) far inside."""
@@ -139,6 +142,7 @@ def test_eleven_cameras_reach_the_cramer_rao_bound(seed: int) -> None:
     assert calibration.figures()["used_share"] > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", [CHARUCO, Board("checkerboard", 8, 6, 25.0)], ids=["charuco", "turned by half"])
 def test_other_boards_are_calibrated_too(board: Board) -> None:
     source = session(board, cameras=6, shots=18, seed=3)

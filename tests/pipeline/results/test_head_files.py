@@ -14,8 +14,7 @@ import trimesh
 
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import load_model
-from pipeline.results.head_files import write_head
-from pipeline.results.printable import printable
+from pipeline.results.head_files import printable, write_head
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.write import head_mesh, write_result
@@ -64,12 +63,11 @@ def written(result: Reconstruction, folder: Path, **outputs: object) -> set[str]
 
 def test_every_format_is_written_and_no_other(result: Reconstruction, tmp_path: Path) -> None:
     pytest.importorskip("pxr")
-    for name in ("default", "all", "old", "image"):
+    for name in ("default", "all", "image"):
         (tmp_path / name).mkdir()
     assert written(result, tmp_path / "default") == {"head.ply", "head.glb"}
     every = {"head.ply", "head.glb", "head.obj", "head.mtl", "head.png", "head.usdz", "head.stl", "head.3mf"}
     assert written(result, tmp_path / "all", formats=ALL) == every
-    assert "head.obj" in written(result, tmp_path / "old", obj=True)
     assert written(result, tmp_path / "image", formats=("ply",), ply_texture=True) == {"head.ply", "head.png"}
     assert b"comment TextureFile head.png\n" in (tmp_path / "image" / "head.ply").read_bytes()[:2000]
     plain, named = (read_head_ply(tmp_path / name / "head.ply")[0] for name in ("default", "image"))
@@ -202,7 +200,12 @@ def test_wrong_outputs_are_named() -> None:
     with pytest.raises(InputError) as found:
         settings_from_document({"outputs": {"formats": ["glb", "fbx"], "texture_size": 1000}})
     assert len(found.value.faults) == 2
-    assert settings_from_document({"outputs": {"obj": True}}).outputs.written == ("glb", "ply", "obj")
+
+
+@pytest.mark.parametrize("name", ["obj", "atlas"])
+def test_outputs_of_versions_before_0_3_are_refused_by_name(name: str) -> None:
+    with pytest.raises(InputError, match=f"unknown key 'outputs.{name}'"):
+        settings_from_document({"outputs": {name: True}})
 
 
 @pytest.mark.slow

@@ -2,13 +2,16 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from calibration.scene.rig_scale import times
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
+from pipeline.view_checks.guards import FaceEvidence, Guards
 from pipeline.view_checks.head_size import WrongScale, crown_disc, head_diameter_mm, judge_head_size
+from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
 from tests.support.subjects import random_subjects, worn_silhouettes
@@ -63,10 +66,89 @@ def test_what_is_between_is_warned_of(heads):
 def test_a_camera_may_hang_on_its_side(heads, turns):
     _, of = heads
     mask = of["short"]["cam00"].mask
-    upright, turned = crown_disc(mask), crown_disc(np.ascontiguousarray(np.rot90(mask, turns)))
+    upright, turned = crown_disc(mask, 0), crown_disc(np.ascontiguousarray(np.rot90(mask, turns)), -turns % 4)
     assert upright is not None
     assert turned is not None
     assert turned[1] == pytest.approx(upright[1], abs=2.0)
+
+
+def cropped(rig, silhouettes):
+    """The pictures cut at the left so that a shoulder leaves through the side, and masks that end below the chin, above
+    the border: as other programs cut the chest off by a plane."""
+    cameras, masks = [], {}
+    for camera in rig:
+        mask = silhouettes[camera.name].mask
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        left = int(columns[0] + (columns[-1] - columns[0]) // 12)
+        end = rows[0] + 9 * (rows[-1] - rows[0]) // 10
+        k = camera.intrinsics
+        masks[camera.name] = silhouette_from_mask(
+            np.ascontiguousarray(np.where(np.arange(k.height)[:, None] < end, mask, False)[:, left:])
+        )
+        cameras.append(replace(camera, intrinsics=replace(k, width=k.width - left, cx=k.cx - left)))
+    return Rig(tuple(cameras)), masks
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0])
+@pytest.mark.parametrize("name", STYLES)
+def test_a_mask_may_end_anywhere(heads, renderer, name, factor):
+    rig, of = heads
+    rig, of = rig.scaled(factor), {camera: halved(s, factor) for camera, s in of[name].items()}
+    cut_rig, cut = cropped(rig, of)
+    assert sum(bool(s.mask[:, 0].any()) and not s.mask[-1].any() for s in cut.values()) >= 7
+    whole = head_diameter_mm(of, rig)
+    assert head_diameter_mm(cut, cut_rig) == pytest.approx(whole, rel=0.1)
+    assert judge_head_size(cut, cut_rig) == []
+
+
+def halved(silhouette, factor):
+    height, width = silhouette.mask.shape
+    small = cv2.resize(
+        silhouette.mask.view(np.uint8), (int(width * factor), int(height * factor)), interpolation=cv2.INTER_NEAREST
+    )
+    return silhouette_from_mask(small.view(bool))
+
+
+@pytest.mark.parametrize("count", [4, 11])
+def test_one_wrong_mask_moves_no_crossing(heads, count):
+    rig, of = heads
+    few = rig.subset(rig.names[:count])
+    whole = {name: of["short"][name] for name in few.names}
+    broken = few.names[1]
+    mask = whole[broken].mask.copy()
+    rows = np.flatnonzero(mask.any(axis=1))
+    mask[: rows[0] + (rows[-1] - rows[0]) * 2 // 3] = False  # the shoulders alone
+    cut = {**whole, broken: silhouette_from_mask(mask)}
+    assert head_diameter_mm(cut, few) == pytest.approx(head_diameter_mm(whole, few), rel=0.05)
+
+
+def test_a_face_of_a_humans_size_overrules_the_outlines(heads):
+    rig, of = heads
+    scaled = times(rig, 3.3)
+    front = scaled[scaled.front_camera()]
+    up = -front.camera_from_world.rotation[1]
+    face = FaceEvidence(3.3 * head_middle(of["short"], rig), up, rig.names[:3], ())
+    (warning,) = judge_head_size(of["short"], scaled, lambda: face)
+    assert warning.code == "scale-implausible"
+    assert "scale.json" not in warning.text
+
+
+def test_anyway_turns_the_refusal_into_a_doubtful_pose(heads):
+    rig, of = heads
+    (warning,) = judge_head_size(of["short"], times(rig, 3.3), guards=Guards(anyway=True))
+    assert warning.code == "pose-doubtful"
+    assert "times as large as a head" in warning.text
+
+
+def head_middle(silhouettes, rig):
+    """Where the discs of the heads meet, by plain least squares over views that are all right."""
+    rays, centres = [], []
+    for camera in rig:
+        disc = crown_disc(silhouettes[camera.name].mask, 0)
+        rays.append(camera.rays_world(disc[0][None])[0])
+        centres.append(camera.centre_world)
+    across = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
+    return np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, np.array(centres)))
 
 
 def test_a_cut_crown_says_nothing(heads):

@@ -53,6 +53,7 @@ def test_every_command_has_help_with_an_example(command: str) -> None:
     assert f"Example: eigenhead {command}" in done.stdout or "eigenhead worker" in done.stdout
 
 
+@pytest.mark.usefixtures("real_exec")
 def test_help_is_quick() -> None:
     """CPU time, which a busy machine does not stretch."""
     began = time.perf_counter()

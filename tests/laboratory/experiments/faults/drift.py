@@ -12,9 +12,8 @@ random camera is turned by ``TURN_DEG`` about an axis across its view. Condition
 A camera may be named as moved (its view is left out), or as one that moved or has a loose mask (the view is kept).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -29,8 +28,7 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import Records, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.support.spoilt_captures import LOOSE_PX, close_up, knocked, loosened
 from tests.support.subjects import Planted, off_by, random_subjects, worn_silhouettes
 
@@ -40,16 +38,13 @@ CUT_VIEWS, CUT_SHARE = 3, 0.3  # of width and height: how far such a view is aim
 CONDITIONS = ("turned", "good", "loose", "loose_one", "cut_off", "close_up", "close_up_loose")
 
 
-def drift(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def drift(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 20) -> Outcome:
     """Runs this module's experiment. Returns the share of turned cameras that are named, and of good cameras that are,
     by condition and by warning."""
-    records = Records(folder, "drift", key_of(model.sha256, camera_drift, tangency, TURN_DEG, LOOSE_PX))
+    records = bench.records("drift", key_of(model.sha256, camera_drift, tangency, TURN_DEG, LOOSE_PX))
     span, rows = with_modes(model, 60), []
     for i, subject in enumerate(random_subjects(subjects, seed=17)):
-        report(subject.name, i / subjects)
+        bench.report(subject.name, i / subjects)
         rng = np.random.default_rng([17, i])
         rows.append(records.row(subject.name, lambda s=subject, r=rng: {"name": s.name} | draw(span, s, renderer, r)))
     found = figures(rows)

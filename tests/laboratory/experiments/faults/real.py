@@ -38,7 +38,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels
-from tests.laboratory.experiments.outcome import Outcome, Row
+from tests.laboratory.experiments.records import Bench, Outcome, Row
 
 USED = 11
 SIDE_DEG = 100.0  # from the front view's direction: the eleven, and the views they are judged by, look from there
@@ -63,10 +63,9 @@ def real(
     model: HeadModel,
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     front: Annotated[str | None, "the view that the subject faces"] = None,
     outlines: Annotated[Path | None, "outlines drawn by hand, outlines.json, of a single folder"] = None,
-    folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns a row for every folder, and their figures. By default a folder's own
     outlines.json is read. Estimated cameras are written to ``folder``. Raises InputError if a folder has no more views
@@ -74,13 +73,14 @@ def real(
     if outlines is not None and len(folders) > 1:
         raise InputError("--outlines", ["belongs to one folder; put outlines.json into each of several"])
     settings, rows = Settings(), list[Row]()
-    prepare_kernels(report, settings)
+    prepare_kernels(bench.report, settings)
     with TemporaryDirectory() as scratch:
         captures = [
-            read_real_capture(each, (folder or Path(scratch)) / each.name, front, outlines, report) for each in folders
+            read_real_capture(each, (bench.folder or Path(scratch)) / each.name, front, outlines, bench.report)
+            for each in folders
         ]
     for one in captures:
-        rows.append({"name": one.name, **judge(model, one, renderer=renderer, settings=settings, report=report)})
+        rows.append({"name": one.name, **judge(model, one, renderer=renderer, settings=settings, report=bench.report)})
     figures = {
         f"{row['name']}_{key}": float(value)
         for row in rows

@@ -47,7 +47,7 @@ from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh
-from rig.progress import Progress, discard_progress
+from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -56,9 +56,8 @@ from rig.studio.scene.subject import Subject
 from rig.studio.scene.visible import VisiblePoints
 from rig.studio.sensor.faults import Fault
 from rig.studio.sensor.preset import PRESET, Preset
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Records, Row
+from tests.laboratory.experiments.records import Bench, Outcome, Row
 from tests.laboratory.experiments.surface.visible_surface import read_visible
 
 Level = Literal["span", "kernel", "photo"]
@@ -102,10 +101,9 @@ def run(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     others: HeadModel | None = None,
     subjects: int | None = None,
-    folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
     ``<subject>_<model>_<level>_<quantity>``.
@@ -114,13 +112,11 @@ def run(
         models: by the name in the figures; the first one is used for random heads, faults and left-out cameras.
         captures: folders with a truth beside them.
         renderer: for the studio.
-        report: progress.
         others: the population from which random heads are drawn.
         subjects: number of random heads of it (20 by default), and of the first model's span (10 by default).
-        folder: keeps rows, which are not computed again.
     """
     draws, in_span = subjects or 20, subjects or 10
-    records = Records(folder, "detail", _key(models, others))
+    records = bench.records("detail", _key(models, others))
     label, model = next(iter(models.items()))
     jobs: list[Job] = []
     for name, path in captures.items():
@@ -143,9 +139,8 @@ def run(
             jobs.append((f"heldout-{name}-{camera}_{label}", compute))
     rows = []
     for done, (name, compute) in enumerate(jobs):
-        report(name, done / len(jobs))
+        bench.report(name, done / len(jobs))
         rows.append({"name": name, **records.row(name, compute)})
-    report("done", 1.0)
     return {"figures": figures(rows), "rows": rows}
 
 

@@ -21,7 +21,6 @@ fault.
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
-from pathlib import Path
 
 import numpy as np
 
@@ -39,9 +38,8 @@ from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper import limit
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.spoilt_captures import OVER_EARS, knocked, spoiled
 from tests.support.subjects import (
     Planted,
@@ -61,20 +59,17 @@ CALIBRATIONS_PX, CONTOUR_NOISE_PX = (0.1, 0.2, 0.5), 0.3
 KNOCKS_DEG = (1.0, 5.0)
 
 
-def robustness(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def robustness(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 20) -> Outcome:
     """Returns the contour solver's errors under each condition of this module, their ratios to those of perfect input
     and to the best possible error (the Cramer-Rao bound), and how often faulty cameras are found."""
-    records = Records(folder, "robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
+    records = bench.records("robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
     span = with_modes(model, 60)
     rows = []
     planted = random_subjects(subjects, seed=66)
     for i, subject in enumerate(planted):
         row: Row = {"name": subject.name}
         for j, (name, condition) in enumerate(CONDITIONS.items()):
-            report(f"{subject.name} {name}", (i + j / len(CONDITIONS)) / subjects)
+            bench.report(f"{subject.name} {name}", (i + j / len(CONDITIONS)) / subjects)
             rng = np.random.default_rng([66, i, j])
             compute = partial(condition, span, subject, renderer, rng)
             row[name] = records.row(f"{subject.name} {name}", compute)

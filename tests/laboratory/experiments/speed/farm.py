@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
+from tests.laboratory.experiments.records import Outcome
 
 WORKERS = (1, 8, 32, 64, 128, 256, 512, 1024)
 JOBS_A_WORKER = 12

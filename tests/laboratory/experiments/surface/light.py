@@ -33,7 +33,6 @@ from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.errors import EigenheadError
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -41,10 +40,9 @@ from rig.studio.scene.lights import LAMPS, Lamp
 from rig.studio.scene.simulate import Scene, build_scene, shoot
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.texture import drawn_texture
 from tests.support.colour_chart_pictures import chart_plate
 from tests.support.colour_difference import difference_2000, lab_from_srgb
@@ -68,35 +66,25 @@ LIGHTS: Mapping[str, tuple[Lamp, ...]] = {
 }
 
 
-def light(
-    model: HeadModel,
-    *,
-    renderer: Renderer,
-    report: Progress,
-    subjects: int = SUBJECTS,
-    folder: Path | None = None,
-) -> Outcome:
+def light(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = SUBJECTS) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of
     lights, and a row for each subject.
 
     Args:
         model: fitted; heads are drawn from it, too.
         renderer: for the studio.
-        report: called with the subject and the share done.
         subjects: heads in the studio.
-        folder: keeps rows, so that a stopped run can continue, and a picture of every subject.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head", delight=True, texture_size=2048))
     code = (fitted_light, albedo, decision, chart_colours, colour_chart)
-    records = Records(folder, "light", key_of(model.sha256, settings, LIGHTS, *code))
+    records = bench.records("light", key_of(model.sha256, settings, LIGHTS, *code))
     rows = []
     for number in range(subjects):
         name = f"{number:02}"
-        report(name, number / subjects)
-        picture = None if folder is None else folder / f"light-{name}.png"
+        bench.report(name, number / subjects)
+        picture = None if bench.folder is None else bench.folder / f"light-{name}.png"
         compute = partial(row_of, model, 400 + number, renderer, settings, picture)
         rows.append({"name": name, **records.row(name, compute)})
-    report("done", 1.0)
     keys = [key for key, value in rows[0].items() if isinstance(value, float)]
     return {"figures": {key: float(np.mean([row[key] for row in rows])) for key in keys}, "rows": rows}
 

@@ -8,7 +8,6 @@ import pytest
 from scipy.optimize import rosen
 
 from rig.mesh import Mesh
-from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown, records
 from tests.laboratory.experiments.paper import views
 from tests.laboratory.experiments.paper.tables import correlation
@@ -19,8 +18,6 @@ from tests.laboratory.runner import run
 from tests.laboratory.table import EXPERIMENTS
 from tests.support.scenes import ellipsoid
 from tests.support.shared_data import shared
-from tests.support.spoilt_captures import WRONG_RADII_PX, WRONG_SHARE, spoiled
-from tests.support.subjects import off_by, stated
 
 
 def test_a_stopped_run_goes_on_and_another_key_starts_anew(tmp_path: Path) -> None:
@@ -122,34 +119,6 @@ def test_exchanges_repair_a_greedy_choice() -> None:
     information = np.stack([np.diag([3.0, 3.0]), np.diag([100.0, 0.0]), np.diag([0.0, 100.0])])
     assert views.a_optimal([(information, np.eye(2))], 1, 0.1 * np.eye(2)) == [0]
     assert views.a_optimal([(information, np.eye(2))], 2, 0.1 * np.eye(2)) == [1, 2]
-
-
-def test_a_fifth_of_the_contour_is_wrong() -> None:
-    rows, columns = np.ogrid[:300, :400]
-    mask = (rows - 150) ** 2 + (columns - 200) ** 2 < 100**2
-    wrong = spoiled(mask, np.random.default_rng(1))
-    edge = 2 * np.pi * 100
-    changed = np.argwhere(wrong != mask)
-    angle = np.arctan2(changed[:, 0] - 150, changed[:, 1] - 200)
-    share = len(np.unique((angle / (2 * np.pi) * 400).astype(int))) / 400
-    assert WRONG_SHARE - 0.02 < share < WRONG_SHARE + 2 * WRONG_RADII_PX[1] / edge + 0.02
-    assert (wrong & ~mask).any()
-    assert (mask & ~wrong).any()
-
-
-def test_cameras_are_off_by_what_was_asked() -> None:
-    """Mean square motion of points on a sphere of 100 mm radius, in squares of what was asked: along each image axis 1
-    of tilt and slide, and 1/3 each of roll and range."""
-    rig, rng = default_layout(), np.random.default_rng(3)
-    directions = rng.standard_normal((200, 3))
-    points = rig.centre_world() + 100.0 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    squares = []
-    for _ in range(30):
-        off = off_by(rig, 0.5, rng)
-        squares += [((off[c.name].project(points) - c.project(points)) ** 2).sum(axis=1).mean() for c in rig]
-    # 330 cameras with about three numbers each that dominate: a standard error of 4 % in squares.
-    assert np.mean(squares) == pytest.approx(0.5**2 * 2 * (1 + 1 / 3 + 1 / 3), rel=0.16)
-    assert all(camera.covariance is not None for camera in stated(rig, 0.5))
 
 
 def test_correlation_of_too_few_rows_is_none() -> None:

@@ -10,8 +10,8 @@ from types import FunctionType
 import llvmlite.binding
 import pytest
 
-from pipeline.compute import jit as compiled
-from pipeline.compute.jit import function_digest, njit
+from rig import jit as compiled
+from rig.jit import function_digest, njit
 
 ROOT = Path(__file__).parents[3]
 SCALE = 2.0
@@ -137,7 +137,7 @@ def test_what_one_machine_compiled_runs_on_the_next(variables: dict[str, str]) -
     features = llvmlite.binding.get_host_cpu_features()
     if not all(features.get(feature) for feature in compiled.PORTABLE_FEATURES):
         pytest.skip("another processor: it compiles for itself")
-    code = "from pipeline.compute.jit import machine; print(machine())"
+    code = "from rig.jit import machine; print(machine())"
     environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_CPU")} | variables
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
@@ -149,4 +149,4 @@ def test_every_compiled_loop_of_the_project_is_kept() -> None:
     for room in ("rig", "pipeline", "calibration", "server"):
         for path in (ROOT / room).rglob("*.py"):
             if path != ROOT / "pipeline" / "compiled.py":
-                assert "from numba import njit" not in path.read_text(encoding="utf-8"), f"{path}: pipeline.compute.jit"
+                assert "from numba import njit" not in path.read_text(encoding="utf-8"), f"{path}: rig.jit"
