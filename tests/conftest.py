@@ -30,7 +30,7 @@ hypothesis.settings.load_profile("eigenhead")
 
 ALLOWED_SKIPS = Path(__file__).with_name("allowed_skips.txt")
 ALLOWED_SECONDS = Path(__file__).with_name("allowed_seconds.txt")
-# CPU seconds of a fast test in its call, children included: a second of a free core, and up to two of one whose caches
+# CPU seconds of a fast test's call, child processes included: a second of a free core, up to two of one whose caches
 # another process uses (the same twelve poses took 1.4 s and 2.0 s).
 MAX_CALL_S = 2.0
 IN_CI = os.environ.get("CI") == "true"

@@ -19,7 +19,6 @@ WORDS = frozenset({"told", "given", "own", "asked", "looks"})
 REPLACED = {
     "About": "CaptureMetadata",
     "AspectsAt": "LinearisedAspectPrior",
-    "Bench": "WorkerContext",
     "Carrier": "SurfaceBinding",
     "Children": "ChildProcessPool",
     "CornersAt": "LinearisedCornerTerm",
