@@ -1,8 +1,10 @@
 # Two commands do everything on a fresh Debian with git, make and python3: `make demo` and `make test`.
-.PHONY: setup setup-tests demo serve test test-slow check coverage format bench dependencies reference results pictures docs sbom audit mutants
+.PHONY: setup setup-tests demo serve test test-shapes test-slow test-nightly test-laboratory check coverage format bench dependencies reference results pictures docs sbom audit mutants
 BIN := .venv/bin
 # The tests start many processes: with compiled modules kept beside them each starts in half the time.
 unexport PYTHONDONTWRITEBYTECODE
+# A test goes to the core that is free. In CI the longest are printed.
+PYTEST = $(BIN)/pytest -n 2 --dist worksteal $(if $(filter true,$(CI)),--durations=50)
 UV = $(shell command -v uv || echo $${XDG_CACHE_HOME:-$$HOME/.cache}/eigenhead/uv)
 
 setup:       ## uv, the locked environment, an EGL; nothing where nothing is missing
@@ -19,10 +21,19 @@ serve: setup ## the service with its data in out/data
 	$(BIN)/eigenhead serve --data out/data
 
 test: setup  ## the fast tests
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(PYTEST)
 
-test-slow: setup  ## the tests that take more than a few seconds each
-	$(BIN)/pytest -m slow -n 2 --dist loadfile
+test-shapes: setup  ## calls of the rooms below the server, held to their annotated types and shapes; SHAPES=all: every parameter set
+	$(PYTEST) --shapes $(or $(SHAPES),once) tests/calibration tests/pipeline tests/rig tests/test_shape_checks.py
+
+test-slow: setup  ## the tests that take more than a second each
+	$(PYTEST) -m "slow and not nightly"
+
+test-nightly: setup  ## these, and in full size what they hold in a smaller one
+	$(PYTEST) -m slow
+
+test-laboratory: setup  ## the tests of experiments, benchmarks and model files, slow ones too: before a release
+	$(BIN)/pytest -m "slow or not slow" -n 2 tests/laboratory/tests
 
 check: ## ruff, pyright, import-linter, biome (JavaScript), dead links of the documents
 	@deploy/setup.sh --docs
@@ -35,7 +46,7 @@ check: ## ruff, pyright, import-linter, biome (JavaScript), dead links of the do
 
 coverage: setup ## what share of the product's lines the fast tests run, child processes included, compiled loops left out
 	@mkdir -p out/coverage && rm -f out/coverage/data*
-	$(BIN)/coverage run -m pytest -n 2 --dist loadfile
+	$(BIN)/coverage run -m pytest -n 2 --dist worksteal
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report --skip-covered --sort=cover
 
@@ -46,7 +57,7 @@ format:
 	@if [ -x $(BIN)/biome ]; then $(BIN)/biome format --write; else echo "format: skipped: no biome for this machine, JavaScript is as it was"; fi
 
 bench: setup ## timings of inner loops
-	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib" tests/laboratory/benchmarks
+	$(BIN)/pytest -o addopts="-ra --strict-markers --import-mode=importlib -p no:jaxtyping" tests/laboratory/benchmarks
 
 dependencies: setup ## docs/dependencies.md: every locked package with licence and reason
 	$(BIN)/python -m tests.tools.dependencies
@@ -73,4 +84,4 @@ audit: setup ## known faults of the locked packages, asked of osv.dev; fails whe
 
 mutants: setup ## MODULE=rig/geometry.py, or SAMPLE=50 of compiled loops: changes code and tells what no test notices
 	$(UV) sync --locked --quiet --group docs --group mutants
-	$(BIN)/python -m tests.support.$(if $(SAMPLE),mutant_sample $(SAMPLE),mutants $(MODULE))
+	$(BIN)/python -m tests.tools.$(if $(SAMPLE),mutant_sample $(SAMPLE),mutants $(MODULE))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.adjustment.intrinsics import Lens
-from calibration.adjustment.state import INTRINSICS
+from calibration.adjustment.state import INTRINSICS, rms
 from calibration.adjustment.timing import TimeOffsets
 from calibration.board.board import Board
 from calibration.quality.checks import (
@@ -150,7 +150,7 @@ class Calibration:
         for camera in self.rig:
             residuals = [miss for (name, _), (_, _, miss) in self.misses.items() if name == camera.name]
             cameras[camera.name] = {
-                "rms_px": _rms(np.concatenate(residuals)),
+                "rms_px": rms(np.concatenate(residuals)),
                 "alone_rms_px": self.lenses[camera.name].rms_px,
                 "views": len(residuals),
                 "corners": int(sum(len(miss) for miss in residuals)),
@@ -160,7 +160,7 @@ class Calibration:
                 "covered": self._covered(camera),
             }
         return {
-            "rms_px": _rms(everything),
+            "rms_px": rms(everything),
             "used_share": len(everything) / self.detected,
             "corners": len(everything),
             "sync_px": self.sync_px,
@@ -239,7 +239,3 @@ def _check_document(check: Check) -> CheckDocument:
 def write_calibration(calibration: Calibration, path: Path) -> None:
     """Writes ``cameras.json`` with covariances."""
     write_atomically(path, json.dumps(document_from_rig(calibration.rig), indent=1).encode())
-
-
-def _rms(misses: Float[np.ndarray, "n 2"]) -> float:
-    return float(np.sqrt((misses**2).sum(axis=1).mean()))

@@ -7,7 +7,7 @@ imports so that they say where the module then is (`from rig.camera import Camer
 like that (a module named in a string, `import rig.camera`) ends the build with its file and line.
 
 With EIGENHEAD_WHEEL_LOOPS=1 the wheel also carries the loops of a job compiled, for
-`pipeline.compute.jit.PORTABLE_CPU`, and the Python and Numba of the environment that builds (`uv build --wheel
+`rig.jit.PORTABLE_CPU`, and the Python and Numba of the environment that builds (`uv build --wheel
 --no-build-isolation`); with others they are not found, and compiled as from any other wheel.
 
 The package `eigenhead` itself is written here, for the wheel and for the checkout's own environment: the names of
@@ -31,7 +31,6 @@ WHEEL_PACKAGE = "eigenhead"
 PACKAGES = ("rig", "pipeline", "calibration", "server")
 LOOPS = "EIGENHEAD_WHEEL_LOOPS"
 COMPILE_S = 1800.0  # the longest that compiling may take
-RESEARCH = Path("pipeline", "research")  # experiments are run from a checkout
 NOT_CARRIED = shutil.ignore_patterns("__pycache__", "*.nbi", "*.nbc")
 
 _MODULE_NAME = re.compile(rf"({'|'.join(PACKAGES)})((\.\w+)*)\.?(:\w*)?")
@@ -73,14 +72,13 @@ class WheelImports(BuildHookInterface):
 
 
 def carry_packages(root: Path, target: Path) -> None:
-    """Copies the four packages from the checkout `root` into `target`, with their imports moved, and without research.
+    """Copies the four packages from the checkout `root` into `target`, with their imports moved.
 
     Raises:
         ImportCannotMove: see the module.
     """
     for name in PACKAGES:
         shutil.copytree(root / name, target / name, ignore=NOT_CARRIED)
-    shutil.rmtree(target / RESEARCH)
     for path in sorted(target.rglob("*.py")):
         if path != target / "__init__.py" and path != target / "__main__.py":
             place = path.relative_to(target)
@@ -97,7 +95,7 @@ def carry_loops(package: Path) -> None:
         environment = os.environ | {"PYTHONPATH": str(package.parent), "EIGENHEAD_CACHE": cache}
         command = [sys.executable, "-P", "-m", WHEEL_PACKAGE, "prepare"]
         subprocess.run(command, env=environment, check=True, timeout=COMPILE_S)
-        shutil.copytree(Path(cache) / "kernels", package / "pipeline" / "compute" / "compiled_loops")
+        shutil.copytree(Path(cache) / "kernels", package / "rig" / "compiled_loops")
     for left in package.rglob("__pycache__"):
         shutil.rmtree(left)
 

@@ -20,15 +20,17 @@ from pipeline.stages.views import Views, check_lenses, find_views
 from rig.formats.meshes.usdz import check_usd
 
 
-def fit_shape(
-    run: Recorder, context: ReconstructionContext, views: Views, alignment: Alignment
-) -> tuple[PartLabels, HeadFit]:
+def fit_shape(run: Recorder, views: Views, alignment: Alignment) -> tuple[PartLabels, HeadFit]:
     """Fits the head to the outlines, labels the pixels as skin, hair or clothes, and then fits the head to the
     photographs."""
-    cap = run(find_worn_cap, context, views, alignment)
-    outlines = run(fit_outlines, context, views, alignment, cap)
-    labels = run(label_parts, context, views, outlines.model, outlines.mesh_world, cap)
-    return labels, run(fit_head, context, views, outlines, labels)
+    with run.stage("alignment") as stage:
+        cap = stage.keep(find_worn_cap(stage.context, views, alignment))
+    with run.stage("fit") as stage:
+        outlines = stage.keep(fit_outlines(stage.context, views, alignment, cap))
+    with run.stage("parts") as stage:
+        labels = stage.keep(label_parts(stage.context, views, outlines.model, outlines.mesh_world, cap))
+    with run.stage("fit") as stage:
+        return labels, stage.keep(fit_head(stage.context, views, outlines, labels))
 
 
 def reconstruct(context: ReconstructionContext) -> Reconstruction:
@@ -37,44 +39,56 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
     Raises EigenheadError where there is no answer (too few usable views, feature points that determine nothing) or a
     warning has a code that ``settings.fail_on`` names, and Cancelled when ``context.progress`` does.
     """
-    if "usdz" in context.settings.outputs.written:
+    if "usdz" in context.settings.outputs.formats:
         check_usd()
-    run = Recorder(context.progress)
-    views = run(find_views, context)
-    with run.beside(check_lenses, context, views):
-        faces = run(find_faces, context, views.capture)
-        alignment = run(align_head, context, views, faces)
-        labels, head = fit_shape(run, context, views, alignment)
-    depth = run(measure_depth, context, views, head, labels)
-    with run.beside(fuse_depth, context, views, head.mesh_world, labels, depth) as fused:
-        refined = run(refine_head, context, views, faces, head, labels, depth)
-    with run.beside(shape_bust, context, views, depth, refined, fused.product) as surface:
-        texturing = run(texture_head, context, views, head, refined, labels)
-        pose = run(check_pose, context, faces, alignment, head, refined)
-        evidence = run(judge_head, context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
-    bust = run(colour_bust, context, views, surface.product, texturing.capture)
-    hair = run(push_out_hair, context, refined, bust)
+    run = Recorder(context)
+    with run.stage("segmentation") as stage:
+        views = stage.keep(find_views(stage.context))
+    with run.beside("segmentation", lambda quiet: check_lenses(quiet, views)):
+        with run.stage("faces") as stage:
+            faces = stage.keep(find_faces(stage.context, views.capture))
+        with run.stage("alignment") as stage:
+            alignment = stage.keep(align_head(stage.context, views, faces))
+        labels, head = fit_shape(run, views, alignment)
+    with run.stage("depth") as stage:
+        depth = stage.keep(measure_depth(stage.context, views, head, labels))
+    with (
+        run.beside("bust", lambda quiet: fuse_depth(quiet, views, head.mesh_world, labels, depth)) as fused,
+        run.stage("fine") as stage,
+    ):
+        refined = stage.keep(refine_head(stage.context, views, faces, head, labels, depth))
+    with run.beside("bust", lambda quiet: shape_bust(quiet, views, depth, refined, fused.product)) as surface:
+        with run.stage("texture") as stage:
+            texturing = stage.keep(texture_head(stage.context, views, head, refined, labels))
+        with run.stage("evidence") as stage:
+            pose = stage.keep(check_pose(stage.context, faces, alignment, head, refined))
+            evidence = stage.keep(
+                judge_head(stage.context, views, faces, alignment, head, refined, texturing=texturing, pose=pose)
+            )
+    with run.stage("bust") as stage:
+        bust = stage.keep(colour_bust(stage.context, views, surface.product, texturing.capture))
+        hair = stage.keep(push_out_hair(stage.context, refined, bust))
     if any(warning.code == "pose-doubtful" for warning in run.warnings):  # of a refusal that was overruled, too
         pose = replace(pose, doubtful=True)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
     return Reconstruction(
-        context.model.name,
-        context.model.sha256,
-        context.settings,
-        context.device.description if context.device else "cpu",
-        context.capture.digests,
-        views,
-        faces,
-        alignment,
-        labels,
-        head,
-        refined,
-        texturing,
-        bust,
-        hair,
-        pose,
-        evidence,
+        model_name=context.model.name,
+        model_sha256=context.model.sha256,
+        settings=context.settings,
+        device=context.device.description if context.device else "cpu",
+        digests=context.capture.digests,
+        views=views,
+        faces=faces,
+        alignment=alignment,
+        labels=labels,
+        head=head,
+        refined=refined,
+        texturing=texturing,
+        bust=bust,
+        hair=hair,
+        pose=pose,
+        evidence=evidence,
         warnings=run.warnings,
         seconds=run.seconds(),
     )

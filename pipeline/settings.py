@@ -238,18 +238,11 @@ class OutputSettings:
     morphs: bool = False  # posed.glb, with morph targets under Apple's 52 names; of a template head-NAME.glb, too
     slicer: bool = False  # landmarks.mrk.json, a point list for 3D Slicer
     template: str | None = None  # head-NAME.obj: the head in the vertex order of a registered template, too
-    obj: bool = False  # of earlier versions: "obj" among the formats
-    atlas: bool = False  # of earlier versions: head.glb has a texture now
-
-    @property
-    def written(self) -> tuple[str, ...]:
-        """Returns the formats to write, those of earlier settings included."""
-        return (*self.formats, *(["obj"] if self.obj and "obj" not in self.formats else []))
 
     @property
     def textured(self) -> bool:
         """Tells whether any file has a texture."""
-        requested = self.ply_texture or self.delit or bool({"glb", "obj", "usdz"} & set(self.written))
+        requested = self.ply_texture or self.delit or bool({"glb", "obj", "usdz"} & set(self.formats))
         return self.surface != "bust" and requested
 
     @property

@@ -37,7 +37,6 @@ WARNING_CODES = (
     "no-pores",
     "no-texture",
     "no-texture-layout",
-    "old-setting",
     "outlines-loose",
     "outlines-unexplained",
     "picture-duplicated",

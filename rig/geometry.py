@@ -124,6 +124,38 @@ def rigid_fit(
     return RigidTransform(rotation, target_mean - rotation @ source_mean)
 
 
+def nearest_to_rays(
+    centres: Float[np.ndarray, "v 3"],
+    rays: Float[np.ndarray, "v ... 3"],
+    weights: Float[np.ndarray, "v ..."] | None = None,
+    ridge: float = 1e-9,
+) -> Float[np.ndarray, "... 3"]:
+    """Returns the points with the least weighted sum of squared distances to their rays, one from each centre.
+
+    Args:
+        centres: where the rays begin (mm).
+        rays: unit directions, for each centre and point.
+        weights: 0 where a centre has no ray for a point; equal by default.
+        ridge: added to the diagonal of the equations, which parallel rays leave singular.
+    """
+    matrix, right = ray_equations(centres, rays, weights)
+    return np.linalg.solve(matrix + ridge * np.eye(3), right[..., None])[..., 0]
+
+
+def ray_equations(
+    centres: Float[np.ndarray, "v 3"],
+    rays: Float[np.ndarray, "v ... 3"],
+    weights: Float[np.ndarray, "v ..."] | None = None,
+) -> tuple[Float[np.ndarray, "... 3 3"], Float[np.ndarray, "... 3"]]:
+    """Returns matrix and right side of the equations of the points nearest to rays, as ``nearest_to_rays`` solves
+    them. The smallest eigenvalue of the matrix is the sum of squared sines between the rays and their mean
+    direction."""
+    weights = np.ones(rays.shape[:-1]) if weights is None else weights
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    matrix = np.einsum("v...,v...ij->...ij", weights, across)
+    return matrix, np.einsum("v...,v...ij,vj->...i", weights, across, centres)
+
+
 def look_at(
     centre: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]
 ) -> RigidTransform:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from rig.camera import Camera
 from rig.errors import EigenheadError
+from rig.geometry import nearest_to_rays
 from rig.messages.message import compose
 
 
@@ -60,12 +61,8 @@ class Rig:
 
     def centre_world(self) -> Float[np.ndarray, " 3"]:
         """Returns the point (mm) nearest to all optical axes by least squares, near which the subject should be."""
-        normal, right = np.zeros((3, 3)), np.zeros(3)
-        for camera in self.cameras:
-            off_axis = np.eye(3) - np.outer(camera.axis_world, camera.axis_world)
-            normal += off_axis
-            right += off_axis @ camera.centre_world
-        return np.linalg.solve(normal + 1e-9 * np.eye(3), right)
+        centres = np.stack([camera.centre_world for camera in self.cameras])
+        return nearest_to_rays(centres, np.stack([camera.axis_world for camera in self.cameras]))
 
     def front_camera(self) -> str:
         """Returns the name of the camera in the middle of the rig: that whose direction is nearest to the mean of all

@@ -102,12 +102,14 @@ class ServiceSettings(BaseSettings):
     archive_members: int = Field(default=5000, ge=1, description="the most files and folders of one archive")
     archive_bytes: int = Field(default=16 << 30, ge=1, description="the most that one archive unpacks to")
     archive_ratio: float = Field(default=100.0, gt=1, description="the most that an archive may unpack to, by its size")
-    image_pixels: int = Field(default=64_000_000, ge=1, description="the largest image of a capture")
+    image_pixels: int = Field(default=64_000_000, ge=1, description="pixels of the largest picture of a capture")
     free_bytes: int = Field(default=256 << 20, ge=0, description="disk space that uploads and jobs must leave")
     jobs_per_key: int = Field(default=200, ge=1, description="queued and running jobs of one API key")
     batches_per_key: int = Field(default=100, ge=1, description="unfinished batches of one API key")
     batch_captures: int = Field(default=10_000, ge=1, description="the most captures of one batch")
     checks_at_once: int = Field(default=2, ge=1, description="processes that unpack and check uploads")
+    check_s: float = Field(default=900.0, gt=0, description="the longest that the check of one upload may take")
+    check_bytes: int = Field(default=4 << 30, ge=0, description="memory of each of these processes; 0: any")
     upload_hours: float = Field(default=48.0, gt=0, description="how long an unfinished resumable upload is kept")
 
     keep_results_days: float | None = Field(

@@ -32,7 +32,8 @@ from tests.tools.reference import OF_OTHERS
 
 DOCS = ROOT / "docs"
 KEPT = DOCS / "results"  # words around kept figures, no pages
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted(path for path in DOCS.rglob("*.md") if KEPT not in path.parents)]
+NOTES = ROOT / "tests" / "laboratory" / "notes"
+PAGES = sorted({*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *NOTES.glob("*.md")} - {*KEPT.glob("*.md")})
 LINK = re.compile(r"(?<!!)\[[^\]]+\]\(([^)\s]+)\)")
 CAN_BE_MADE_AGAIN = {"cache", "incoming", "uploads", "trash", "set-aside"}
 

@@ -1,6 +1,8 @@
 """The notebooks run from top to bottom, and draw; in the repository they have no outputs."""
 
+import ast
 import base64
+import importlib
 import os
 import re
 import subprocess
@@ -28,7 +30,18 @@ def test_a_notebook_is_kept_without_outputs(path: Path) -> None:
     assert all(cell.outputs == [] and cell.execution_count is None for cell in cells)
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_code_compiles_and_finds_what_it_imports(path: Path) -> None:
+    cells = [cell.source for cell in nbformat().read(path, as_version=4).cells if cell.cell_type == "code"]
+    tree = ast.parse("\n".join(line for cell in cells for line in cell.splitlines() if not line.startswith("%")))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    assert imports
+    for node in imports:
+        module = importlib.import_module(str(node.module))
+        assert [alias.name for alias in node.names if not hasattr(module, alias.name)] == []
+
+
+@pytest.mark.nightly
 @pytest.mark.gl
 @pytest.mark.timeout(900)
 @pytest.mark.filterwarnings("ignore")  # Jupyter's own

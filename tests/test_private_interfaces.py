@@ -16,7 +16,7 @@ from nicegui.elements import scene
 from numba.core import caching
 from numba.core.compiler import CompileResult
 
-from pipeline.compute.jit import KeptFunction
+from rig.jit import KeptFunction
 
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = ("rig", "pipeline", "calibration", "server")
@@ -24,9 +24,9 @@ DOCUMENTED = re.compile(r"os\._exit|\w+\._(asdict|replace|fields)")  # public, f
 USES = {
     ("rig/formats/captures/archive.py", "zipfile._EndRecData"),
     ("rig/formats/captures/archive.py", "super()._proc_member"),
-    ("pipeline/compute/jit.py", "dispatcher._cache"),  # used in tests/pipeline/compute/test_jit.py
-    ("pipeline/compute/jit.py", "result._reduce"),
-    ("pipeline/compute/jit.py", "CompileResult._rebuild"),
+    ("rig/jit.py", "dispatcher._cache"),  # used in tests/rig/test_jit.py
+    ("rig/jit.py", "result._reduce"),
+    ("rig/jit.py", "CompileResult._rebuild"),
     ("server/worker/engine.py", "DBOS._recover_pending_workflows"),  # held by tests/server/worker/test_engine.py
 }
 

@@ -28,7 +28,7 @@ def test_every_table_is_shown_somewhere() -> None:
 def test_what_is_kept_says_how_when_and_on_what(name: str) -> None:
     document = kept(name)
     assert set(document) == {"command", "date", "machine", "figures"}
-    assert re.match(r"(eigenhead|python -m tests\.benchmarks\.\w+) ", document["command"])
+    assert re.match(r"python -m tests\.laboratory \w+ ", document["command"])
     assert datetime.date.fromisoformat(document["date"]) >= datetime.date(2026, 1, 1)
     assert re.fullmatch(r"\d+ cores of \w+", document["machine"])  # neither a host's name nor a path
     assert document["figures"]

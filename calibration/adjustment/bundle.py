@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.adjustment import cholesky
 from calibration.adjustment.corner_term import CornerTerm
 from calibration.adjustment.lens_prior import AspectTerm, LensPrior
 from calibration.adjustment.state import (
@@ -26,6 +25,7 @@ from calibration.adjustment.state import (
     residuals,
 )
 from pipeline.estimation.levenberg_marquardt import Evidence, Limits, minimise
+from pipeline.estimation.positive_definite import inverse
 from pipeline.estimation.robust import Cauchy, Huber, LeastSquares, Loss
 from pipeline.estimation.terms import Problem
 
@@ -67,13 +67,12 @@ class BundleSolution:
         full = np.zeros((len(self.free), len(self.free)))
         # Scaled to a unit diagonal first: parameters span from 1e-4 (distortion) to 1e3 (mm).
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self.normal), 1e-12))
-        scaled, eye = self.normal * np.outer(scale, scale), np.eye(len(scale))
+        scaled = self.normal * np.outer(scale, scale)
         try:
-            lower = cholesky.factor(scaled)
-        except cholesky.NotPositiveDefinite:
-            lower = cholesky.factor(scaled + 1e-9 * eye)  # gives undetermined parameters a huge variance
-        inverse = cholesky.solve(lower, eye) * np.outer(scale, scale)
-        full[np.ix_(self.free, self.free)] = 0.5 * (inverse + inverse.T)
+            covariance = inverse(scaled)
+        except np.linalg.LinAlgError:
+            covariance = inverse(scaled + 1e-9 * np.eye(len(scale)))  # gives undetermined parameters a huge variance
+        full[np.ix_(self.free, self.free)] = covariance * np.outer(scale, scale)
         return full
 
 
@@ -117,7 +116,7 @@ def solve(
     """
     problem = bundle_problem(state, CornerTerm(seen, sigma, loss or LeastSquares()), prior, free or Free())
     limits = Limits(steps=steps, tolerance=TOLERANCE, tries=6, first_damping=1e-4)
-    found = minimise(problem, state, limits, solve=cholesky.solve_system, watch=tick)
+    found = minimise(problem, state, limits, watch=tick)
     assert problem.free is not None
     return BundleSolution(found.value, problem.equations(found.at).matrix, problem.free, found.evidence)
 

@@ -140,3 +140,8 @@ def residuals(state: BundleState, seen: Observations) -> Float[np.ndarray, "n 2"
     miss = lens_image(inside, state.intrinsics[camera]) - seen.pixels
     miss[behind] = BEHIND_PX
     return miss
+
+
+def rms(misses: Float[np.ndarray, "n 2"]) -> float:
+    """Returns the root mean square length of misses (px); 0 for none."""
+    return float(np.sqrt((misses**2).sum(axis=1).mean())) if len(misses) else 0.0

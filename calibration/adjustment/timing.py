@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from calibration.adjustment.bundle import HUBER, Free, solve
 from calibration.adjustment.lens_prior import LensPrior
-from calibration.adjustment.state import BundleState, Observations, residuals
+from calibration.adjustment.state import BundleState, Observations, residuals, rms
 from rig.geometry import RigidTransform, vector_from_rotation
 
 
@@ -47,7 +47,7 @@ def estimate_offsets(
     state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"]
 ) -> TimeOffsets:
     """Estimates the offsets by solving the bundle again with them, starting from its solution ``state``."""
-    before = _rms(state, seen)
+    before = rms(residuals(state, seen))
     state = replace(state, velocities=board_velocities(state))
     first = solve(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER).state
     state = replace(first, velocities=board_velocities(first))  # which follow the poses, and those moved a little
@@ -55,8 +55,4 @@ def estimate_offsets(
     state = solution.state
     cameras = len(state.intrinsics)
     spread = np.sqrt(np.diag(solution.covariance())[-cameras:])
-    return TimeOffsets(state.offsets, spread, before, _rms(state, seen))
-
-
-def _rms(state: BundleState, seen: Observations) -> float:
-    return float(np.sqrt((residuals(state, seen) ** 2).sum(axis=1).mean()))
+    return TimeOffsets(state.offsets, spread, before, rms(residuals(state, seen)))

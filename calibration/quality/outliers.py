@@ -12,7 +12,7 @@ from calibration.adjustment.state import BundleState, Observations, intrinsics_o
 from calibration.board.board import Board
 from calibration.board.detection import Detections, View
 from rig.camera import Camera
-from rig.geometry import RigidTransform, rigid_fit
+from rig.geometry import RigidTransform, nearest_to_rays, rigid_fit
 from rig.messages.message import Message, compose
 
 # A view is out if its RMS is this many times the median view's: with Gaussian corners the ratio passes 1.5 once in 1e4
@@ -183,13 +183,10 @@ def _triangulated(
     wanted = np.flatnonzero(counts >= 2)
     if len(wanted) < 4:
         return None
-    normal = np.zeros((len(counts), 3, 3))
-    right = np.zeros((len(counts), 3))
-    for (camera, _, pixels), numbers in zip(triples, ids, strict=True):
-        rays = camera.rays_world(pixels)
-        if not np.isfinite(rays).all():
-            return None
-        off_axis = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        normal[numbers] += off_axis
-        right[numbers] += off_axis @ camera.centre_world
-    return wanted, np.linalg.solve(normal[wanted], right[wanted][:, :, None])[:, :, 0]
+    rays, weights = np.zeros((len(triples), len(counts), 3)), np.zeros((len(triples), len(counts)))
+    for view, ((camera, _, pixels), numbers) in enumerate(zip(triples, ids, strict=True)):
+        rays[view, numbers], weights[view, numbers] = camera.rays_world(pixels), 1.0
+    if not np.isfinite(rays).all():
+        return None
+    centres = np.stack([camera.centre_world for camera, _, _ in triples])
+    return wanted, nearest_to_rays(centres, rays[:, wanted], weights[:, wanted], ridge=0.0)

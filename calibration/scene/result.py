@@ -4,8 +4,7 @@ left out."""
 from dataclasses import dataclass
 from typing import TypedDict
 
-import numpy as np
-
+from calibration.adjustment.state import rms
 from calibration.scene.covariance import Uncertainty
 from calibration.scene.scale import Scale
 from calibration.scene.structure import Structure
@@ -100,7 +99,7 @@ class SceneCalibration:
         for index, camera in enumerate(self.rig):
             of_camera = self.structure.camera_of == index
             cameras[camera.name] = {
-                "rms_px": _rms(misses[of_camera]),
+                "rms_px": rms(misses[of_camera]),
                 "features": self.features[camera.name],
                 "points": int(of_camera.sum()),
                 "pose_sigma_px": float(self.uncertainty.pose_sigma_px[index]),
@@ -108,7 +107,7 @@ class SceneCalibration:
                 "focal_sigma_px": float(self.uncertainty.focal_sigma_px[index]),
             }
         return {
-            "rms_px": _rms(misses),
+            "rms_px": rms(misses),
             "used_share": len(misses) / max(1, self.matched),
             "noise_px": self.uncertainty.noise_px,
             "points": len(self.structure.points),
@@ -134,7 +133,3 @@ class SceneCalibration:
             "warning_messages": documents_of(self.warnings),
             "rig": document_from_rig(self.rig),
         }
-
-
-def _rms(misses: np.ndarray) -> float:
-    return float(np.sqrt((misses**2).sum(axis=1).mean())) if len(misses) else 0.0

@@ -78,12 +78,6 @@ class FeatureAlignment:
     remarks: tuple[Message, ...]
 
 
-def align_to_features(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> Similarity:
-    """Aligns the mean head to picked feature points, as ``feature_alignment``, and returns only the pose
-    world_from_head. Raises TooFewFeatures or WrongFeatures."""
-    return feature_alignment(model, features, rig, settings).world_from_head
-
-
 def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> FeatureAlignment:
     """Aligns the mean head to picked feature points: rejects outliers, minimises eq. (3), then weighs the points by
     their covariance. Raises TooFewFeatures or WrongFeatures."""

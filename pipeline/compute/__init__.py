@@ -1,4 +1,4 @@
-"""How loops run: compiled and kept by content, shared out over threads, and the arrays that a model alone decides.
+"""How loops run, compiled ahead and shared out over threads, and the arrays that a model alone decides.
 
 Knows nothing of heads or images; every room may use it.
 """

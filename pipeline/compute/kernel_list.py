@@ -16,12 +16,13 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from numba import types
 from numba.core.dispatcher import Dispatcher
 
-from pipeline.compute.jit import KeptFunction, code_size
+from rig.jit import KeptFunction, code_size
 
 LIST = Path(__file__).with_name("kernels.txt")
 PACKAGE = (__package__ or "").rpartition(".")[0] or "pipeline"  # "eigenhead.pipeline" in the wheel
@@ -34,7 +35,7 @@ _NAMED = re.compile(r"([\w.]+):(\w+)\{(.*)\}")
 class Kernel:
     """Holds one compiled function together with the types of its arguments."""
 
-    place: str  # "contour_fit.rim_kernels:see", relative to this package
+    place: str  # "contour_fit.rim_kernels:see", relative to this package; those of ``rig`` have their room before them
     arguments: tuple[str, ...]
 
     @classmethod
@@ -56,7 +57,7 @@ class Kernel:
     def dispatcher(self) -> Dispatcher | None:
         """Returns the compiled function's dispatcher, or None if loops are not compiled (NUMBA_DISABLE_JIT)."""
         module, _, name = self.place.partition(":")
-        function = getattr(importlib.import_module(f"{PACKAGE}.{module}"), name)
+        function = getattr(import_kernels(module), name)
         return function if isinstance(function, Dispatcher) else None
 
     def signature(self) -> tuple[types.Type, ...]:
@@ -83,6 +84,12 @@ class Kernel:
             dispatcher.compile(self.signature())
 
 
+def import_kernels(module: str) -> ModuleType:
+    """Returns a module of the list."""
+    package = PACKAGE.removesuffix("pipeline") if module.startswith("rig.") else f"{PACKAGE}."
+    return importlib.import_module(package + module)
+
+
 def listed_kernels(*, dense: bool = True) -> list[Kernel]:
     """Returns all kernels of the list; with ``dense`` False, without those that only the dense stage calls."""
     plain, _, added = LIST.read_text(encoding="utf-8").partition("\n\n")
@@ -107,7 +114,7 @@ def type_from_text(text: str) -> types.Type:
         return types.UniTuple(_scalar(several[2]), int(several[1]))
     if named := _NAMED.fullmatch(text):
         module, name, inside = named.groups()
-        kind = getattr(importlib.import_module(f"{PACKAGE}.{module}"), name)
+        kind = getattr(import_kernels(module), name)
         found = types.BaseTuple.from_types([type_from_text(each) for each in _members(inside)], kind)
         if found is None:
             raise ValueError(f"{text} is no tuple of a kernel's arguments")

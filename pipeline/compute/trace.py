@@ -1,4 +1,4 @@
-"""What runs on which thread when, recorded for Chrome's trace viewer and Perfetto, and for ``experiments scaling``.
+"""What runs on which thread when, for Chrome's trace viewer and Perfetto, and for the laboratory's ``scaling``.
 
 Nothing is recorded, and nothing but one test is paid, unless a trace is active. Stages, parts of stages, shared loops
 and their slices are spans of one thread each; those of one thread nest. A stage that runs beside others lies in a

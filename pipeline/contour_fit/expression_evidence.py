@@ -19,7 +19,7 @@ from pipeline.estimation.bounded import least_within
 from pipeline.estimation.positive_definite import inverse_diagonal
 
 ROUNDS = 6
-NEUTRAL = 0.2  # sum of weights below which a head makes no face: neutral ones have 0 to 0.13 (experiments expressions)
+NEUTRAL = 0.2  # sum of weights below which a head makes no face: neutral ones have 0 to 0.13 (laboratory's expressions)
 VARIANCE_RANGE = (0.02, 4.0)
 
 

@@ -20,12 +20,12 @@ from jaxtyping import Float, Int
 
 from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
-from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.gaussian_process import SCALES
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
+from rig.mesh import vertex_normals
 
-# Measured on heads of the model's population and of another, with ears and forehead under hair (experiments hidden).
+# Measured on heads of the model's population and of another, with ears and forehead under hair (laboratory's hidden).
 MIN_DETERMINED = 5.0  # coefficients; of fewer the prior's scale is not estimated
 VARIANCE_RANGE = (0.1, 4.0)
 KERNEL_VARIANCE_UNSEEN = 4.0  # hidden skin strays more than seen skin: no landmark holds it in its place

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import placed, turned
+from rig.jit import njit
 
 POSE = 7  # rotation, translation, log scale
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import project, projection_slopes
 from pipeline.imaging.sampling_kernels import cell, sample_row
+from rig.jit import njit
 
 BLOCK = 1024  # faces whose planes stay in the cache while all views look at them
 # Columns of a sample: weight of its edge's second vertex; world point; d(outline along its normal) / d(point), before

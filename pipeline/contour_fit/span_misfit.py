@@ -14,8 +14,8 @@ from pipeline.contour_fit.contour import ContourSolution, finish, run_stage
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import cage_variance, with_estimated_prior
 from pipeline.contour_fit.problem import Stage, widened
-from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.model import HeadModel
+from rig.mesh import vertex_normals
 
 LEVEL, STEPS = "p95", 4  # as the contour solver's own stage with more modes
 

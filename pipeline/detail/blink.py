@@ -15,10 +15,10 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.detail.association import associate
 from pipeline.detail.eyelids import EyeEvidence, Fissure, eye_fissure
 from pipeline.detail.surface_points import SurfacePoints
-from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.expressions import BLINKS, plain_name
 from pipeline.head_model.model import HeadModel
 from pipeline.part_labels.codes import Part
+from rig.mesh import vertex_normals
 
 HALF, OTHERS = 0.5, (0.25, 0.75, 1.0)
 NEAR = 0.6  # of the fissure's length: points about the eye

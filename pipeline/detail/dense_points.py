@@ -12,13 +12,12 @@ from pipeline.compute.trace import traced
 from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import vertex_normals
 from pipeline.part_labels.codes import Part, codes_from_channels
 from pipeline.part_labels.votes import PartVotes, part_shares
 from pipeline.settings import FineSettings
 from pipeline.stereo.depth_map import DepthMap, points_world
 from rig.camera import Camera
-from rig.mesh import Mesh
+from rig.mesh import Mesh, vertex_normals
 
 INSIDE_MM = 4.0  # farther behind the fitted head a point shows something that neither pulls nor bounds it
 EVERY = 4  # vertices of the head stand for the others

@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Int
 from pipeline.detail.association import Target, interpolated
 from pipeline.detail.surface_points import SurfacePoints
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
 from rig.geometry import rotation_from_vector
+from rig.mesh import vertex_normals
 
 ABOUT_MM = 25.0  # points that far from the ear may be its own
 BLEND_MM = 10.0  # over which the head follows

@@ -25,9 +25,9 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.prior_term import weight_slope
 from pipeline.detail.association import associate, interpolated
 from pipeline.estimation.bounded import least_within
-from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.patches import thinned
+from rig.mesh import vertex_normals
 
 SPACING_MM = 2.5  # of the places that are asked
 EVIDENCE = 4  # rounds in which the kernel's variance is estimated

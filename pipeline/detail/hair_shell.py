@@ -15,10 +15,10 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 
 from pipeline.detail.untangling import Topology, topology_of, untangled
-from pipeline.geometry.normals import normals_of, vertex_normals
+from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.part_labels.codes import Part
-from rig.mesh import Mesh
+from rig.mesh import Mesh, vertex_normals
 
 CANDIDATES = 12
 DIRECTION_STEPS = 150  # of averaging normals over neighbours: about 15 mm, so that ears and folds do not spread them

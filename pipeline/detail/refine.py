@@ -37,11 +37,11 @@ from pipeline.detail.solve import (
 from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.detail.untangling import untangled_head
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
 from pipeline.settings import FineSettings
+from rig.mesh import vertex_normals
 from rig.progress import Progress
 
 SEED = 16

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 SIDES, PARTS = 6, 4  # main directions of a normal; codes of ``Part``, at most
 

@@ -24,10 +24,10 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.contour_fit.fit import Fit
-from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.gaussian_process import SCALES
 from pipeline.head_model.model import HeadModel
 from rig.geometry import cross_matrix
+from rig.mesh import vertex_normals
 
 DISTANCES: Mapping[str, tuple[str, str]] = {
     "head_breadth": ("euryon_right", "euryon_left"),

@@ -33,7 +33,7 @@ from pipeline.faces.limbus_fit import (
 )
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS
-from rig.geometry import cross_matrix, rotation_from_vector
+from rig.geometry import cross_matrix, nearest_to_rays, rotation_from_vector
 from rig.image import ImageRgb
 from rig.rig import Rig
 
@@ -243,11 +243,9 @@ def _nearest_to_rays(seen: Sequence[EyeSight], start: Float[np.ndarray, " 3"]) -
     ``CENTRE_STD_MM``."""
     rays = np.concatenate([each.view.camera.rays_world(each.network_px[None]) for each in seen])
     centres = np.array([each.view.camera.centre_world for each in seen])
-    off = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     point = start
     for _ in range(10):
-        miss = np.linalg.norm(np.einsum("nij,nj->ni", off, point - centres), axis=1)
-        weights = 1.0 / (1.0 + (miss / 1.0) ** 2)
-        matrix = np.einsum("n,nij->ij", weights, off) + np.eye(3) / CENTRE_STD_MM**2
-        point = np.linalg.solve(matrix, np.einsum("n,nij,nj->i", weights, off, centres) + start / CENTRE_STD_MM**2)
+        miss = np.linalg.norm(np.cross(rays, point - centres), axis=1)
+        # About ``start`` the ridge is the prior.
+        point = start + nearest_to_rays(centres - start, rays, 1.0 / (1.0 + miss**2), ridge=CENTRE_STD_MM**-2)
     return point

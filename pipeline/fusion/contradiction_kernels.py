@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.fusion.vote_kernels import (
     CENTRE,
     FRAME,
@@ -16,6 +15,7 @@ from pipeline.fusion.vote_kernels import (
     seen_at,
 )
 from pipeline.geometry.projection_kernels import LENS, NEAREST_MM
+from rig.jit import njit
 
 BLOCK = 4  # pixels along the side of what is decided at once
 STRIDE = 3  # every third pixel of every third row stands for the others

@@ -7,8 +7,8 @@ touching does not count.
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.cell_kernels import COLUMNS, columns_about
+from rig.jit import njit
 
 
 @njit(cache=True, nogil=True)

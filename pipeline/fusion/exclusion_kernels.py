@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.fusion.vote_kernels import FRAME, OUTLINE, PIXEL_STEP, Pixels, nearest_pixel, seen_at
 from pipeline.geometry.projection_kernels import LENS, NEAREST_MM
+from rig.jit import njit
 
 BLOCK = 3  # nodes along the side of a block
 STRETCH = 1.5  # most by which a lens lengthens a way on the photograph, that to the corner of a pixel included

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.surface_nets_kernels import corners_of
+from rig.jit import njit
 
 
 @njit(cache=True, nogil=True)

@@ -8,8 +8,8 @@ that holds.
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.surface_nets_kernels import corners_of
+from rig.jit import njit
 
 SQUARES = np.array(
     [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]], np.int64

@@ -15,7 +15,7 @@ ALONE_MM = 0.3  # of what a single view says, beside its own deviation: nobody c
 EDGE_MM, SLOPE, MAX_MM = 1.5, 0.25, 15.0  # a guess at the edge of what is seen, its growth with the distance, its end
 EVERY = 4  # seen vertices stand for the others
 # Smaller patches that views agree on, with nothing seen about them, are often chance: without this the farthest places
-# of `eigenhead experiments planted` are six times as far off.
+# of the laboratory's `planted` are six times as far off.
 ISLAND_MM2 = 100.0
 
 

@@ -11,8 +11,7 @@ from pipeline.compute.trace import traced
 from pipeline.fusion.refinement_kernels import measure, smooth_offsets
 from pipeline.fusion.view_stack import ViewStack
 from pipeline.geometry.fans import corners_at_vertices
-from pipeline.geometry.normals import vertex_normals
-from rig.mesh import Mesh
+from rig.mesh import Mesh, vertex_normals
 
 GATE_STEPS = 1.5  # a view that is farther off shows another surface
 AGREEMENT_MM = 1.0  # of views, for the same surface

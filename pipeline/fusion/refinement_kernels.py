@@ -3,7 +3,6 @@ offsets."""
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.fusion.vote_kernels import (
     FLATTEST,
     MAX_VIEWS,
@@ -20,6 +19,7 @@ from pipeline.fusion.vote_kernels import (
 )
 from pipeline.geometry.projection_kernels import NEAREST_MM
 from pipeline.imaging.sampling_kernels import bilinear
+from rig.jit import njit
 
 TURNED = 0.4  # cosine between the normals of a vertex and of a pixel below which the pixel shows another surface
 STEP_MM = 4.0  # four pixels that differ by more in depth show two surfaces

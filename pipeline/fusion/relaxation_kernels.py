@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 
 class Membrane(NamedTuple):

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.fusion.vote_kernels import FRAME, OUTLINE, PIXEL_STEP
 from pipeline.geometry.projection_kernels import distorted
 from pipeline.imaging.sampling_kernels import held, sample
+from rig.jit import njit
 
 
 @njit(cache=True, nogil=True)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, pinhole, placed
+from rig.jit import njit
 
 NORMAL, SIGMA, OUTLINE, FRAME = 0, 3, 4, 5  # columns of ``Pixels.shown``; the normal has three
 # What one step of a column is: a thousandth of a millimetre and a 32nd of a pixel are far below what is measured.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 COLUMNS = 9  # of three cells each: those about a cell, and it
 

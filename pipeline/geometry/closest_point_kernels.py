@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 
 class FannedMesh(NamedTuple):

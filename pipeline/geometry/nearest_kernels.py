@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 LEAF = 12  # points of a leaf, at most; with 4 to 24 it is as fast
 DEEPEST = 64  # nodes that wait at once, more than any tree is deep

@@ -8,7 +8,7 @@ calling loop's, fast or strict. Only ``distorted`` is always fast: strict, it ma
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 LENS = 12  # entry of a row at which the lens begins
 NOWHERE = 1e9  # a pixel outside of every image

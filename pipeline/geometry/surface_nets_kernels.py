@@ -3,7 +3,7 @@ grid."""
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 EDGES = np.array(
     [[0, 4], [1, 5], [2, 6], [3, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 1], [2, 3], [4, 5], [6, 7]], np.int64

@@ -22,7 +22,7 @@ def noise_level(grey: Float32[np.ndarray, "h w"]) -> float:
 def blur_growth(noise: float) -> float:
     """Returns the factor by which a photograph with this noise is blurred more before matching: 1 up to
     ``QUIET_LEVELS``. Noise first hides the finest relief of smooth skin. (Measured by ``python -m
-    tests.laboratory.benchmarks.captures --noise 6``.)"""
+    tests.laboratory captures --noise 6``.)"""
     return max(noise / QUIET_LEVELS, 1.0) ** 0.4
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
-from pipeline.geometry.normals import facing_cosine, normals_of
+from pipeline.geometry.normals import facing_cosine
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import interpolate, rasterise
@@ -92,7 +92,7 @@ def without_highlights(
     cameras = [camera for camera in rig if camera.name in images and silhouettes[camera.name].quality.usable]
     if len(cameras) < MIN_VIEWS:
         return out
-    normals = normals_of(head_world)
+    normals = head_world.normals()
     sights = map_in_threads(
         lambda k: _seen(cameras[k], images[cameras[k].name], silhouettes[cameras[k].name], head_world, normals),
         len(cameras),

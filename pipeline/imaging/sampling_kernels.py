@@ -7,7 +7,7 @@ Four neighbouring pixels are named ``a b`` above ``c d``; ``right`` and ``down``
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 INSIDE = 1.001  # px before an image's far edge where places beyond are held: all four neighbours are then inside
 

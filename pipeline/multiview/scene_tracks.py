@@ -18,6 +18,7 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.scene_points import neighbouring_pairs
 from rig.camera import Camera
+from rig.geometry import nearest_to_rays
 from rig.image import ImageRgb
 from rig.rig import Rig
 
@@ -81,15 +82,13 @@ def find_tracks(
 def misses_px(tracks: SceneTracks, rig: Rig) -> Float[np.ndarray, "n 2"]:
     """Returns the reprojection error of each observation, measured minus projected: each point is placed where it is
     nearest to all its rays. NaN where a pixel lies outside what the lens can show."""
-    rays, centres = np.zeros((len(tracks.points), 3)), np.zeros((len(tracks.points), 3))
+    rays, weights = np.zeros((len(rig), tracks.count, 3)), np.zeros((len(rig), tracks.count))
     for number, camera in enumerate(rig):
         observed = tracks.cameras == number
-        rays[observed], centres[observed] = camera.rays_world(tracks.pixels[observed]), camera.centre_world
-    across = np.eye(3) - rays[:, :, None] * rays[:, None]
-    matrix, right = np.zeros((tracks.count, 3, 3)), np.zeros((tracks.count, 3))
-    np.add.at(matrix, tracks.points, across)
-    np.add.at(right, tracks.points, np.einsum("nij,nj->ni", across, centres))
-    points = np.linalg.solve(matrix, right[..., None])[..., 0][tracks.points]
+        rays[number, tracks.points[observed]] = camera.rays_world(tracks.pixels[observed])
+        weights[number, tracks.points[observed]] = 1.0
+    centres = np.stack([camera.centre_world for camera in rig])
+    points = nearest_to_rays(centres, rays, weights, ridge=0.0)[tracks.points]
     missed = np.zeros((len(tracks.points), 2))
     for number, camera in enumerate(rig):
         observed = tracks.cameras == number

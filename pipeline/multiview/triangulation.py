@@ -14,6 +14,7 @@ from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.terms import Problem, Residuals
 from rig.camera import Camera, CameraStack
 from rig.errors import EigenheadError
+from rig.geometry import ray_equations
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -82,7 +83,10 @@ def triangulate(
     picked = np.array([np.asarray(pixel, float) for pixel in pixels.values()])
     term = ReprojectionTerm(picked, CameraStack.of([rig[name] for name in pixels]), noise_px)
     problem = Problem((term,), 3, np.add)
-    start = _start(rays_of(pixels, rig) if rays_world is None else {name: rays_world[name] for name in pixels}, rig)
+    rays = rays_of(pixels, rig) if rays_world is None else rays_world
+    start = _nearest_to_rays(
+        np.stack([rig[name].centre_world for name in pixels]), np.stack([rays[name] for name in pixels])[:, None]
+    )[0]
     at_start = problem.at(start)
     if not np.isfinite(at_start.cost):
         raise NoPoint(compose("point-behind-camera"))
@@ -125,7 +129,12 @@ def triangulate_many(
 
     Raises NoPoint if a point's rays are parallel, if it lies behind a camera, or if a pixel lies outside its lens.
     """
-    points = _nearest_to_rays(pixels, cameras, noise_px) if start is None else start
+    if start is None:
+        rays = np.stack([camera.rays_world(seen) for camera, seen in zip(cameras, pixels, strict=True)])
+        shares = 1.0 / noise_px**2
+        shares /= shares.sum(axis=0)
+        start = _nearest_to_rays(np.stack([camera.centre_world for camera in cameras]), rays, shares)
+    points = start
     weights = 1.0 / noise_px[..., None]
     at_points = _whitened(points, pixels, cameras, weights)
     if not np.isfinite(at_points[0]).all():
@@ -152,22 +161,18 @@ def triangulate_many(
 
 
 def _nearest_to_rays(
-    pixels: Float[np.ndarray, "v n 2"], cameras: Sequence[Camera], noise: Float[np.ndarray, "v n"]
+    centres_world: Float[np.ndarray, "v 3"],
+    rays_world: Float[np.ndarray, "v n 3"],
+    weights: Float[np.ndarray, "v n"] | None = None,
 ) -> Float[np.ndarray, "n 3"]:
     """Returns, for each point, the place with the least weighted sum of squared distances to its rays. Raises
     NoPoint."""
-    rays_world = np.stack([camera.rays_world(seen) for camera, seen in zip(cameras, pixels, strict=True)])
-    centres_world = np.stack([camera.centre_world for camera in cameras])
     if not np.isfinite(rays_world).all():
         raise NoPoint(compose("point-outside-lens"))
-    weights = 1.0 / noise**2
-    weights = weights / weights.sum(axis=0)
-    off_rays = np.eye(3) - rays_world[..., :, None] * rays_world[..., None, :]
-    normal = np.einsum("vn,vnij->nij", weights, off_rays)
-    if np.linalg.eigvalsh(normal)[:, 0].min() < MIN_RAYS_APART**2:
+    matrix, right = ray_equations(centres_world, rays_world, weights)
+    if np.linalg.eigvalsh(matrix)[:, 0].min() < MIN_RAYS_APART**2:
         raise NoPoint(compose("point-rays-parallel"))
-    right = np.einsum("vn,vnij,vj->ni", weights, off_rays, centres_world)
-    return np.linalg.solve(normal, right[..., None])[..., 0]
+    return np.linalg.solve(matrix, right[..., None])[..., 0]
 
 
 def _whitened(
@@ -183,18 +188,3 @@ def _whitened(
     residual = np.where(counts, weights * (np.stack(projected) - pixels), 0.0)
     slopes = np.where(counts[..., None], weights[..., None] * np.stack(slopes), 0.0)
     return np.where(np.isfinite(residual), residual, np.inf), slopes
-
-
-def _start(rays_world: Mapping[str, Float[np.ndarray, " 3"]], rig: Rig) -> Float[np.ndarray, " 3"]:
-    """Returns the point with the least sum of squared distances to the rays. Raises NoPoint."""
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for name, ray in rays_world.items():
-        off_ray = np.eye(3) - np.outer(ray, ray)
-        normal += off_ray
-        right += off_ray @ rig[name].centre_world
-    if not np.isfinite(normal).all():
-        raise NoPoint(compose("point-outside-lens"))
-    # The smallest eigenvalue is the sum of squared sines between the rays and their mean direction.
-    if np.linalg.eigvalsh(normal)[0] < MIN_RAYS_APART**2:
-        raise NoPoint(compose("point-rays-parallel"))
-    return np.linalg.solve(normal, right)

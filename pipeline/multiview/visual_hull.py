@@ -19,6 +19,7 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull_kernels import COARSE, carve_view, mark_occupied
 from rig.camera import Camera
 from rig.errors import EigenheadError
+from rig.geometry import nearest_to_rays
 from rig.mesh import Mesh
 from rig.messages.message import compose
 from rig.rig import Rig
@@ -47,20 +48,17 @@ def mask_extent(masks: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig) -> tuple
     The centre is the point nearest to the rays through the masks' middles; the edge is the largest diagonal of a mask
     at that depth. Without any mask, the centre is the point that the cameras are directed at, and the edge 400 mm.
     """
-    normal, right, views = 1e-9 * np.eye(3), np.zeros(3), []
+    views, rays = [], []
     for name, mask in masks.items():
         camera = rig[name]
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         scale = camera.intrinsics.width / mask.shape[1]
         middle = np.array([[(columns[0] + columns[-1]) / 2, (rows[0] + rows[-1]) / 2]])
-        ray = camera.rays_world((middle + 0.5) * scale - 0.5)[0]
-        across = np.eye(3) - np.outer(ray, ray)
-        normal += across
-        right += across @ camera.centre_world
+        rays.append(camera.rays_world((middle + 0.5) * scale - 0.5)[0])
         views.append((camera, scale * np.hypot(np.ptp(rows), np.ptp(columns))))
     if not views:
         return rig.centre_world(), 400.0
-    centre = np.linalg.solve(normal, right)
+    centre = nearest_to_rays(np.stack([camera.centre_world for camera, _ in views]), np.stack(rays))
     return centre, float(max(diagonal * depth_of(camera, centre) / camera.intrinsics.fx for camera, diagonal in views))
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, distorted, placed
 from pipeline.imaging.sampling_kernels import sample
+from rig.jit import njit
 
 COARSE = 4  # fine cells along the side of a coarse one
 

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import normals_of
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.imaging.colour_balance import balance
@@ -85,7 +84,7 @@ def head_guide(
     border = vertices[np.unique(mesh.faces[mixed])]
     distance = nearest(PointTree.of(border), vertices)[0] if len(border) else np.full(len(vertices), 1e3)
     into_face, height = np.where(face_region, distance, -distance), (vertices - chin) @ up
-    downward = np.clip(-(normals_of(mesh) @ up - DOWNWARD[0]) / (DOWNWARD[0] - DOWNWARD[1]), 0.0, 1.0)
+    downward = np.clip(-(mesh.normals() @ up - DOWNWARD[0]) / (DOWNWARD[0] - DOWNWARD[1]), 0.0, 1.0)
     feature, underside = _features(vertices, landmarks, up), downward * np.clip(into_face / 20.0 + 2.0, 0.0, 1.0)
     across = np.abs((vertices - eyes) @ left) / float(left @ left)
     low, high = float((landmarks["subnasale"] - chin) @ up), float((eyes - chin) @ up)
@@ -194,7 +193,7 @@ def _gains(
     """Returns the linear gain of every camera's colours, estimated from parts of the face that several cameras see."""
     rows = np.flatnonzero(head.into_face_mm > 0)
     rows = rows[:: max(1, len(rows) // BALANCE_VERTICES)]
-    points, normals = head.mesh.vertices[rows], normals_of(head.mesh)[rows]
+    points, normals = head.mesh.vertices[rows], head.mesh.normals()[rows]
     weights = np.zeros((len(cameras), len(rows)), np.float32)
     colours = np.zeros((len(cameras), len(rows), 3), np.float32)
     for k, (camera, size, picture, depth) in enumerate(zip(cameras, sizes, light, depths, strict=True)):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 
 @njit(cache=True, nogil=True, fastmath=True)

@@ -3,9 +3,9 @@ each, a = 2 v image axes."""
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import placed, projection_slopes, turned
 from pipeline.photometric_fit.correlation_kernels import read
+from rig.jit import njit
 
 
 @njit(cache=True, nogil=True, fastmath=True)

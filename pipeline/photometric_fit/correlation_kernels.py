@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from pipeline.compute.jit import njit
 from pipeline.imaging.sampling_kernels import held, sample_row
+from rig.jit import njit
 
 
 class Samples(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from pipeline.compute.threads import map_in_threads
 from pipeline.contour_fit.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.contour_fit.rim import Views
-from pipeline.geometry.normals import facing_cosine, normals_of
+from pipeline.geometry.normals import facing_cosine
 from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import rasterise
@@ -102,7 +102,7 @@ def visibility_of(
         speaks: which views have a photograph with texture; the others see nothing.
         settings: margins.
     """
-    normals = normals_of(head_world)
+    normals = head_world.normals()
     points, outward = patches.points(head_world.vertices), patches.normals(normals)
 
     def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -288,7 +288,7 @@ def head_depth_factor(
 ) -> float:
     """Returns the median of ``depth_factor`` over the vertices ``face`` of a head (mm). Each vertex counts as seen by
     its ``views_most`` most frontal cameras; what may hide it is ignored. Returns 1 if no vertex faces two cameras."""
-    points, normals = head_world.vertices[face], normals_of(head_world)[face]
+    points, normals = head_world.vertices[face], head_world.normals()[face]
     centres = np.array([camera.centre_world for camera in cameras])
     towards = centres[None] - points[:, None]
     cosine = np.einsum("ckx,cx->ck", towards, normals) / np.linalg.norm(towards, axis=2)

@@ -13,8 +13,8 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int, Int32
 from scipy.spatial import KDTree
 
-from pipeline.geometry.normals import vertex_normals
 from pipeline.head_model.model import HeadModel
+from rig.mesh import vertex_normals
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.geometry.normals import normals_of
 from pipeline.geometry.raster import picture
 from pipeline.results.overlays import PAPER, Resized
 from rig.camera import Camera, Intrinsics
@@ -57,6 +56,6 @@ def lit(
     mesh: Mesh, colours: UInt8[np.ndarray, "v 3"] | None = None, darkest: float = DARKEST
 ) -> UInt8[np.ndarray, "v 3"]:
     """Returns the colours of the vertices (clay if None) shaded by the lamp."""
-    cosine: Float[np.ndarray, " v"] = np.clip(normals_of(mesh) @ (LAMP / np.linalg.norm(LAMP)), 0.0, 1.0)
+    cosine: Float[np.ndarray, " v"] = np.clip(mesh.normals() @ (LAMP / np.linalg.norm(LAMP)), 0.0, 1.0)
     base = SKIN if colours is None else colours.astype(float)
     return np.clip(base * (darkest + (1.0 - darkest) * cosine[:, None]), 0, 255).astype(np.uint8)

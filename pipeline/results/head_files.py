@@ -12,21 +12,25 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
-from pipeline.results.metadata import asset_extras, ply_comments
-from pipeline.results.printable import printable
+from pipeline.head_model.subdivision import boundary_loops, close_loop
+from pipeline.results.metadata import QUALITY, asset_extras, ply_comments
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.results.set_files import strength_png, write_set_textures
 from pipeline.results.skin_files import write_skin_maps
+from pipeline.texturing.chart_colours import CODES, ENCODED
 from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.sets.specular import Specular
+from pipeline.texturing.sets.texture_sets import SetTextures
+from pipeline.texturing.visibility import LINEAR
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.glb import Skin, glb_bytes
 from rig.formats.meshes.obj import mtl_bytes, obj_bytes, textured_obj_bytes
 from rig.formats.meshes.ply import write_ply
 from rig.formats.meshes.printing import stl_bytes, threemf_bytes
 from rig.formats.meshes.usdz import usdz_bytes
+from rig.formats.pictures.exr import write_exr
 from rig.mesh import Mesh
 
 JPEG_OPTIONS = (
@@ -37,6 +41,8 @@ ENCODINGS = {
     "webp": (".webp", "image/webp", (cv2.IMWRITE_WEBP_QUALITY, 92)),
     "png": (".png", "image/png", (cv2.IMWRITE_PNG_COMPRESSION, 6)),
 }
+FAN_MM = 15.0  # a border that reaches so far to all sides is the neck's: it is closed by a fan about its middle
+PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # level 6 takes four times as long for a tenth of the size
 
 
 def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
@@ -48,7 +54,7 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         result: what is written.
         head: the head's mesh in the head frame, mm.
     """
-    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.written, result.texturing.atlas
+    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.formats, result.texturing.atlas
     named = atlas is not None and outputs.ply_texture
     corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
     write_ply(
@@ -59,7 +65,7 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         quality=result.refined.deviation_mm.astype(np.float32),
         views=result.texturing.vertices.views,
         corner_uv=corner_uv,
-        comments=[*ply_comments(result), *(["TextureFile head.png"] if named else [])],
+        comments=[*ply_comments(result), QUALITY, *(["TextureFile head.png"] if named else [])],
     )
     if atlas is not None and (named or "obj" in formats):
         write_atomically(folder / "head.png", encoded(atlas, "png"))
@@ -132,3 +138,52 @@ def encoded(atlas: Atlas, kind: str) -> bytes:
     stored: UInt8[np.ndarray, "s s 3"] = np.ascontiguousarray(atlas.image[:, :, ::-1])  # it is kept blue first
     _, data = cv2.imencode(suffix, stored, list(options))
     return data.tobytes()
+
+
+def printable(head: Mesh) -> Mesh:
+    """Returns the head (head frame, mm) as a closed mesh for printing: z up, standing on z = 0.
+
+    The neck is closed by triangles around the middle of its border; open lids and lips are closed by a strip from
+    corner to corner. Raises NotAManifold if a border touches itself.
+    """
+    vertices, added = [head.vertices], [head.faces]
+    count = len(head.vertices)
+    for loop in boundary_loops(head.faces):
+        border = head.vertices[loop]
+        if np.ptp(border, axis=0).min() < FAN_MM and np.ptp(border[:, [0, 2]], axis=0).min() < 2 * FAN_MM:
+            added.append(close_loop(head.vertices, loop))
+            continue
+        ring = np.array(loop)
+        added.append(np.stack([np.roll(ring, -1), ring, np.full(len(ring), count)], axis=1).astype(np.int32))
+        vertices.append(border.mean(axis=0, keepdims=True))
+        count += 1
+    points = np.concatenate(vertices)[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
+    points[:, 2] -= points[:, 2].min()
+    return Mesh(points, np.concatenate(added))
+
+
+def write_set_textures(folder: Path, sets: SetTextures) -> None:
+    """Writes the textures below ``folder``, each under a temporary name first. Raises OSError."""
+    for name, atlas in sets.atlases.items():
+        _write_png(folder / "sets" / f"{name}.png", atlas.image)
+    if sets.specular is not None and sets.diffuse is not None:
+        _write_png(folder / "diffuse.png", sets.diffuse.image)
+        write_exr(folder / "diffuse.exr", LINEAR[sets.diffuse.image])
+        light = sets.specular.light.astype(np.float32)
+        _write_png(folder / "specular.png", _encode_light(light))
+        write_exr(folder / "specular.exr", light)
+
+
+def strength_png(specular: Specular) -> bytes:
+    """Returns glTF's specular strength as a PNG whose alpha it is; the colours of the pixels are white."""
+    alpha = specular.strength()
+    return cv2.imencode(".png", cv2.merge([np.full_like(alpha, 255)] * 3 + [alpha]), PNG_SPEED)[1].tobytes()
+
+
+def _encode_light(light: Float[np.ndarray, "s s 3"]) -> UInt8[np.ndarray, "s s 3"]:
+    return ENCODED[(CODES * np.clip(light, 0.0, 1.0) + 0.5).astype(np.int32)]
+
+
+def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"]) -> None:
+    stored = np.ascontiguousarray(image[:, :, ::-1])
+    write_atomically(path, cv2.imencode(".png", stored, PNG_SPEED)[1].tobytes())

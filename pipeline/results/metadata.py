@@ -8,9 +8,11 @@ from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import document_from_settings
 from rig.digest import document_sha256
 
+QUALITY = "quality is the posterior standard deviation in mm, views the number of images that coloured a vertex"
+
 
 def ply_comments(result: Reconstruction) -> list[str]:
-    """Returns the comment lines for the headers of head.ply and bust.ply."""
+    """Returns the comment lines that the headers of a result's PLY and OBJ files share."""
     return [
         "unit mm",
         "frame world",
@@ -18,7 +20,6 @@ def ply_comments(result: Reconstruction) -> list[str]:
         f"job inputs sha256 {document_sha256(result.digests)}",
         f"job settings sha256 {document_sha256(document_from_settings(result.settings))}",
         f"version eigenhead {version('eigenhead')}",
-        "quality is the posterior standard deviation in mm, views the number of images that coloured a vertex",
     ]
 
 

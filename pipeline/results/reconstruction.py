@@ -22,7 +22,7 @@ from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Reconstruction:
     """Holds everything that a reconstruction produced: the products of all stages, with the textured head in the world
     frame and its evidence."""

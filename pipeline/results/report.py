@@ -8,22 +8,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.templates.header import TemplateHeader
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.expression import BlendshapeRig, Found
+from pipeline.evidence.gaze import angles_deg
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.faces.detection import FaceDetection
+from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.faces.subject import SubjectFaces
 from pipeline.imaging.silhouette import Silhouette, ViewQuality
 from pipeline.part_labels.votes import PART_NAMES
-from pipeline.results.eye_report import eyes_document
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report_types import (
     FORMAT,
     BustReport,
     CameraReport,
     ExpressionReport,
+    EyeReport,
     FaceReport,
+    GazeReport,
     HairReport,
     MorphsReport,
     PoseReport,
@@ -32,7 +34,6 @@ from pipeline.results.report_types import (
     SimilarityReport,
     SkinReport,
     SpecularReport,
-    TemplateReport,
     TextureReport,
     ViewReport,
 )
@@ -54,11 +55,8 @@ from rig.messages.message import documents_of, texts_of
 ON_CHART, MEAN_ONE = "the chart's white is white", "the mean over the sphere is 1 in each channel"
 
 
-def report_document(
-    result: Reconstruction, template: TemplateHeader | None = None, flame: Mapping[str, float] | None = None
-) -> Report:
-    """Returns the report as JSON types. Every number is finite; unknown ones are None. ``template`` is the template in
-    whose vertex order the head was also written, ``flame`` the figures of its FLAME model's fit."""
+def report_document(result: Reconstruction) -> Report:
+    """Returns the report as JSON types. Every number is finite; unknown ones are None."""
     head, evidence, refined = result.head, result.evidence, result.refined
     document: Report = {
         "format": FORMAT,
@@ -82,7 +80,7 @@ def report_document(
         "coefficients": _shape_coefficients(head),
         "expression": [_expression(found) for found in evidence.expression],
         "morphs": None if evidence.blendshape_rig is None else _morphs(evidence.blendshape_rig),
-        "template": None if template is None else _template(template, flame),
+        "template": None,
         "world_from_head": similarity_document(head.fit.world_from_head),
         "landmarks": {
             name: {"position": _numbers(mark.position_mm), "std": _optional_numbers(mark.std_mm)}
@@ -176,18 +174,6 @@ def _expression(found: Found) -> ExpressionReport:
 def _morphs(blendshape_rig: BlendshapeRig) -> MorphsReport:
     used = {name: weight for name, weight in blendshape_rig.weights.items() if weight}
     return {"weights": used, "without_counterpart": list(blendshape_rig.missing)}
-
-
-def _template(template: TemplateHeader, flame: Mapping[str, float] | None) -> TemplateReport:
-    figures: TemplateReport = {
-        "name": template.name,
-        "source": template.source,
-        "sha256": template.source_sha256,
-        "registration": dict(template.figures),
-    }
-    if flame is not None:
-        figures["flame"] = dict(flame)
-    return figures
 
 
 def similarity_document(transform: Similarity) -> SimilarityReport:
@@ -309,3 +295,39 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def eyes_document(eyes: Mapping[str, Iris | UnseenEye], world_from_head: Similarity) -> dict[str, EyeReport]:
+    """Describes the eyes by side."""
+    return {side: _eye(eye, world_from_head) for side, eye in eyes.items()}
+
+
+def _eye(eye: Iris | UnseenEye, world_from_head: Similarity) -> EyeReport:
+    if isinstance(eye, UnseenEye):
+        return {
+            "seen": False,
+            "cause": eye.cause,
+            "iris": None,
+            "radius": None,
+            "gaze": None,
+            "std_deg": None,
+            "rig": None,
+            "face": None,
+            "views": [],
+        }
+    return {
+        "seen": True,
+        "cause": None,
+        "iris": {"position": eye.centre.tolist(), "std": eye.centre_std_mm.tolist()},
+        "radius": {"value": eye.radius_mm, "std": float(np.sqrt(eye.covariance[6, 6]))},
+        "gaze": eye.gaze.tolist(),
+        "std_deg": eye.gaze_std_deg,
+        "rig": _direction(eye.gaze),
+        "face": _direction(world_from_head.rotation.T @ eye.gaze),
+        "views": list(eye.views),
+    }
+
+
+def _direction(gaze: Float[np.ndarray, " 3"]) -> GazeReport:
+    azimuth, elevation = angles_deg(gaze)
+    return {"azimuth_deg": azimuth, "elevation_deg": elevation}

@@ -254,3 +254,9 @@ class Report(TypedDict):
     settings: dict[str, object]
     inputs: dict[str, str]
     warnings: list[MessageDocument]
+
+
+class AddedReport(TypedDict, total=False):
+    """Declares the fields of the report that writers beside the method's own may fill; they are None without."""
+
+    template: TemplateReport

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, distorted, placed
+from rig.jit import njit
 
 MAX_DISSENT = 3  # more dissent than this is not counted
 MIN_WITNESSES = 4  # cameras that must see a point before it can be allowed

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.imaging.sampling_kernels import bilinear
+from rig.jit import njit
 
 OTHER = 10.0  # log odds that a pixel must show against every mixture before it is taken for another colour
 # q by alpha, at most: two standard deviations of the subject's brightness. What is brighter at the rim is a highlight:

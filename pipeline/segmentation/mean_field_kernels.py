@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 MAX_ODDS = 6.0  # log odds are clipped there, so that one pixel cannot outvote its eight neighbours for ever
 

@@ -15,7 +15,7 @@ from pipeline.multiview.upright import guessed_up
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.faces import Faces
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
@@ -50,7 +50,6 @@ def front_camera(rig: Rig, settings: Settings) -> str:
     return settings.front
 
 
-@stage("alignment")
 def align_head(context: ReconstructionContext, views: Views, faces: Faces) -> Staged[Alignment]:
     """Aligns the mean head to the capture's feature points; without these, to the subject's face in the photographs;
     and without a face, to the silhouettes. Refuses with TooFewFeatures, WrongFeatures, NoSubject."""

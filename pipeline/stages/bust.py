@@ -11,17 +11,16 @@ from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.silent_hair import find_silent_hair
 from pipeline.fusion.skin import measured_skin
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import normals_of, vertex_normals
 from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth
 from pipeline.stages.part_labels import PartLabels
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
-from rig.mesh import Mesh
+from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose
 
 
@@ -43,7 +42,6 @@ class Bust:
         return self.surface.mesh_world
 
 
-@stage("bust")
 def fuse_depth(
     context: ReconstructionContext, views: Views, head_world: Mesh, labels: PartLabels, depth: Depth
 ) -> Staged[DepthSurface | None]:
@@ -73,7 +71,6 @@ def fuse_depth(
     return Staged(surface, surface.warnings)
 
 
-@stage("bust")
 def shape_bust(
     context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
 ) -> Staged[BustSurface | None]:
@@ -88,7 +85,6 @@ def shape_bust(
     return Staged(finished(fused, depth.votes, skin, views.silhouettes, context.rig))
 
 
-@stage("bust")
 def colour_bust(
     context: ReconstructionContext, views: Views, surface: BustSurface | None, coloured: Capture
 ) -> Staged[Bust | None]:
@@ -96,7 +92,7 @@ def colour_bust(
     if surface is None:
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, surface.mesh_world
-    normals, depths = normals_of(mesh), depth_maps(rig, mesh)
+    normals, depths = mesh.normals(), depth_maps(rig, mesh)
     colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
     return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 
@@ -111,7 +107,6 @@ class HairyHead:
     views: UInt8[np.ndarray, " v"]
 
 
-@stage("bust")
 def push_out_hair(context: ReconstructionContext, refined: RefinedHead, bust: Bust | None) -> Staged[HairyHead | None]:
     """Pushes the delivered head out to the bust's hair, if the settings ask for it. Returns None otherwise, and without
     a bust. Warns ``hair-beyond-head`` where the head's vertices do not reach the hair."""

@@ -16,7 +16,7 @@ from pipeline.settings import FINE_LEVELS, Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.estimate import estimate_depth
@@ -42,7 +42,6 @@ def is_refined(head: HeadFit, settings: Settings) -> bool:
     return head.detail.level == "photo" and settings.detail in FINE_LEVELS
 
 
-@stage("depth")
 def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, labels: PartLabels) -> Staged[Depth]:
     """Measures depth in every view if a later stage needs it. The fitted head limits the depths to search."""
     settings, mesh = context.settings, head.mesh_world

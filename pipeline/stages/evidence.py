@@ -36,7 +36,7 @@ from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
@@ -60,7 +60,6 @@ class Evidence:
     blendshape_rig: BlendshapeRig | None  # where the settings ask for it
 
 
-@stage("evidence")
 def judge_head(
     context: ReconstructionContext,
     views: Views,

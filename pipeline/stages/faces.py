@@ -9,7 +9,7 @@ from pipeline.faces.irises import Iris, UnseenEye, find_irises
 from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import SubjectFaces, find_subject
 from pipeline.stages.context import ReconstructionContext
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from rig.capture import Capture
 
 
@@ -26,7 +26,6 @@ class Faces:
     eyes: Mapping[str, Iris | UnseenEye] = field(default_factory=dict)
 
 
-@stage("faces")
 def find_faces(context: ReconstructionContext, capture: Capture) -> Staged[Faces]:
     """Finds the subject's face in every photograph that shows it."""
     if not context.settings.faces.find:

@@ -23,7 +23,7 @@ from pipeline.simplex.hierarchy import fit_simplex
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.part_labels import PartLabels
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
 from pipeline.warnings import Detail
 from rig.mesh import Mesh
@@ -66,7 +66,6 @@ def fitted_mesh(model: HeadModel, fit: Fit) -> Mesh:
     return Mesh(fit.world_from_head.apply(model.vertices(fit.coefficients)), model.levels["full"].faces)
 
 
-@stage("fit")
 def fit_outlines(
     context: ReconstructionContext, views: Views, alignment: Alignment, cap: Cap | None
 ) -> Staged[OutlineFit]:
@@ -106,7 +105,6 @@ def fit_outlines(
     return Staged(OutlineFit(solved, model, Mesh(vertices_world, model.levels["full"].faces)))
 
 
-@stage("fit")
 def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels) -> Staged[HeadFit]:
     """Refines the fit with the photographs inside the outlines, to the level of detail that settings and photographs
     allow."""

@@ -15,7 +15,7 @@ from pipeline.part_labels.labelling import PartMap, classify_parts
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
 from rig.colour_space import linear_from_srgb, srgb_from_text
 from rig.mesh import Mesh
@@ -61,7 +61,6 @@ class OnePart(Mapping[str, Float32[ndarray, "_ _"]]):
         return len(self.maps)
 
 
-@stage("alignment")
 def find_worn_cap(context: ReconstructionContext, views: Views, alignment: Alignment) -> Staged[Cap | None]:
     """Finds the cap that the settings name by its colour in the photographs, on the mean head at its pose. Returns None
     if they name none, and with the warning ``cap-not-found`` where the photographs do not show it."""
@@ -85,7 +84,6 @@ def find_worn_cap(context: ReconstructionContext, views: Views, alignment: Align
     return Staged(None, [compose("cap-not-found", colour=settings.colour, share=cap.share)])
 
 
-@stage("parts")
 def label_parts(
     context: ReconstructionContext, views: Views, model: HeadModel, head_world: Mesh, cap: Cap | None
 ) -> Staged[PartLabels]:

@@ -19,7 +19,7 @@ from pipeline.stages.depth import Depth, is_refined
 from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
 from pipeline.warnings import Detail
 from rig.mesh import Mesh
@@ -41,7 +41,6 @@ class RefinedHead:
     displaced: DeformedSurface | None = None
 
 
-@stage("fine")
 def refine_head(
     context: ReconstructionContext, views: Views, faces: Faces, head: HeadFit, labels: PartLabels, depth: Depth
 ) -> Staged[RefinedHead]:

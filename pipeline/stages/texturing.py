@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.geometry.normals import normals_of
 from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo
@@ -45,13 +44,12 @@ class Texturing:
     sets: SetTextures | None = None  # where the capture has texture sets
 
 
-@stage("texture")
 def texture_head(
     context: ReconstructionContext, views: Views, head: HeadFit, refined: RefinedHead, labels: PartLabels
 ) -> Staged[Texturing]:
     """Colours the delivered head from the photographs, and paints its textures and maps."""
     settings, rig, model, mesh = context.settings, context.rig, head.model, refined.mesh_world
-    normals, depths, face = normals_of(mesh), depth_maps(rig, mesh), model.levels["full"].face_region
+    normals, depths, face = mesh.normals(), depth_maps(rig, mesh), model.levels["full"].face_region
     layout, layout_warnings = find_layout(model, settings)
     chart, chart_warnings = chart_colours(views.capture, rig) if settings.texture.chart else (None, [])
     capture = views.capture if chart is None else with_true_colours(views.capture, chart)

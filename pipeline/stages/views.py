@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.stages.context import ReconstructionContext
-from pipeline.stages.recorder import Staged, stage
+from pipeline.stages.recorder import Staged
 from pipeline.view_checks.lens_distortion import judge_distortion
 from pipeline.view_checks.usable_views import usable_views
 from rig.capture import Capture
@@ -25,7 +25,6 @@ class Views:
     assignment: Mapping[str, str]
 
 
-@stage("segmentation")
 def find_views(context: ReconstructionContext) -> Staged[Views]:
     """Finds the silhouettes of the capture and decides which views take part. Refuses with TooFewViews,
     ExchangedPictures, WrongRig, WrongScale."""
@@ -38,7 +37,6 @@ def find_views(context: ReconstructionContext) -> Staged[Views]:
     return Staged(Views(found.capture, found.silhouettes, found.pictures), found.warnings)
 
 
-@stage("segmentation")
 def check_lenses(context: ReconstructionContext, views: Views) -> Staged[None]:
     """Warns if the pictures were undistorted though the rig has distortion, or the other way round."""
     return Staged(None, judge_distortion(views.capture.images, views.silhouettes, context.rig))

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import NEAREST_MM, placed
 from pipeline.stereo.matching_kernels import HEIGHT, START, WIDTH
+from rig.jit import njit
 
 FAR_TOLERANCES = 20.0  # along a ray: at the steepest slope the planes are then six tolerances apart
 

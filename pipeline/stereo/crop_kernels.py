@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import NOWHERE, distorted
+from rig.jit import njit
 
 BESIDE_PX = -1e4  # a place that is in no photograph
 

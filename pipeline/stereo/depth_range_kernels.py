@@ -1,8 +1,8 @@
 """Compiled loop that finds the range of depths along each ray that the silhouettes leave to the subject."""
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import NEAREST_MM, placed
 from pipeline.stereo.matching_kernels import HEIGHT, START, UNSEEN_PX, WIDTH
+from rig.jit import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

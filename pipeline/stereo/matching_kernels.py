@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection_kernels import NEAREST_MM, turned
 from pipeline.imaging.sampling_kernels import bilinear, bilinear_slopes
+from rig.jit import njit
 
 NO_SAY = 2.0  # a score that says nothing: the view does not see the place
 AGAINST = -1.0  # the view shows the place beside the subject

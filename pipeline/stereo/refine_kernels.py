@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.stereo.matching_kernels import (
     UNSEEN_PX,
     Loaded,
@@ -13,6 +12,7 @@ from pipeline.stereo.matching_kernels import (
     place_window,
 )
 from pipeline.stereo.sweep_kernels import cost_of
+from rig.jit import njit
 
 MIN_CORRELATION = 0.3  # correlation of a view that may speak
 BEHIND_BEST = 0.35  # a view that is less alike than the best by this is taken for hidden

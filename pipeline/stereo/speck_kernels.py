@@ -7,7 +7,7 @@ piece is consistent in itself, so that neither planes of neighbours nor a mean o
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -3,8 +3,8 @@ agree."""
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.stereo.matching_kernels import AGAINST, NO_SAY, Loaded, farthest, load_window, match
+from rig.jit import njit
 
 NOT_COMPARED = 1.0  # cost of a place that no pair of views says anything about: that of no likeness
 ALONE = 0.15  # cost of a place that a single other view speaks for

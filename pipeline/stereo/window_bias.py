@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 
 from pipeline.compute.threads import in_threads
 from pipeline.geometry.cells import sorted_into_cells
-from pipeline.geometry.normals import normals_of
 from pipeline.stereo.window_bias_kernels import windowed_heights
 from rig.mesh import Mesh
 
@@ -55,6 +54,6 @@ def without_bias(mesh_world: Mesh, measured: Bool[np.ndarray, " v"], bias: Windo
     normals."""
     if bias == WindowBias():
         return mesh_world
-    vertices, normals = mesh_world.vertices, normals_of(mesh_world)
+    vertices, normals = mesh_world.vertices, mesh_world.normals()
     off_mm = bias.common_mm + bias.share * windowed_height(vertices, normals, measured)
     return Mesh(vertices - np.where(measured, off_mm, 0.0)[:, None] * normals, mesh_world.faces)

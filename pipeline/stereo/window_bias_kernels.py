@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.cell_kernels import COLUMNS, columns_about
+from rig.jit import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)

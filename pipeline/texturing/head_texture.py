@@ -18,16 +18,13 @@ from rig.rig import Rig
 
 def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
     """Returns the model's texture layout; None if no file of the result has a texture, or if the model cannot be laid
-    flat. Also returns warnings about settings and model."""
-    outputs = settings.outputs
-    old = {"outputs.obj": outputs.obj, "outputs.atlas": outputs.atlas}
-    warnings = [compose("old-setting", setting=name) for name, is_set in old.items() if is_set]
-    if not outputs.textured or settings.texture.blend == "reference":
-        return None, warnings
+    flat. Also returns warnings about the model."""
+    if not settings.outputs.textured or settings.texture.blend == "reference":
+        return None, []
     try:
-        return model_layout(model), warnings
+        return model_layout(model), []
     except NoLayout as reason:
-        return None, [*warnings, compose("no-texture-layout", reason=reason.message)]
+        return None, [compose("no-texture-layout", reason=reason.message)]
 
 
 @traced

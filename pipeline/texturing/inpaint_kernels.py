@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 LANES = 4  # channels side by side, so that a vertex is one vector register: 16 bytes
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 PHASES = 64  # places between two pixels that the sampling window is tabulated for: 0.4 code of a black to white edge
 TAPS = 4

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 DARKER = 0.5  # of a difference, where a view is darker: most are shading that turns with the surface, few are shadows
 MAX_VOTE = 0.7  # of a view about the median, by the mean weight: a close-up that a shadow lies in is one of many

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 NEVER = np.float32(1e6)  # cost of a view that does not see a vertex
 RING_SHARE = 0.7  # of a view's quality that the neighbours decide: beside an occluding edge it soon sees something else

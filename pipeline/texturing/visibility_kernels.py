@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 WINDOW = 2  # pixels around a vertex in which a nearer surface may blur over it: 3 sigma of the preset's defocus
 SLOPE_SLACK = 1.5  # by how much more than its own slope a surface may come nearer within the window

@@ -156,10 +156,6 @@ class TriggerBox:
         """Allows one FIRE within ``window_s``; after that the box disarms itself."""
         self._command(f"ARM {round(window_s * 1000)}")
 
-    def disarm(self) -> None:
-        """Takes back the permission to fire that ``arm`` gave."""
-        self._command("DISARM")
-
     def fire(self, mask: int, pulse_us: int) -> Fired:
         """Raises the outputs whose bits are set in ``mask``, each after its delay, for ``pulse_us``. The box must be
         armed."""

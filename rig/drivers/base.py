@@ -2,7 +2,7 @@
 
 ``grab`` waits for the camera's next frame and returns when it arrived; ``retrieve`` decodes that frame. They are two
 calls because most frames of a stream are never used, and decoding them all would make the arrival times late.
-``grab_frame`` does both. A driver belongs to one thread at a time (``rig.drivers.feed``).
+A driver belongs to one thread at a time (``rig.drivers.feed``).
 """
 
 from dataclasses import dataclass
@@ -106,12 +106,6 @@ class DriverMissing(DriverError):
 
     def __init__(self, camera: CameraConfig, needs: Message | str) -> None:
         super().__init__(camera.name, compose("driver-needs", driver=f"{camera.driver!r}", needs=needs))
-
-
-def grab_frame(driver: Driver, timeout_s: float) -> Frame:
-    """Returns the next frame, decoded. Raises as ``grab`` and ``retrieve`` do."""
-    arrival = driver.grab(timeout_s)
-    return Frame(driver.retrieve(), arrival.time_s, arrival.sequence)
 
 
 def upright(image: ImageRgb, rotation_deg: int) -> UInt8[np.ndarray, "_ _ 3"]:

@@ -10,22 +10,21 @@ from server.tasks.child import DISK_FULL, WorkFailed
 SIGKILL = 9
 
 
-def failure_of(error: EigenheadError | OSError, capture: Path, attempt: str, origin: Origin | None) -> FailureRecord:
-    """Returns the failure record for an error. ``attempt``: token of the process (``Claims.token``); ``origin``: None
-    if the capture could not be read."""
+def failure_of(error: EigenheadError | OSError, capture: Path, origin: Origin | None) -> FailureRecord:
+    """Returns the failure record for an error. ``origin``: None if the capture could not be read."""
     if isinstance(error, WorkFailed):
-        return FailureRecord(attempt, error.kind, _of_work(error), error.faults, origin, error.trace)
+        return FailureRecord(error.kind, _of_work(error), error.faults, origin, error.trace)
     if isinstance(error, EigenheadError):
         kind = "input" if isinstance(error, InputError) else "refused"
-        return FailureRecord(attempt, kind, error.message, getattr(error, "faults", ()), origin)
+        return FailureRecord(kind, error.message, getattr(error, "faults", ()), origin)
     if error.errno in DISK_FULL:
-        return FailureRecord(attempt, "disk-full", compose("batch-disk-full"), (), origin)
+        return FailureRecord("disk-full", compose("batch-disk-full"), (), origin)
     reason = error.strerror or str(error)
     if origin is None:
         message = compose("batch-capture-unreadable", path=str(capture), reason=reason)
-        return FailureRecord(attempt, "input", message, (), origin)
+        return FailureRecord("input", message, (), origin)
     message = compose("batch-result-unwritable", path=str(error.filename or ""), reason=reason)
-    return FailureRecord(attempt, "unwritable", message, (), origin)
+    return FailureRecord("unwritable", message, (), origin)
 
 
 def _of_work(error: WorkFailed) -> Message:

@@ -2,22 +2,26 @@
 
 NAME/             a result as ``eigenhead reconstruct`` writes it, and batch.json: what it was made from
 heads.csv heads.parquet sheet.html sheet.pdf
-.batch/           claims/, attempts/ (results being made), failures/: gone when nothing is at work and none failed
+.batch/           K-of-N.lock (a share at work), attempts/K-of-N.0 (a result in the making), failures/: gone when
+                  nothing is at work and none failed
 """
 
+import fcntl
 import hashlib
 import json
+import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
 from rig.messages.message import Message, compose, documents_of, read_message
+from server.batch.shards import Shard
 from server.storage.result_folder import RESULT_FILE
 
 RECORD = "batch.json"
@@ -31,6 +35,13 @@ class ForeignFiles(EigenheadError):
 
     def __init__(self, folder: Path, names: list[str]) -> None:
         super().__init__(compose("batch-foreign-files", folder=str(folder), names=names[:5]))
+
+
+class ShareTaken(EigenheadError):
+    """Reports that another process works on the share already."""
+
+    def __init__(self, share: str) -> None:
+        super().__init__(compose("batch-share-taken", share=share))
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +65,8 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class FailureRecord:
-    """Holds why the latest attempt at a capture failed. ``attempt``: token of the process that made it
-    (``Claims.token``)."""
+    """Holds why the latest attempt at a capture failed."""
 
-    attempt: str
     kind: str
     message: Message
     faults: tuple[Message, ...]
@@ -66,13 +75,58 @@ class FailureRecord:
 
 
 class BatchFolder:
-    """Manages the paths and records of the folder ``out`` that a batch fills. Claims (server.batch.claims) decide which
-    process may write what."""
+    """Manages the paths and records of the folder ``out`` that a batch fills. One process works on a share at a
+    time."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
         self.work = out / ".batch"
-        self.claims, self.attempts = self.work / "claims", self.work / "attempts"
+        self.attempts = self.work / "attempts"
+
+    @contextmanager
+    def share(self, shard: Shard) -> Iterator[None]:
+        """Holds a share during the block, and removes what processes that have ended left: attempts, and folders that
+        are empty. Raises ShareTaken if another process has the share."""
+        try:
+            with self._lock(_lock_name(shard), wait=False) as held:
+                if not held:
+                    raise ShareTaken(str(shard))
+                self._remove_attempts(_lock_name(shard))
+                yield
+        finally:
+            self._tidy()
+
+    def _tidy(self) -> None:
+        """Removes the attempts of shares that no process has, and empty folders."""
+        alive = set[str]()
+        for lock in self.work.glob("*.lock"):
+            with self._lock(lock.stem, wait=False) as free:
+                alive |= set() if free else {lock.stem}
+        for path in self.attempts.glob("*"):
+            if path.name.partition(".")[0] not in alive:
+                shutil.rmtree(path, ignore_errors=True)
+        for folder in (self.attempts, self.work / "failures", self.work):
+            with suppress(OSError):
+                folder.rmdir()
+
+    @contextmanager
+    def table(self) -> Iterator[None]:
+        """Holds the right to write the table during the block. Waits for another process that has it."""
+        with self._lock("table", wait=True):
+            yield
+
+    @contextmanager
+    def _lock(self, name: str, *, wait: bool) -> Iterator[bool]:
+        """Locks a file in ``.batch`` during the block and removes it then; the kernel ends a lock with its process, on
+        NFS too. Yields whether this process has the lock."""
+        path = self.work / f"{name}.lock"
+        file = _locked(path, wait=wait)
+        try:
+            yield file is not None
+        finally:
+            if file is not None:
+                path.unlink(missing_ok=True)
+                file.close()
 
     def result(self, name: str) -> Path:
         """Returns the folder of a capture's result."""
@@ -93,12 +147,12 @@ class BatchFolder:
         """Reads the report.json of a result. Raises OSError and ValueError."""
         return json.loads((self.result(name) / REPORT).read_text(encoding="utf-8"))
 
-    def new_attempt(self, token: str) -> Path:
-        """Makes a folder for one attempt at a result, with the empty folders ``result`` and ``scratch`` in it.
-        ``token`` names the process that makes the attempt (``Claims.token``)."""
+    def new_attempt(self, shard: Shard) -> Path:
+        """Makes a folder for one attempt at a result of a share, with the empty folders ``result`` and ``scratch`` in
+        it."""
         number = 0
         while True:
-            attempt = self.attempts / f"{token}.{number}"
+            attempt = self.attempts / f"{_lock_name(shard)}.{number}"
             try:
                 attempt.mkdir(parents=True)  # a process that ends may remove the empty parent folder meanwhile
             except FileExistsError:
@@ -112,7 +166,7 @@ class BatchFolder:
         """Renames the finished result of an attempt to its final place, replacing an earlier result of that name, and
         removes the failure record.
 
-        Raises ForeignFiles, and OSError if another process has just published the same result.
+        Raises ForeignFiles, and OSError if a process with another division into shares has just published it.
         """
         made, target = attempt / "result", self.result(name)
         self.check_replaceable(name)
@@ -135,19 +189,13 @@ class BatchFolder:
         if foreign := [entry for entry in entries if entry not in FOUND_FILES and not RESULT_FILE.match(entry)]:
             raise ForeignFiles(self.result(name), foreign)
 
-    def remove_attempts(self, is_alive: Callable[[str], bool]) -> None:
-        """Removes the attempts of processes that have ended. ``is_alive`` is asked for each process by its token."""
-        for path in self._attempts():
-            if not is_alive(path.name.partition(".")[0]):
-                shutil.rmtree(path, ignore_errors=True)
-
     def failure(self, name: str) -> FailureRecord | None:
         """Reads why the latest attempt at a capture failed. Returns None if there is no such record."""
         with suppress(OSError, ValueError, KeyError, TypeError):
             record = json.loads(self.failure_file(name).read_text(encoding="utf-8"))
             origin = None if record["origin"] is None else Origin(**record["origin"])
             message, faults = read_message(record["message"]), tuple(map(read_message, record["faults"]))
-            return FailureRecord(record["attempt"], record["kind"], message, faults, origin, record["trace"])
+            return FailureRecord(record["kind"], message, faults, origin, record["trace"])
         return None
 
     def note_failure(self, name: str, failure: FailureRecord) -> None:
@@ -155,7 +203,6 @@ class BatchFolder:
         document = {
             "format": FAILURE_FORMAT,
             "capture": name,
-            "attempt": failure.attempt,
             "kind": failure.kind,
             "message": failure.message.document(),
             "faults": documents_of(failure.faults),
@@ -177,22 +224,29 @@ class BatchFolder:
                 if path.name not in retained:
                     path.unlink(missing_ok=True)
 
-    def remove_empty_folders(self) -> None:
-        """Removes the empty folders in ``.batch``, unless other processes are at work there."""
-        with suppress(OSError):
-            for folder in (self.claims / "owners", self.claims):
-                folder.rmdir()
-        if self.claims.exists():
-            return
-        for folder in (self.attempts, self.work / "failures", self.work):
-            with suppress(OSError):
-                folder.rmdir()
+    def _remove_attempts(self, lock_name: str) -> None:
+        for path in self.attempts.glob(f"{lock_name}.*"):
+            shutil.rmtree(path, ignore_errors=True)
 
-    def _attempts(self) -> list[Path]:
-        try:
-            return list(self.attempts.iterdir())
-        except FileNotFoundError:
-            return []
+
+def _locked(path: Path, *, wait: bool) -> IO[bytes] | None:
+    """Opens and locks a file that whoever has locked it may remove. Returns None if another process has the lock."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # another process has just removed the empty folder, or the file
+            file = path.open("ab")
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if path.stat().st_ino == os.fstat(file.fileno()).st_ino:
+                    return file
+            except BlockingIOError:
+                file.close()
+                return None
+            file.close()
+
+
+def _lock_name(shard: Shard) -> str:
+    return f"{shard.number}-of-{shard.count}"
 
 
 def file_name(name: str) -> str:

@@ -39,10 +39,6 @@ class BatchProgress:
         if not failed:
             self._took.append(self._clock() - since)
 
-    def leave(self, name: str) -> None:
-        """Records that another process works on this capture."""
-        self._running.pop(name, None)
-
     def share(self) -> float:
         """Returns the share of the whole batch that is done, from 0 to 1."""
         begun = sum(share for _, share in self._running.values())

@@ -8,19 +8,19 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from rig.errors import Cancelled, EigenheadError, InputError
 from rig.messages.message import compose
 from rig.progress import Progress
-from server.batch.claims import Claims
 from server.batch.digests import capture_sha256
 from server.batch.failures import failure_of
-from server.batch.folder import BatchFolder, FailureRecord, Origin, file_name
+from server.batch.folder import BatchFolder, FailureRecord, Origin
+from server.batch.shards import WHOLE, Shard
 from server.tasks.child import Child, WorkerContext
 from server.tasks.progress import JobProgress
 from server.tasks.reconstruct_folder import reconstruct_beside
@@ -28,9 +28,7 @@ from server.tasks.reconstruct_folder import reconstruct_beside
 if TYPE_CHECKING:
     from server.batch.plan import BatchTask
 
-POLL_S = 0.5  # interval of checks whether another process has finished a capture
 EXAMINERS = 4  # captures whose files are compared at once: hashing releases the interpreter lock
-TABLE = "table"  # name of the claim on writing the table
 
 
 class FolderWork(Protocol):
@@ -56,8 +54,7 @@ class FolderWork(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Holds how a capture ended: ``made`` by this process, ``kept`` from an earlier run or another process, or
-    ``failed``."""
+    """Holds how a capture ended: ``made`` by this process, ``kept`` from an earlier run, or ``failed``."""
 
     name: str
     state: Literal["made", "kept", "failed"]
@@ -80,10 +77,6 @@ class Observer(Protocol):
         """Receives which share of a capture is done, 0 to 1."""
         ...
 
-    def leave(self, name: str) -> None:
-        """Receives that this process stops working on the capture because another one has it."""
-        ...
-
     def end(self, outcome: Outcome) -> None:
         """Receives how a capture ended."""
         ...
@@ -100,36 +93,29 @@ class BatchRun:
         workers: int,
         variables: Mapping[str, str],
         observer: Observer,
+        shard: Shard = WHOLE,
         work: FolderWork = reconstruct_beside,
-        claims: Claims | None = None,
     ) -> None:
         self._folder, self._tasks, self._workers, self._variables = folder, tasks, workers, variables
-        self._observer, self._work = observer, work
-        self._claims = claims or Claims(folder.claims)
+        self._observer, self._shard, self._work = observer, shard, work
         self._lock, self._stopped = threading.Lock(), threading.Event()
         self._pending: deque[BatchTask] = deque()
-        self._failed_before: dict[str, str] = {}
         self._outcomes: dict[str, Outcome] = {}
 
     def run(self, publish_table: Callable[[], object]) -> list[Outcome]:
         """Makes the results that are missing and returns how each capture ended, in the order of the tasks. It may be
         killed at any moment; the next run makes what is missing then.
 
-        ``publish_table`` is called at the end, never by two processes at a time. Raises OSError if the folder cannot be
-        written.
+        ``publish_table`` is called at the end, never by two processes at a time. Raises ShareTaken if another process
+        works on the same share, and OSError if the folder cannot be written.
         """
-        try:
-            with self._claims.beating():
-                self._sweep()
-                self._examine()
-                with self._lock:
-                    self._observer.begin(len(self._pending))
-                self._work_off()
-                with self._table_claim():
-                    publish_table()
-                self._sweep()
-        finally:
-            self._folder.remove_empty_folders()
+        with self._folder.share(self._shard):
+            self._examine()
+            with self._lock:
+                self._observer.begin(len(self._pending))
+            self._work_off()
+            with self._folder.table():
+                publish_table()
         return [self._outcomes[task.capture.name] for task in self._tasks if task.capture.name in self._outcomes]
 
     def _examine(self) -> None:
@@ -137,25 +123,20 @@ class BatchRun:
 
         def kept(task: "BatchTask") -> bool:
             try:
-                return self._is_done(task, None)
+                return self._is_done(task)
             except OSError:  # reported when the capture's turn comes
                 return False
 
         with ThreadPoolExecutor(EXAMINERS) as pool:
             for task, done in zip(self._tasks, pool.map(kept, self._tasks), strict=True):
-                name = task.capture.name
                 if done:
-                    self._outcomes[name] = Outcome(name, "kept")
-                    continue
-                self._pending.append(task)
-                if (failure := self._folder.failure(name)) is not None:
-                    self._failed_before[name] = failure.attempt
+                    self._outcomes[task.capture.name] = Outcome(task.capture.name, "kept")
+                else:
+                    self._pending.append(task)
 
-    def _is_done(self, task: "BatchTask", input_sha256: str | None) -> bool:
+    def _is_done(self, task: "BatchTask") -> bool:
         origin = self._folder.origin(task.capture.name)
-        if origin is None:
-            return False
-        return origin.is_of(self._origin(task, input_sha256 or capture_sha256(task.capture.path)))
+        return origin is not None and origin.is_of(self._origin(task, capture_sha256(task.capture.path)))
 
     def _origin(self, task: "BatchTask", input_sha256: str) -> Origin:
         return Origin(input_sha256, task.settings_sha256, task.model_sha256, task.version)
@@ -173,71 +154,40 @@ class BatchRun:
 
     def _serve(self) -> None:
         with closing(Child(variables=self._variables)) as child:
-            passed_over = 0
             while not self._stopped.is_set():
                 with self._lock:
                     if not self._pending:
                         return
-                    task, left = self._pending.popleft(), len(self._pending)
-                if self._take(task, child):
-                    passed_over = 0
-                    continue
+                    task = self._pending.popleft()
+                    self._observer.start(task.capture.name)
+                try:
+                    outcome = self._outcome(task, child)
+                except Cancelled:
+                    return
                 with self._lock:
-                    self._pending.append(task)
-                passed_over += 1
-                if passed_over > left:  # other processes have all remaining captures
-                    passed_over = 0
-                    self._stopped.wait(POLL_S)
+                    self._outcomes[outcome.name] = outcome
+                    self._observer.end(outcome)
 
-    def _take(self, task: "BatchTask", child: Child) -> bool:
-        """Works on a capture and tells whether it has ended. Returns False if another process has it, or if this one is
-        to stop."""
-        name = task.capture.name
-        claim = file_name(name)
-        if not self._claims.take(claim):
-            return False
-        try:
-            with self._lock:
-                self._observer.start(name)
-            outcome = self._outcome(task, claim, child)
-        finally:
-            self._claims.release(claim)
-        with self._lock:
-            if outcome is None:
-                self._observer.leave(name)
-                return False
-            self._outcomes[name] = outcome
-            self._observer.end(outcome)
-        return True
-
-    def _outcome(self, task: "BatchTask", claim: str, child: Child) -> Outcome | None:
+    def _outcome(self, task: "BatchTask", child: Child) -> Outcome:
         name, began = task.capture.name, time.monotonic()
         origin: Origin | None = None
         try:
             origin = self._origin(task, capture_sha256(task.capture.path))
-            if self._is_done(task, origin.input_sha256):
-                return Outcome(name, "kept")
-            failure = self._folder.failure(name)
-            if failure is not None and failure.attempt != self._failed_before.get(name):
-                return Outcome(name, "failed", failure=failure)  # another process has just tried
-            self._make(task, origin, child, claim)
+            self._make(task, origin, child)
             return Outcome(name, "made", time.monotonic() - began)
         except Cancelled:
-            return None
+            raise
         except (EigenheadError, OSError) as error:
-            if not self._claims.holds(claim):  # another process took this one for dead and the claim from it
-                return None
-            failure = failure_of(error, task.capture.path, self._claims.token, origin)
+            failure = failure_of(error, task.capture.path, origin)
         with suppress(OSError):  # on a full disk only the terminal shows it
             self._folder.note_failure(name, failure)
         return Outcome(name, "failed", time.monotonic() - began, failure)
 
-    def _make(self, task: "BatchTask", origin: Origin, child: Child, claim: str) -> None:
-        """Makes a result in a folder of its own and lays it down. Raises Cancelled where this process is to stop, or
-        another one has the capture now."""
+    def _make(self, task: "BatchTask", origin: Origin, child: Child) -> None:
+        """Makes a result in a folder of its own and lays it down. Raises Cancelled where this process is to stop."""
         name = task.capture.name
         self._folder.check_replaceable(name)
-        attempt = self._folder.new_attempt(self._claims.token)
+        attempt = self._folder.new_attempt(self._shard)
         progress = JobProgress(task.expected_s)
 
         def report(stage: str, fraction: float) -> None:
@@ -257,22 +207,6 @@ class BatchRun:
             )
             if capture_sha256(task.capture.path) != origin.input_sha256:
                 raise InputError(name, [compose("batch-capture-changed")])
-            if not self._claims.holds(claim):
-                raise Cancelled
             self._folder.publish(name, attempt, origin)
         finally:
             shutil.rmtree(attempt, ignore_errors=True)
-
-    @contextmanager
-    def _table_claim(self) -> Iterator[None]:
-        while not self._claims.take(TABLE):
-            time.sleep(POLL_S)
-        try:
-            yield
-        finally:
-            self._claims.release(TABLE)
-
-    def _sweep(self) -> None:
-        """Removes what dead processes left."""
-        self._claims.forget_dead()
-        self._folder.remove_attempts(self._claims.is_alive)

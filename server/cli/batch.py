@@ -145,7 +145,7 @@ def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "S
     with terminated_like_interrupted(), BatchDisplay.opened(count, share_tasks) as display:
         display.prepare(share_tasks)
         variables = {"EIGENHEAD_THREADS": str(threads_of_worker(cores, count))} | _threads_variable()
-        run = BatchRun(folder, share_tasks, workers=count, variables=variables, observer=display)
+        run = BatchRun(folder, share_tasks, workers=count, variables=variables, observer=display, shard=share)
         outcomes = run.run(lambda: files.extend(write_summary(folder, tasks)))
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     _warn_of_versions(folder, share_tasks)

@@ -63,11 +63,6 @@ class BatchDisplay:
         self._progress.report(name, share)
         self._show()
 
-    def leave(self, name: str) -> None:
-        """Shows that another process has the capture."""
-        self._progress.leave(name)
-        self._show()
-
     def end(self, outcome: Outcome) -> None:
         """Shows how a capture ended, and why if it failed."""
         self._progress.end(outcome.name, failed=outcome.state == "failed")

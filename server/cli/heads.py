@@ -127,15 +127,11 @@ def reconstruct(
     formats: Formats = None,
     albedo: Annotated[
         bool,
-        typer.Option("--albedo", "--delight", help="Also texture/albedo.png: the texture with its light taken off."),
+        typer.Option("--albedo", help="Also texture/albedo.png: the texture with its light taken off."),
     ] = False,
     cap: CapColour = None,
     cap_thickness: CapThickness = None,
     chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in clean plates.")] = False,
-    obj: Annotated[
-        bool, typer.Option("--obj", hidden=True)
-    ] = False,  # from earlier versions; a warning says what replaced it
-    atlas: Annotated[bool, typer.Option("--atlas", hidden=True)] = False,
     normal_map: Annotated[
         bool, typer.Option("--normal-map", help="head.glb of few triangles, with a normal map of what they leave out.")
     ] = False,
@@ -153,7 +149,7 @@ def reconstruct(
     from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
-    switches = {"obj": obj, "atlas": atlas, "delight": albedo, "normal_map": normal_map}
+    switches = {"delight": albedo, "normal_map": normal_map}
     switches |= {"neutral": neutral, "morphs": morphs, "slicer": slicer}
     outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}

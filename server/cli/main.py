@@ -58,7 +58,7 @@ def of_all(
 @app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
 def experiments(context: typer.Context) -> None:
     """Say where the experiments are."""
-    name = context.args[0] if context.args else "NAME"
+    name = next((word for word in context.args if not word.startswith("-")), "NAME")
     print(
         f"experiments are in the laboratory of a checkout: python -m tests.laboratory {name} [--json]", file=sys.stderr
     )

@@ -91,7 +91,7 @@ def doctor(data: Data = None, json_out: Json = False) -> None:
 @keys_app.command("add", epilog="Example: eigenhead keys add console --scope read --scope capture --scope submit")
 def keys_add(
     name: str,
-    scope: Annotated[list[str], typer.Option(help="read, capture, submit or admin; may be repeated.")] = ["admin"],  # noqa: B006
+    scope: Annotated[list[str], typer.Option(help="read, capture, submit, erase, admin; may be repeated.")] = ["admin"],  # noqa: B006
     data: Data = None,
     json_out: Json = False,
 ) -> None:

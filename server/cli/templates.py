@@ -49,8 +49,8 @@ def template_add(
     from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks
     from pipeline.applications.templates.make import make_template
     from pipeline.applications.templates.template_file import save_template
+    from pipeline.applications.templates.write.picture import template_picture
     from pipeline.head_model.model import load_model
-    from pipeline.results.template_picture import template_picture
     from rig.formats.pictures.images import write_image
 
     marked = landmarks or landmark_file(file)

@@ -16,7 +16,7 @@ from starlette.types import Scope
 from rig.atomic_write import write_atomically
 from rig.messages.message import compose
 from server.address import is_loopback
-from server.errors import Forbidden, Unauthenticated
+from server.errors import Unauthenticated
 from server.services.keys import LOCAL, SCOPES, Caller
 from server.services.service import Service
 from server.settings import ServiceSettings
@@ -49,8 +49,7 @@ def permit(caller: Caller | None, scope: str) -> Caller:
     scope."""
     if caller is None:
         raise Unauthenticated("key-missing", compose("sign-in-again"))
-    if not caller.may(scope):
-        raise Forbidden("scope-missing", compose("your-key-lacks-scope", scope=f"{scope!r}"))
+    caller.check_may(scope)
     return caller
 
 

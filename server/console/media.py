@@ -138,7 +138,7 @@ def faces(who: Reader, capture_id: str) -> Response:
 async def upload(who: Taker, request: Request) -> Response:
     """Receives an archive and makes a capture of it. Answers 201 with its id, or a problem document."""
     try:
-        record, _ = await receive_capture(who[0], request)
+        record, _ = await receive_capture(who[0], request, who[1].key)
     except Exception as error:
         return as_problem(error).response()
     return JSONResponse({"id": record.id}, 201)
@@ -149,7 +149,7 @@ async def upload_calibration_pictures(who: Taker, request: Request) -> Response:
     """Receives an archive of board pictures or photographs and queues a calibration. Answers 202 with its id, or a
     problem document."""
     try:
-        made = await receive_calibration_pictures(who[0], request)
+        made = await receive_calibration_pictures(who[0], request, who[1].key)
     except Exception as error:
         return as_problem(error).response()
     return JSONResponse({"id": made.id}, 202)

@@ -29,6 +29,13 @@ BATCHES_AGAIN_S = 5.0
 STORE_AGAIN_S = 10.0
 EXPOSED = ("Location", "ETag", "Upload-Offset", "Upload-Length", "Upload-Expires", "Tus-Resumable", "X-Request-Id")
 
+POLICY = (  # NiceGUI writes scripts and styles into its pages, and Vue compiles their templates by eval
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob: ws: wss:; "
+    "worker-src 'self' blob:; object-src 'none'; base-uri 'self'; form-action 'self'; frame-ancestors 'none'"
+)
+SAFE_HEADERS = ((b"content-security-policy", POLICY.encode()), (b"x-content-type-options", b"nosniff"))
+
 MODULES = (captures, calibrations, jobs, batches, sessions, uploads, rig, storage, operations)
 MountPages = Callable[[FastAPI, ServiceSettings], None]
 
@@ -87,7 +94,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
 
 
 class Watch:
-    """Gives every request an id (header X-Request-Id), logs it, and counts it in the metrics."""
+    """Gives every request an id (header X-Request-Id) and ``SAFE_HEADERS``, logs it, and counts it in the metrics."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app, self._metrics = app, metrics
@@ -103,7 +110,11 @@ class Watch:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                message["headers"] = [*message.get("headers", []), (b"x-request-id", request_id.encode())]
+                message["headers"] = [
+                    *message.get("headers", []),
+                    *SAFE_HEADERS,
+                    (b"x-request-id", request_id.encode()),
+                ]
             await send(message)
 
         with structlog.contextvars.bound_contextvars(request=request_id):

@@ -13,6 +13,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rig.messages.message import compose
 from server.http.auth import check_caller
+from server.wire.patience import IDLE_TIMEOUT_S, within
 from server.wire.problems import Problem, problem_from
 
 JSON_BYTES = 4 << 20  # the largest legitimate body, feature points of all cameras, has 0.3 MB
@@ -23,9 +24,11 @@ class JsonBodies:
     passes the request on. It answers others with a problem document: 401 or 403 for the caller, 413 for the size, 415
     for a form."""
 
-    def __init__(self, app: ASGIApp, routes: Sequence[APIRoute], most: int = JSON_BYTES) -> None:
+    def __init__(
+        self, app: ASGIApp, routes: Sequence[APIRoute], most: int = JSON_BYTES, body_s: float = IDLE_TIMEOUT_S
+    ) -> None:
         """Wraps ``app``. ``routes`` are all of its routes in their order."""
-        self._app, self._routes, self._most = app, routes, most
+        self._app, self._routes, self._most, self._body_s = app, routes, most, body_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one ASGI connection. What is no request with a JSON body is passed on unread."""
@@ -53,8 +56,8 @@ class JsonBodies:
     async def _read(self, request: Request) -> list[Message]:
         """Returns the ASGI messages of the body, up to its end or the client's disconnection.
 
-        Raises a 413 problem for a body that is too large, and 415 for a form: that is an archive sent to the wrong
-        address."""
+        Raises a 413 problem for a body that is too large, 408 for one that takes longer than ``body_s`` seconds, and
+        415 for a form: that is an archive sent to the wrong address."""
         if request.headers.get("content-type", "").casefold().startswith("multipart/"):
             detail = compose("json-wanted-here")
             raise Problem(415, "unsupported-media-type", detail)
@@ -62,11 +65,12 @@ class JsonBodies:
         self._check(int(announced) if announced.isascii() and announced.isdigit() else 0)
         messages: list[Message] = []
         received, more = 0, True
-        while more:
-            messages.append(message := await request.receive())
-            received += len(message.get("body", b""))
-            self._check(received)
-            more = message["type"] == "http.request" and message.get("more_body", False)
+        async with within(self._body_s):
+            while more:
+                messages.append(message := await request.receive())
+                received += len(message.get("body", b""))
+                self._check(received)
+                more = message["type"] == "http.request" and message.get("more_body", False)
         return messages
 
     def _check(self, length: int) -> None:

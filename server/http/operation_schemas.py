@@ -25,7 +25,7 @@ class NewKey(Received):
     )
 
     name: str = Field(min_length=1, max_length=200, pattern=PLAIN)
-    scopes: list[Literal["read", "capture", "submit", "admin"]] = Field(min_length=1, max_length=4)
+    scopes: list[Literal["read", "capture", "submit", "erase", "admin"]] = Field(min_length=1, max_length=5)
 
 
 class ModelOut(Answer):

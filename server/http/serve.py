@@ -22,6 +22,7 @@ from server.storage.database import open_database
 if TYPE_CHECKING:
     import uvicorn
 
+BACKLOG = 128  # connections taken in one turn of the loop: fewer than connections.DESCRIPTORS_SPARED
 WORKER_PAUSE_S = 1.0  # before a worker that died is started again; doubled up to a minute
 
 log = structlog.get_logger()
@@ -107,12 +108,19 @@ def _serve(settings: ServiceSettings, sock: socket.socket, worker: bool, ready: 
     import uvicorn
 
     from server.http.app import create_app
+    from server.http.connections import BoundedConnection
 
     mount = None
     if settings.console:
         from server.console.mount import mount_console as mount  # NiceGUI takes longer to import than all the rest
     config = uvicorn.Config(
-        create_app(settings, mount), log_config=None, lifespan="on", timeout_graceful_shutdown=3, access_log=False
+        create_app(settings, mount),
+        http=BoundedConnection,
+        backlog=BACKLOG,
+        log_config=None,
+        lifespan="on",
+        timeout_graceful_shutdown=3,
+        access_log=False,
     )
 
     class Server(uvicorn.Server):

@@ -82,7 +82,7 @@ def _outcome(store: Store, capture: BatchCapture, job: Job | None, input_sha256:
     result, link = store.folder("jobs", job.id) / "result", f"/result/{job.id}"
     if job.error is not None:
         kind = job.error.type.removeprefix(URN)
-        failure = FailureRecord("", kind, job.error.detail, job.error.errors, None)
+        failure = FailureRecord(kind, job.error.detail, job.error.errors, None)
         return Outcome(capture, result, link, failure=failure)
     with suppress(OSError, ValueError):  # not made yet, or removed since
         report = json.loads((result / REPORT).read_bytes())

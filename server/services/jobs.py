@@ -179,17 +179,13 @@ class Jobs:
         capture: str | None = None,
         session: str | None = None,
         limit: int = 100,
-        offset: int = 0,
     ) -> list[Job]:
-        """Returns jobs, newest first, ``limit`` at most after skipping ``offset``. They can be restricted to one state,
-        capture or session."""
+        """Returns jobs, newest first, ``limit`` at most. They can be restricted to one state, capture or session."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
         if ids == []:
             return []
         status = STATUSES[state] if state else None
-        rows = self.client.list_workflows(
-            name=WORKFLOW, workflow_ids=ids, status=status, limit=limit, offset=offset, sort_desc=True
-        )
+        rows = self.client.list_workflows(name=WORKFLOW, workflow_ids=ids, status=status, limit=limit, sort_desc=True)
         return self._jobs(rows)
 
     def page(self, query: JobQuery, limit: int = 100, cursor: str | None = None) -> Found[Job]:

@@ -16,11 +16,11 @@ import sqlalchemy as sa
 
 from rig.errors import EigenheadError
 from rig.messages.message import compose
-from server.errors import NotFound
+from server.errors import Forbidden, NotFound
 from server.settings import ServiceSettings
 from server.storage.database import api_keys, now_sql
 
-SCOPES = ("read", "capture", "submit", "admin")  # admin holds all the others
+SCOPES = ("read", "capture", "submit", "erase", "admin")  # admin holds all the others
 LOCAL = "local"
 
 
@@ -46,6 +46,11 @@ class Caller:
         """Returns whether the caller has a scope. The scope "admin" includes all others."""
         return scope in self.scopes or "admin" in self.scopes
 
+    def check_may(self, scope: str) -> None:
+        """Raises Forbidden if the caller does not have a scope."""
+        if not self.may(scope):
+            raise Forbidden("scope-missing", compose("your-key-lacks-scope", scope=f"{scope!r}"))
+
 
 @dataclass(frozen=True, slots=True)
 class ApiKey:
@@ -62,6 +67,13 @@ class Keys:
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
+
+    def add_for(self, caller: Caller, name: str, scopes: tuple[str, ...]) -> str:
+        """Makes an API key for a caller who has one, as in ``add``. Raises Forbidden on a service without keys: its
+        first key would lock out whoever else uses it, and any process of the machine could make it."""
+        if caller.key == LOCAL:
+            raise Forbidden("first-key", compose("first-key-by-command"))
+        return self.add(name, scopes)
 
     def add(self, name: str, scopes: tuple[str, ...]) -> str:
         """Makes an API key and returns its text, which cannot be shown again: only its hash is stored."""

@@ -141,7 +141,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
     migrate(settings)
     jobs, rig = Jobs(settings, store, engine, library), open_rig(settings)
     webhooks = Webhooks(engine, settings.webhook_origins)
-    children = ChildProcessPool(settings.checks_at_once, niceness=3)
+    children = ChildProcessPool(settings.checks_at_once, niceness=3, memory=settings.check_bytes)
     return Service(
         settings=settings,
         store=store,
@@ -155,7 +155,7 @@ def open_service(settings: ServiceSettings, metrics: Metrics) -> Service:
         keys=Keys(engine),
         webhooks=webhooks,
         uploads=ResumableUploads(store, settings),
-        threads=Threads(checks=settings.checks_at_once),
+        threads=Threads(checks=settings.checks_at_once, check_s=settings.check_s),
         children=children,
         rig=rig,
         metrics=metrics,

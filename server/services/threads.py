@@ -1,27 +1,91 @@
 """Runs blocking functions in thread pools of bounded size."""
 
-from collections.abc import Callable
+import asyncio
+import threading
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
 import anyio
 import anyio.to_thread
 
+from rig.errors import Cancelled
+from rig.messages.message import compose
+from server.errors import Conflict, InvalidInput, TooMany
+from server.services.keys import LOCAL
+from server.tasks.child import CANCELLED, WorkFailed
+
 T = TypeVar("T")
+
+IN_LINE_MOST = 64  # checks of one key that run or wait: a console sends a folder of captures at once
+AGAIN_S = 30  # Retry-After of one that is refused
 
 
 class Threads:
     """Runs blocking functions in two thread pools apart from the web framework's. Fifty waiting uploads then do not
-    delay a request for a job's status."""
+    delay a request for a job's status.
 
-    def __init__(self, disk: int = 8, checks: int = 2) -> None:
-        self._disk, self._checks = anyio.CapacityLimiter(disk), anyio.CapacityLimiter(checks)
+    ``checks``: checks at once, of which one key has all but one at most; ``check_s``: the longest that one may take.
+    """
+
+    def __init__(self, disk: int = 8, checks: int = 2, check_s: float = 900.0) -> None:
+        self._disk, self._checks, self._check_s = anyio.CapacityLimiter(disk), anyio.CapacityLimiter(checks), check_s
+        self._shares: dict[str, anyio.CapacityLimiter] = {}
+        self._in_line = Counter[str]()
 
     async def disk(self, function: Callable[..., T], *arguments: Any) -> T:
         """Runs a function that reads or writes files in a thread and returns its result. At most ``disk`` run at once;
         others wait."""
         return await anyio.to_thread.run_sync(function, *arguments, limiter=self._disk)
 
-    async def check(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Runs a function that unpacks or checks an upload in a thread and returns its result. At most ``checks`` run
-        at once; others wait."""
-        return await anyio.to_thread.run_sync(function, *arguments, limiter=self._checks)
+    async def check(
+        self,
+        function: Callable[..., T],
+        *arguments: Any,
+        key: str,
+        hung_up: Callable[[], Awaitable[None]] | None = None,
+    ) -> T:
+        """Runs a function that unpacks or checks an upload in a thread and returns its result. Its work in child
+        processes ends after ``check_s`` seconds, and once ``hung_up()`` has returned: then nobody waits for it.
+
+        At most ``checks`` run at once; others wait. Raises TooMany if too many of this key wait, InvalidInput if the
+        time or the memory does not suffice, and Conflict for a client who is gone.
+        """
+        if self._in_line[key] >= IN_LINE_MOST:
+            raise TooMany("too-many-checks", compose("too-many-checks", most=IN_LINE_MOST), retry_after_s=AGAIN_S)
+        gone = threading.Event()
+        watching = None if hung_up is None else asyncio.ensure_future(_set_after(hung_up, gone))
+        self._in_line[key] += 1
+        try:
+            async with self._share(key):
+                return await anyio.to_thread.run_sync(self._checked, gone, function, *arguments, limiter=self._checks)
+        finally:
+            self._in_line[key] -= 1
+            if watching is not None:
+                watching.cancel()
+
+    def _share(self, key: str) -> anyio.CapacityLimiter:
+        most = self._checks.total_tokens
+        return self._shares.setdefault(key, anyio.CapacityLimiter(most if key == LOCAL else max(1, most - 1)))
+
+    def _checked(self, gone: threading.Event, function: Callable[..., T], *arguments: Any) -> T:
+        deadline = time.monotonic() + self._check_s
+        CANCELLED.set(
+            lambda: gone.is_set() or time.monotonic() > deadline
+        )  # of this call alone: a thread's own context
+        try:
+            return function(*arguments)
+        except Cancelled:
+            if gone.is_set():
+                raise Conflict("client-gone", compose("client-gone")) from None
+            raise InvalidInput("check-too-long", compose("check-too-long", seconds=self._check_s)) from None
+        except WorkFailed as failure:
+            if failure.kind not in ("out-of-memory", "crash"):  # native code may die where memory is refused
+                raise
+            raise InvalidInput("check-out-of-memory", compose("check-out-of-memory")) from failure
+
+
+async def _set_after(hung_up: Callable[[], Awaitable[None]], gone: threading.Event) -> None:
+    await hung_up()
+    gone.set()

@@ -13,6 +13,7 @@ import importlib
 import os
 import pickle
 import queue
+import resource
 import signal
 import socket
 import subprocess
@@ -22,6 +23,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar
 from multiprocessing.connection import Connection
 from types import MappingProxyType
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -37,6 +39,9 @@ DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 P = ParamSpec("P")
 T = TypeVar("T")
+CANCELLED: ContextVar[Callable[[], bool]] = ContextVar(
+    "cancelled", default=lambda: False
+)  # asked where no other is named
 STOP = b""
 Report = Progress  # as the task of a reconstruction calls it
 
@@ -77,11 +82,12 @@ class WorkerContext:
 class Child:
     """Runs pieces of work in one child process, which starts at the first one. Two threads must not use it at once.
 
-    ``variables``: environment variables of the child, which override those of this process.
+    ``variables``: environment variables of the child, which override those of this process; ``memory``: bytes that it
+    may allocate (0: any number), beyond which its work fails as "out-of-memory".
     """
 
-    def __init__(self, niceness: int = 0, variables: Mapping[str, str] = MappingProxyType({})) -> None:
-        self._niceness, self._variables = niceness, dict(variables)
+    def __init__(self, niceness: int = 0, variables: Mapping[str, str] = MappingProxyType({}), memory: int = 0) -> None:
+        self._niceness, self._variables, self._memory = niceness, dict(variables), memory
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
 
@@ -90,7 +96,7 @@ class Child:
         work: Callable[Concatenate[WorkerContext, Progress, P], T],
         *,
         report: Progress = lambda stage, fraction: None,
-        cancelled: Callable[[], bool] = lambda: False,
+        cancelled: Callable[[], bool] | None = None,
     ) -> Callable[P, T]:
         """Returns a function that runs ``work`` in the child: ``child.remote(work)(name=value)`` calls ``work(context,
         report, name=value)`` there. ``work`` must be a module's function, since only its name is sent.
@@ -100,7 +106,7 @@ class Child:
         """
 
         def call(*arguments: P.args, **named: P.kwargs) -> T:
-            return self._run(pickle.dumps((work, arguments, named)), report, cancelled)
+            return self._run(pickle.dumps((work, arguments, named)), report, cancelled or CANCELLED.get())
 
         return call
 
@@ -132,7 +138,7 @@ class Child:
             return self._connection
         self._kill()
         ours, theirs = socket.socketpair()
-        command = python_command("tasks.child", str(theirs.fileno()), str(self._niceness))
+        command = python_command("tasks.child", str(theirs.fileno()), str(self._niceness), str(self._memory))
         with theirs:
             environment = python_environment() | self._variables
             self._process = subprocess.Popen(
@@ -174,8 +180,8 @@ class Child:
 class ChildProcessPool:
     """Lends a fixed number of child processes to many threads. Each child serves one thread at a time."""
 
-    def __init__(self, count: int, niceness: int = 0) -> None:
-        self._all = [Child(niceness) for _ in range(count)]
+    def __init__(self, count: int, niceness: int = 0, memory: int = 0) -> None:
+        self._all = [Child(niceness, memory=memory) for _ in range(count)]
         self._free: queue.LifoQueue[Child] = queue.LifoQueue()
         for child in self._all:
             self._free.put(child)
@@ -211,10 +217,16 @@ def _described(error: BaseException) -> tuple[str, str, Message, str, tuple[Mess
         return "failed", type(error).__name__, error.message, "", messages, ""
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return "failed", "disk-full", compose("disk-full"), "", (), ""
-    if isinstance(error, MemoryError):
+    if _lacks_memory(error):
         return "failed", "out-of-memory", compose("out-of-memory"), "", (), ""
     trace = "".join(traceback.format_exception(error))
     return "failed", "bug", verbatim(f"{type(error).__name__}: {error}"[:500]), "", (), trace
+
+
+def _lacks_memory(error: BaseException) -> bool:
+    """Tells whether memory was refused: by Python, by OpenCV (its StsNoMem is -4), or for a thread's stack."""
+    no_thread = isinstance(error, RuntimeError) and "start new thread" in str(error)
+    return isinstance(error, MemoryError) or getattr(error, "code", None) == -4 or no_thread
 
 
 def serve(connection: Connection) -> None:
@@ -271,4 +283,6 @@ def function_at(address: str) -> Callable[..., Any]:
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of a terminal; the parent ends its children
     os.nice(int(sys.argv[2]))
+    if memory := int(sys.argv[3]):
+        resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
     serve(Connection(int(sys.argv[1])))

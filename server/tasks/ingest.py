@@ -49,6 +49,7 @@ from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import WorkerContext
 from server.tasks.photographs import CAMERAS, FIGURES, calibrate_photographs, check_sizes, photographs_alone
 
+PICTURES_MOST = 16  # of the largest size that one camera may have: picture, mask, eight plates, six texture sets
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
 
@@ -223,9 +224,8 @@ def check_capture(
         report("check", number / len(rig))
         of_sizes, of_files = _size_faults(root, files, camera, image_pixels), list[Message]()
         if not of_sizes:
-            shot = read_shot(root, rig.subset([camera.name]), of_files, files, with_features=False, with_cut_outs=False)
-            digests |= shot.digests
-            empty += [camera.name] if _shows_its_plate(shot, camera.name) else []
+            shot, is_empty = _read_view(root, rig.subset([camera.name]), of_files, files, digests)
+            empty += [camera.name] if is_empty else []
             views |= _view_of(shot, camera.name, measured)
             image = shot.images.get(camera.name)
             if networks is not None and image is not None and min(image.shape[:2]) >= SMALLEST_PX:
@@ -290,11 +290,29 @@ def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
     return {name: check_view(image, plates[0] if plates else None, shot.masks.get(name), place_only=measured)}
 
 
-def _shows_its_plate(shot: Capture, name: str) -> bool:
-    """Whether a picture is, pixel for pixel, one of its camera's clean plates: noise never repeats."""
+def _read_view(
+    root: Path, rig: Rig, faults: list[Message], files: ShotFiles, digests: dict[str, str]
+) -> tuple[Capture, bool]:
+    """Reads the files of the one camera of ``rig``, never more than two of its pictures at once, and adds their SHA-256
+    to ``digests``. Returns the picture with its first plate and its mask, and whether the picture is, pixel for pixel,
+    one of its clean plates: noise never repeats."""
+    (name,) = rig.names
+    first, *others = files.plates.get(name, ()) or (None,)
+    plates = {} if first is None else {name: (first,)}
+    shot = read_shot(
+        root, rig, faults, replace(files, plates=plates, texture_sets={}), with_features=False, with_cut_outs=False
+    )
+    digests |= shot.digests
     image = shot.images.get(name)
-    plates = shot.backgrounds.get(name, ())
-    return image is not None and any(np.array_equal(image, plate) for plate in plates)
+    is_empty = image is not None and any(np.array_equal(image, plate) for plate in shot.backgrounds.get(name, ()))
+    alone = ShotFiles({}, {}, {}, (), ())
+    more = [replace(alone, plates={name: (plate,)}) for plate in others]
+    more += [replace(alone, texture_sets={kind: of_set}) for kind, of_set in files.texture_sets.items()]
+    for part in more:
+        read = read_shot(root, rig, faults, part, with_features=False, with_cut_outs=False)
+        digests |= read.digests
+        is_empty |= image is not None and any(np.array_equal(image, plate) for plate in read.backgrounds.get(name, ()))
+    return shot, is_empty
 
 
 def check_features(context: WorkerContext, report: Progress, *, folder: str, points: Points) -> bytes:
@@ -314,7 +332,7 @@ def check_features(context: WorkerContext, report: Progress, *, folder: str, poi
 
 def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int) -> list[Message]:
     """Sizes as the headers say, before anything is decoded: a small file may claim any size."""
-    faults: list[Message] = []
+    faults, pixels = list[Message](), 0
     wanted = (camera.intrinsics.width, camera.intrinsics.height)
     for _, path in files.of_camera(camera.name):
         name = path.relative_to(root).as_posix()
@@ -323,10 +341,15 @@ def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int
         except InputError as error:
             faults += [compose("of-file", file=name, fault=fault) for fault in error.faults]
             continue
+        pixels += width * height
         if width * height > image_pixels:
             faults.append(compose("picture-too-large", file=name, width=width, height=height, most=image_pixels))
         elif (width, height) != wanted:
             faults.append(size_fault(name, (width, height), camera.intrinsics))
+    if pixels > PICTURES_MOST * image_pixels:
+        faults.append(
+            compose("camera-pixels-many", camera=camera.name, pixels=pixels, most=PICTURES_MOST * image_pixels)
+        )
     return faults
 
 

@@ -111,7 +111,7 @@ class _Work:
 
 def _can_keep() -> bool:
     """Whether the cache folder can be written; where not, a line in the log says so."""
-    from pipeline.compute.jit import say_not_kept
+    from rig.jit import say_not_kept
 
     try:
         folder = cache_folder() / "kernels"

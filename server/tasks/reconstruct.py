@@ -52,7 +52,7 @@ def reconstruct_capture(
     """
     report("read", 0.0)  # a fresh child loads for seconds what this takes
     share_one_heap()
-    from pipeline.applications.templates.load import load_template
+    from pipeline.applications.templates.write.writers import load_template_writers
     from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
@@ -69,7 +69,7 @@ def reconstruct_capture(
     context.keep(f"loops {kind}", lambda: prepare_kernels(lambda _, share: report("compiling", share), chosen))
     name = model or "default"
     head_model = context.keep(f"model {name}", lambda: load_model(name))
-    template = load_template(chosen.outputs.template, head_model)
+    writers = load_template_writers(chosen.outputs.template, head_model)
     renderer = context.keep("renderer", Renderer.create)
     shot, rig = read_scaled_capture(Path(capture))
 
@@ -93,4 +93,4 @@ def reconstruct_capture(
     report("write", 0.0)
     warnings = calibration_warnings(Path(capture)) or ()
     done = replace(done, warnings=(*warnings, *done.warnings))
-    write_result(Path(result), done, shot, template)
+    write_result(Path(result), done, shot, writers)

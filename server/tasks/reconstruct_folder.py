@@ -60,7 +60,7 @@ def reconstruct_folder(
     kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
     with span("stage", "compiling"):
         context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))
-    from pipeline.applications.templates.load import load_template
+    from pipeline.applications.templates.write.writers import load_template_writers
     from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
@@ -72,7 +72,7 @@ def reconstruct_folder(
     name = model or "default"
     with span("stage", "read"):
         head_model = context.keep(f"model {name}", lambda: load_model(name))
-        template = load_template(chosen.outputs.template, head_model)
+        writers = load_template_writers(chosen.outputs.template, head_model)
         renderer = context.keep("renderer", Renderer.create)
         device = matching_device(context, chosen, renderer)
     segment = partial(keep_masks, kept)
@@ -91,7 +91,7 @@ def reconstruct_folder(
     done = replace(done, warnings=(*prepared.warnings, *done.warnings))
     report("write", 0.0)
     with span("stage", "write"):
-        write_result(out, done, prepared.capture, template)
+        write_result(out, done, prepared.capture, writers)
 
 
 def reconstruct_beside(

@@ -4,6 +4,7 @@ The body is parsed here and not by the framework, for three reasons: key and fre
 byte, no file is held in memory or in a temporary folder elsewhere, and every write happens in a thread."""
 
 from collections.abc import Collection, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from server.services.uploads import too_large
 from server.settings import ServiceSettings
 from server.storage.records import CaptureRecord, JsonObject
 from server.storage.store import Store
-from server.wire.patience import IDLE_TIMEOUT_S, with_idle_timeout
+from server.wire.patience import IDLE_TIMEOUT_S, await_hang_up, with_idle_timeout
 from server.wire.problems import Problem
 
 BLOCK_BYTES = 1 << 20
@@ -181,10 +182,10 @@ def check_fields(names: Iterable[str], known: Collection[str]) -> None:
 
 
 async def receive_capture(
-    service: Service, request: Request, known: Collection[str] = ABOUT
+    service: Service, request: Request, key: str, known: Collection[str] = ABOUT
 ) -> tuple[CaptureRecord, dict[str, str]]:
-    """Receives an archive in a multipart body and makes a capture of it. Returns the capture's record and the form's
-    fields.
+    """Receives an archive in a multipart body and makes a capture of it. ``key`` is the caller's. Returns the capture's
+    record and the form's fields.
 
     Raises InputError for fields that are not in ``known`` and for faults of the archive, and what ``receive_multipart``
     and ``Captures.accept`` raise.
@@ -193,14 +194,15 @@ async def receive_capture(
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
         check_fields(fields, known)
-        record = await service.threads.check(service.captures.accept, archive, folder, CaptureMetadata.of(fields))
+        about, hung_up = CaptureMetadata.of(fields), partial(await_hang_up, request.receive)
+        record = await service.threads.check(service.captures.accept, archive, folder, about, key=key, hung_up=hung_up)
     return record, fields
 
 
-async def receive_calibration_pictures(service: Service, request: Request) -> Calibration:
-    """Receives an archive in a multipart body and queues a calibration. The archive holds IMAGES/ and board.toml or, if
-    the field ``from`` is ``scene``, photographs. Raises InputError naming every fault, and what ``receive_multipart``
-    raises."""
+async def receive_calibration_pictures(service: Service, request: Request, key: str) -> Calibration:
+    """Receives an archive in a multipart body and queues a calibration. ``key`` is the caller's. The archive holds
+    IMAGES/ and board.toml or, if the field ``from`` is ``scene``, photographs. Raises InputError naming every fault,
+    and what ``receive_multipart`` raises."""
     await service.threads.disk(check_length, request, service.store, service.settings)
     with service.store.incoming() as folder:
         archive, fields = await receive_multipart(request, folder, service.store, service.settings, service.threads)
@@ -215,4 +217,5 @@ async def receive_calibration_pictures(service: Service, request: Request) -> Ca
                 compose("calibration-source-unknown"),
                 [compose("field-from-unknown", value=f"{source!r:.80}")],
             )
-        return await service.threads.check(accept[source], archive, folder, label)
+        hung_up = partial(await_hang_up, request.receive)
+        return await service.threads.check(accept[source], archive, folder, label, key=key, hung_up=hung_up)

@@ -2,8 +2,10 @@
 otherwise keep its connection and its locks for ever."""
 
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import anyio
+from starlette.types import Receive
 
 from rig.messages.message import compose
 from server.wire.problems import Problem
@@ -21,9 +23,22 @@ async def with_idle_timeout(stream: AsyncIterator[bytes], silent_s: float) -> As
 
 
 async def _next(stream: AsyncIterator[bytes], silent_s: float) -> bytes | None:
+    async with within(silent_s):
+        return await anext(stream, None)
+
+
+@asynccontextmanager
+async def within(seconds: float) -> AsyncIterator[None]:
+    """Raises a 408 problem if the block takes longer than ``seconds``."""
     try:
-        with anyio.fail_after(silent_s):
-            return await anext(stream, None)
+        with anyio.fail_after(seconds):
+            yield
     except TimeoutError as error:
-        detail = compose("body-silent", seconds=silent_s)
+        detail = compose("body-silent", seconds=seconds)
         raise Problem(408, "body-silent", detail, headers={"Connection": "close"}) from error
+
+
+async def await_hang_up(receive: Receive) -> None:
+    """Returns once the client of a request whose body was read has closed the connection."""
+    while (await receive())["type"] != "http.disconnect":
+        pass

@@ -148,6 +148,7 @@ NAMED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", REFUSED)
 def test_a_fault_that_spoils_everything_is_refused(fault: str, good: Session) -> None:
     plant, error, said = REFUSED[fault]
@@ -155,6 +156,7 @@ def test_a_fault_that_spoils_everything_is_refused(fault: str, good: Session) ->
         calibrate_detections(plant(good))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", NAMED)
 def test_a_fault_in_some_shots_is_named_and_left_out(fault: str, good: Session) -> None:
     plant, shot, said = NAMED[fault]
@@ -219,6 +221,7 @@ def test_what_contradicts_the_last_calibration_is_named(
     assert any(re.search(said, f"{check.detail}: {check.advice}") for check in found), found
 
 
+@pytest.mark.slow
 def test_what_contradicts_the_last_calibration_or_the_ruler_is_refused(good: Session) -> None:
     stretched = replace(CHECKERBOARD, measured_width_mm=229.0, measured_height_mm=150.0)
     detections = replace(good.detections, board=stretched)
@@ -228,6 +231,7 @@ def test_what_contradicts_the_last_calibration_or_the_ruler_is_refused(good: Ses
     assert error.value.calibration is not None  # for the report
 
 
+@pytest.mark.slow
 def test_the_same_rig_passes_every_check(good: Session) -> None:
     calibration = calibrate_detections(good.detections, previous=good.rig)
     assert [check.name for check in calibration.checks if check.passed is not True] == []

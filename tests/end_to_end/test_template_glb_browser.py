@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.applications.templates.animated import AnimatedMesh, animated_mesh
+from pipeline.applications.templates.write.shapes import animated_glb
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import load_model
 from pipeline.head_model.visemes import VISEMES
-from pipeline.results.write_template_shapes import animated_glb
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from tests.end_to_end.test_glb_browser import open_page, site

@@ -12,6 +12,7 @@ from rig.geometry import (
     cross_matrix,
     look_at,
     nearest_rotation,
+    nearest_to_rays,
     rigid_fit,
     rotation_from_vector,
     vector_from_rotation,
@@ -138,3 +139,21 @@ def test_a_small_rotation_has_every_digit() -> None:
     assert rotation[1, 1] == pytest.approx(np.cos(angle), abs=3e-16)
     tiny = np.array([0.0, 5e-13, 0.0])
     np.testing.assert_allclose(vector_from_rotation(rotation_from_vector(tiny)), tiny, rtol=1e-3)
+
+
+def test_the_point_nearest_to_rays_is_where_they_meet_and_weights_decide_where_they_do_not() -> None:
+    rng = np.random.default_rng(1)
+    centres, points = rng.normal(0.0, 1000.0, (4, 3)), rng.normal(0.0, 50.0, (6, 3))
+    rays = points - centres[:, None]
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    np.testing.assert_allclose(nearest_to_rays(centres, rays), points, atol=1e-6)
+    rays[3] = rays[3, ::-1]  # the fourth looks at other points
+    weights = np.ones((4, 6))
+    assert np.linalg.norm(nearest_to_rays(centres, rays, weights) - points, axis=1).max() > 1.0
+    weights[3] = 0.0
+    np.testing.assert_allclose(nearest_to_rays(centres, rays, weights), points, atol=1e-6)
+
+
+def test_the_ridge_keeps_the_point_of_parallel_rays_finite() -> None:
+    along = np.array([[0.0, 0.0, 1.0]] * 2)
+    np.testing.assert_allclose(nearest_to_rays(np.array([[1.0, 0, 0], [3.0, 0, 0]]), along), [2.0, 0, 0], atol=1e-6)

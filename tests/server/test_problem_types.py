@@ -22,7 +22,7 @@ KIND_IN = {
     **{kind.__name__: 0 for kind in Refused.__subclasses__() if kind is not NotFound},
 }
 """Where the type stands among the arguments."""
-NOT_RAISED_IN_JOBS = ("tests.laboratory.experiments", "server")
+NOT_RAISED_IN_JOBS = ("server",)
 
 
 def test_every_type_that_the_service_gives_is_in_the_table_and_no_other_is() -> None:

@@ -28,7 +28,7 @@ from rig.studio.scene.layout import rig_from_directions
 from rig.studio.scene.lights import LAMPS, Lamp
 from rig.studio.scene.subject import Subject, dress, random_look
 from rig.studio.sensor.sensor import Sensor, expose, focus
-from tests.laboratory.experiments.people.expressions import drawn_weights
+from tests.support.drawn_expressions import drawn_weights
 
 SEED = 11
 AZIMUTHS_DEG = (0, 0, 0, -25, 25, -45, 45, -65, 65, -85, 85)

@@ -11,8 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet
-
 from server.batch.captures import find_captures
 from server.batch.folder import BatchFolder
 from server.batch.plan import BatchTask, plan_batch
@@ -52,9 +50,6 @@ class Silent:
     def report(self, name: str, share: float) -> None:
         assert 0 <= share <= 1
 
-    def leave(self, name: str) -> None:
-        self.events.append(("leave", name))
-
     def end(self, outcome: Outcome) -> None:
         self.events.append((outcome.state, outcome.name))
 
@@ -69,7 +64,7 @@ def run_pinned(folder: Path, out: Path, *, workers: int = 2, shard: Shard = WHOL
     target = BatchFolder(out)
     share_tasks = [task for task in tasks if shard.takes(task.capture.name)]
     options = {"observer": Silent(), "variables": {}, "work": work, **options}
-    run = BatchRun(target, share_tasks, workers=workers, **options)
+    run = BatchRun(target, share_tasks, workers=workers, shard=shard, **options)
     return run.run(lambda: write_summary(target, tasks))
 
 
@@ -84,6 +79,8 @@ def _without_seconds(path: Path) -> bytes:
         report = json.loads(path.read_text())
         return json.dumps({key: value for key, value in report.items() if key != "seconds"}).encode()
     if path.name == "heads.parquet":
+        import pyarrow.parquet  # it starts a thread, and a process that forks must have none
+
         rows = pyarrow.parquet.read_table(path).drop_columns("seconds").to_pylist()
         return json.dumps(rows).encode()
     if path.name == "heads.csv":

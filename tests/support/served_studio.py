@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.support import fork_server
+
 ROOT = Path(__file__).resolve().parents[2]
 CLI = [sys.executable, "-m", "server.cli"]
 START_S, STOP_S = 180.0, 20.0
@@ -17,7 +19,7 @@ START_S, STOP_S = 180.0, 20.0
 @contextmanager
 def served_studio(folder: Path, *options: str) -> Iterator[dict[str, Any]]:
     """What ``--json`` prints once the studio is open. At the end it gets the signal of Ctrl-C and must end well."""
-    process = subprocess.Popen(
+    process = fork_server.Popen(
         [*CLI, "simulate", str(folder), "--serve", "--json", *options], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
@@ -41,7 +43,7 @@ def served_studio(folder: Path, *options: str) -> Iterator[dict[str, Any]]:
 
 def command(*arguments: str, timeout_s: float = 600.0) -> dict[str, Any]:
     """What an ``eigenhead`` command prints with --json. Raises CalledProcessError, its words in stderr."""
-    done = subprocess.run([*CLI, *arguments, "--json"], cwd=ROOT, capture_output=True, text=True, timeout=timeout_s)
+    done = fork_server.run([*CLI, *arguments, "--json"], cwd=ROOT, timeout_s=timeout_s)
     if done.returncode:
         raise subprocess.CalledProcessError(done.returncode, arguments, done.stdout, done.stderr)
     return json.loads(done.stdout)

@@ -22,6 +22,7 @@ from rig.formats.captures.archive import pack_folder
 from rig.formats.captures.capture_folder import write_capture
 from rig.geometry import RigidTransform
 from rig.rig import Rig
+from tests.support import fork_server
 
 ROOT = Path(__file__).resolve().parents[2]
 running: "list[RunningService]" = []
@@ -35,6 +36,7 @@ class RunningService:
     environment: dict[str, str]
     port: int
     worker: bool = True
+    forked: bool = True
     process: "subprocess.Popen[bytes] | None" = None
     log: Path = field(init=False)
 
@@ -49,7 +51,7 @@ class RunningService:
         """``terminal``: an open pseudo-terminal that becomes the service's own, so that Ctrl-C there reaches it."""
         command = [sys.executable, "-m", "server.cli", "serve", "--data", str(self.data), "--port", str(self.port)]
         with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
+            self.process = (fork_server.Popen if self.forked else fork_server.ExecPopen)(
                 command + ([] if self.worker else ["--no-worker"]),
                 env=os.environ | self.environment,
                 cwd=ROOT,
@@ -95,13 +97,14 @@ class RunningService:
 
 @contextmanager
 def running_service(
-    data: Path, *, worker: bool = True, terminal: int | None = None, **settings: str
+    data: Path, *, worker: bool = True, terminal: int | None = None, forked: bool = True, **settings: str
 ) -> Iterator[RunningService]:
-    """``settings`` become EIGENHEAD_<NAME> variables; the work is the tiny one unless given, and there are no pages,
-    which take their time to import. A test that fails shows the end of the logs of ``running``."""
+    """Without ``forked`` each process begins with exec, as an operator's does. ``settings`` become EIGENHEAD_<NAME>
+    variables; the work is the tiny one unless given, and there are no pages. A test that fails shows the end of the
+    logs of ``running``."""
     chosen = {"work": "tests.support.tiny:work", "heartbeat_s": "0.5", "poll_s": "0.1", "console": "false"} | settings
     environment = {f"EIGENHEAD_{name.upper()}": value for name, value in chosen.items()}
-    service = RunningService(data, environment, free_port(), worker)
+    service = RunningService(data, environment, free_port(), worker, forked)
     running.append(service)
     try:
         service.start(terminal)

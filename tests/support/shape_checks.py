@@ -1,4 +1,4 @@
-"""Annotations as checks: what the fast tests hold every call of rig, pipeline and calibration to.
+"""Annotations as checks: what `make test-shapes` holds every call of rig, pipeline and calibration to.
 
 beartype checks each value once, its shape by jaxtyping's types. jaxtyping's own import hook does the same, but binds
 every call's arguments to a signature and checks them a second time with the answer: measured on a calibration of many

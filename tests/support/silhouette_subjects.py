@@ -1,15 +1,16 @@
 """Silhouettes of random heads of the model with the studio's hair and shirt, and rigs that are off by a known error."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from calibration.adjustment.gauge import align_world, image_distance, moved
 from pipeline.contour_fit.problem import camera_information
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
-from rig.geometry import Similarity
+from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
@@ -19,6 +20,8 @@ from rig.studio.scene.hair import grow
 from rig.studio.scene.subject import random_look, random_pose
 
 SPREAD_DEG, SPREAD_MM = 4.0, 12.0  # how subjects sit
+MODES = 60
+START_DEG, START_MM = 2.0, 4.0  # of a fit
 
 
 def captures_of(
@@ -69,3 +72,26 @@ def disturbed(rig: Rig, error_px: float, rng: np.random.Generator) -> Rig:
 
 def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Head:
+    """A subject with its truth: vertices of the bare head in the world (mm), and where a fit starts."""
+
+    seen: dict[str, Silhouette]
+    truth: Float[np.ndarray, "v 3"]
+    start: Similarity
+
+
+def heads_of(renderer: Renderer, rig: Rig, count: int, rng: np.random.Generator, *, bare: bool) -> list[Head]:
+    model, heads = load_model(), []
+    for head_rng in rng.spawn(count):
+        vertices, faces, pose = dressed_head(model, rig, head_rng, MODES, bare=bare)
+        with renderer.silhouette_set(rig, faces) as drawn:
+            masks = drawn.masks(pose.apply(vertices))
+        turn = rotation_from_vector(np.radians(START_DEG) * head_rng.standard_normal(3) / np.sqrt(3.0))
+        shift = START_MM * head_rng.standard_normal(3) / np.sqrt(3.0)
+        start = Similarity(1.0, turn @ pose.rotation, pose.translation + shift)
+        seen = {name: silhouette_from_mask(mask) for name, mask in masks.items()}
+        heads.append(Head(seen, pose.apply(vertices)[: model.levels["full"].count], start))
+    return heads

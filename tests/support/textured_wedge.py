@@ -102,6 +102,11 @@ def write_photographs(folder: Path, rig: Rig, shots: Mapping[str, int] | None = 
 
 @cache
 def solved() -> SceneCalibration:
+    """The wedge as ``solve`` calibrates it, once a session."""
+    return solve()
+
+
+def solve() -> SceneCalibration:
     """The wedge calibrated from its photographs, its scale from the tag."""
     with TemporaryDirectory() as folder:
         photos = write_photographs(Path(folder) / "photos", wedge_rig())

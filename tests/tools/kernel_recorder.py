@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.compute.jit import KeptFunction
 from pipeline.compute.kernel_list import Kernel, text_from_type
+from rig.jit import KeptFunction
 
 
 @contextmanager

@@ -33,7 +33,7 @@ WIDTH = 100
 ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
     "heads": ("Heads", ("reconstruct", "batch", "check", "export")),
     "clinic": ("Clinic", ("compare", "register", "measure")),
-    "trials": ("Trials", ("simulate", "demo", "verify", "experiments")),
+    "trials": ("Trials", ("simulate", "demo", "verify")),
     "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
     "rig": ("The rig", ("rig",)),
     "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),

@@ -21,7 +21,8 @@ from rig.atomic_write import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ROOT / "docs" / "results"
-DOCUMENTS = (ROOT / "docs" / "results.md", *sorted((ROOT / "docs" / "lab-notes").glob("*.md")), ROOT / "README.md")
+NOTES = ROOT / "tests" / "laboratory" / "notes"
+DOCUMENTS = (ROOT / "docs" / "results.md", *sorted(NOTES.glob("*.md")), ROOT / "README.md")
 TABLE = re.compile(r"(<!-- table: ([\w.-]+) -->\n\n)(.*?)(\n*<!-- end of table -->)", re.DOTALL)
 PLACE = re.compile(r"\{([\w.-]+):([^{}]*)\}")
 HOURS_MOST = 12

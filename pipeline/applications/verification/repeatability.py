@@ -5,7 +5,6 @@ remove where the subject sat: each head is laid on the mean of all over the give
 anew (generalised Procrustes analysis without scale; Gower 1975, https://doi.org/10.1007/BF02291478).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,13 +76,3 @@ def scatter(
     along = np.einsum("nvc,vc->nv", off, vertex_normals(mean, faces))
     free = len(heads) - 1
     return Scatter(mean, np.sqrt((off**2).sum(axis=(0, 2)) / free), np.sqrt((along**2).sum(axis=0) / free))
-
-
-def by_region(
-    found: Scatter,
-    stated_mm: Float[np.ndarray, " v"],
-    weights: Float[np.ndarray, " v"],
-    regions: Mapping[str, Bool[np.ndarray, " v"]],
-) -> dict[str, dict[str, float]]:
-    """Returns the figures of ``Scatter.figures`` for every region that has vertices."""
-    return {name: found.figures(stated_mm, weights, kept) for name, kept in regions.items() if kept.any()}

@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from pipeline.applications.templates.write.texture import MAX_TILES, Tile, corner_tiles, filled
 from pipeline.applications.wrapping.wrap import Wrapped
 from pipeline.geometry.raster_kernels import interpolate, rasterise
-from pipeline.texturing.template_texture import MAX_TILES, Tile, corner_tiles, filled
 from rig.formats.meshes.polygon_obj import fan
 from rig.mesh import vertex_normals
 

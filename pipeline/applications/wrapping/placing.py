@@ -20,7 +20,7 @@ from rig.mesh import vertex_normals
 from rig.render.renderer import Renderer
 
 # Deviation of a found point, an axis: the network errs by 1 to 2 mm, but all points of a region together. With 2 mm the
-# landmarks of a known head came 2.0 mm off, with 10 mm 1.0 (`experiments wrap`, draw-b): the surface knows better.
+# landmarks of a known head came 2.0 mm off, with 10 mm 1.0 (the laboratory's `wrap`, draw-b): the surface knows better.
 MARK_MM = 10.0
 LID_MM = (20.0, 0.5, 3.0)  # the same of the eyes' network along x, y, z of the head: it tells how high a lid's edge is
 EDGES = np.array([3, 4, 5, 11, 12, 13])  # of ``lids_mm``, an eye: middles of the lids; near corners they end early

@@ -8,11 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pipeline.applications.templates.write.mesh import template_materials, tile_suffix
 from pipeline.applications.wrapping.baking import baked_textures, vertex_colours
 from pipeline.applications.wrapping.wrap import Wrapped, residual_colours, surface_in_head
 from pipeline.results.clay import clay
 from pipeline.results.overlays import contact_sheet
-from pipeline.results.write_template import template_materials, tile_suffix
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.ply import ply_bytes
 from rig.formats.meshes.polygon_obj import polygon_obj_bytes

@@ -83,13 +83,15 @@ def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 
 def _border(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " b"]:
     """The vertices of the one open border, in the order of its directed edges."""
-    known = {(int(a), int(b)) for a, b in _edges(faces)}
-    following = {a: b for a, b in known if (b, a) not in known}
-    vertices, edges = len(np.unique(faces)), (len(known) + len(following)) // 2
+    edges, base = _edges(faces).astype(np.int64), int(faces.max()) + 1
+    known = np.unique(edges @ [base, 1])
+    open_edges = known[~np.isin(known, edges @ [1, base])]
+    following = dict(zip((open_edges // base).tolist(), (open_edges % base).tolist(), strict=True))
     loop = [next(iter(following))] if following else []
     while loop and following[loop[-1]] != loop[0]:
         loop.append(following[loop[-1]])
-    if vertices - edges + len(faces) != 1 or len(loop) != len(following):
+    characteristic = len(np.unique(faces)) - (len(known) + len(open_edges)) // 2 + len(faces)
+    if characteristic != 1 or len(loop) != len(open_edges):
         raise NoLayout
     return np.array(loop)
 
@@ -115,7 +117,8 @@ def _cut_open(
 ) -> tuple[Int[np.ndarray, "f 3"], Int[np.ndarray, " n"]]:
     """Faces with the path's vertices doubled, but for its end; and the vertex that each vertex was."""
     edges = _edges(faces)
-    face_of = {(int(a), int(b)): k % len(faces) for k, (a, b) in enumerate(edges)}
+    beside = np.flatnonzero(np.isin(edges, path).any(axis=1))
+    face_of = dict(zip(map(tuple, edges[beside].tolist()), (beside % len(faces)).tolist(), strict=True))
     steps = {(int(a), int(b)) for a, b in pairwise(path)}
     cut = faces.copy()
     for i, vertex in enumerate(path[:-1].tolist()):

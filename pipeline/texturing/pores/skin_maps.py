@@ -9,18 +9,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from jaxtyping import Bool, Float, Float16, Float32, UInt8, UInt16
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
+from pipeline.texturing.chart_colours import CODES, ENCODED, LINEAR
 from pipeline.texturing.decision import Decision
 from pipeline.texturing.layout.model_layout import ModelLayout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.light import fit_light, transfer
 from pipeline.texturing.pores.close_views import CloseViews, halves_of
 from pipeline.texturing.pores.relief import MIN_SKIN, estimate_detail
-from pipeline.texturing.pores.sharp_texture import sharpened_atlas
 from pipeline.texturing.pores.strips import Strips
 from pipeline.texturing.pores.texel_frames import TexelFrames, texel_frames
 from pipeline.texturing.vertex_colours import Texture
@@ -144,3 +144,18 @@ def skin_share(
         total[seen] += weight[seen] * skin[row, column]
         weights[seen] += weight[seen]
     return total / np.maximum(weights, 1e-12)
+
+
+def sharpened_atlas(atlas: Atlas, brightness: Float16[np.ndarray, "s s"]) -> Atlas:
+    """Returns a texture with its light multiplied by the exponential of ``brightness``."""
+    size = len(atlas.image)
+    stored: UInt8[np.ndarray, "s s 3"] = np.empty((size, size, 3), np.uint8)  # blue first, as the painter's
+
+    def work(first: int, last: int) -> None:
+        for strip in range(first, last):
+            rows = slice(strip * STRIP_ROWS, min((strip + 1) * STRIP_ROWS, size))
+            light = LINEAR[atlas.image[rows, :, ::-1]] * np.exp(brightness[rows].astype(np.float32))[:, :, None]
+            stored[rows] = ENCODED[(CODES * np.minimum(light, 1.0) + 0.5).astype(np.int32)]
+
+    in_threads(-(-size // STRIP_ROWS), work)
+    return Atlas(atlas.layout, stored[:, :, ::-1])

@@ -258,17 +258,3 @@ FOREIGN_KEYS: Mapping[str, tuple[str, Table]] = {
     "aniposelib": ("aniposelib: any TOML with its keys", ANIPOSELIB),
     "opencv-yaml": ("OpenCV's YAML, EasyMocap", OPENCV_YAML),
 }
-
-
-def markdown_table(table: Table) -> str:
-    """Returns the table for ``docs/foreign-cameras.md``, with one row for all keys that share a description."""
-    rows: dict[tuple[Treatment, str | Message], list[str]] = {}
-    for key, rule in table.items():
-        rows.setdefault((rule.treatment, rule.why), []).append(f"`{key}`")
-    order: tuple[Treatment, ...] = ("read", "refused", "told", "nothing")
-    lines = ["| key | | |", "|---|---|---|"]
-    for treatment in order:
-        for (kind, why), keys in rows.items():
-            if kind == treatment:
-                lines.append(f"| {' '.join(keys)} | {treatment} | {why} |")
-    return "\n".join(lines)

@@ -33,6 +33,11 @@ IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM")
 
 PictureKind = Literal["colour", "grey", "mask"]
 JPEG = b"\xff\xd8\xff"
+NO_MEMORY = -4  # cv::Error::StsNoMem
+START_OF_SCAN = 0xDA
+WITHOUT_LENGTH = frozenset((0x00, 0x01, 0xC8, *range(0xD0, 0xDA), *range(0xF0, 0xFE)))  # segments of a marker alone
+SEGMENTS_MOST, METADATA_BYTES = 1000, 16 << 20  # in front of a JPEG's pixels; depth maps of telephones have 5 MB
+EXIF_MOST = 16  # segments of EXIF; the standard knows one
 NETPBM = re.compile(
     rb"P[2356](?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+\d+(?:\s|#[^\n]*\n)+(\d+)\s"
 )  # its last number is the value of white
@@ -197,6 +202,8 @@ def _faults_of(where: str, fault: Message | None = None) -> Iterator[None]:
     except Image.DecompressionBombError as error:
         raise InputError(where, [compose("picture-huge", most=PIXELS_MOST)]) from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, cv2.error) as error:
+        if isinstance(error, cv2.error) and error.code == NO_MEMORY:
+            raise MemoryError from error
         raise InputError(where, [said]) from error
 
 
@@ -211,8 +218,28 @@ def _header_size(data: bytes, suffix: str) -> tuple[tuple[int, int], bytes]:
     if data[FTYP] in OTHER_BRANDS or data.startswith(tuple(OTHER_BEGINNINGS)):
         kind = OTHER_BRANDS.get(data[FTYP]) or next(k for b, k in OTHER_BEGINNINGS.items() if data.startswith(b))
         raise InputError("picture", [compose("picture-of-kind", kind=kind)])
+    _check_metadata(data)
     with Image.open(BytesIO(data), formats=IMAGE_FORMATS) as header:  # reads the header only
         return header.size, header.info.get("icc_profile") or b""
+
+
+def _check_metadata(data: bytes) -> None:
+    """Raises InputError for a JPEG with more metadata before its pixels than a camera writes: Pillow joins segments of
+    EXIF in a time that grows with their square. Steps from segment to segment as Pillow does."""
+    if not data.startswith(JPEG):
+        return
+    at, segments, exif = 2, 0, 0
+    while data[at : at + 1] == b"\xff" and at + 1 < len(data) and data[at + 1] != START_OF_SCAN:
+        exif += data[at + 4 : at + 10] == b"Exif\0\0"
+        if data[at + 1] == 0xFF:
+            at += 1
+        elif data[at + 1] in WITHOUT_LENGTH:
+            at += 2
+        else:
+            at += 2 + max(2, int.from_bytes(data[at + 2 : at + 4], "big"))
+        segments += 1
+        if segments > SEGMENTS_MOST or at > METADATA_BYTES or exif > EXIF_MOST:
+            raise InputError("picture", [compose("picture-metadata-large", megabytes=METADATA_BYTES >> 20)])
 
 
 def _decoded(data: bytes, suffix: str, kind: PictureKind, *, halved: int, bits: int) -> np.ndarray:

@@ -20,6 +20,7 @@ TEMPLATES = {
     "batch-name-wrong": "{where}: {name} cannot name a folder of results; say another one in the column name",
     "batch-name-twice": "{where} have the same name, {name}: say another one in the column name",
     "batch-name-within": "{name} would lie within the result of {outer}: say another name in the column name",
+    "batch-share-taken": "another process works on share {share} of this folder: wait for its end, or divide the captures with --shard K/N.",
     "batch-shard-wrong": "{text} is no share such as 2/8: a number from 1 to the count, which is at most {most:,}",
     "batch-out-within": "{out} lies within the capture {capture}; name another place with --out",
     "batch-foreign-files": "{folder} holds what is no result ({names}): move it away, or name another place with --out",

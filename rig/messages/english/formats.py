@@ -48,6 +48,8 @@ TEMPLATES = {
     "shots-in-folders": "no camera has a {what} in {place}: it holds the folders {folders}, and the cameras are called {cameras}; a capture is one shot: leave the files of one of them in {place}",
     "names-differ": "no camera has a {what} in {place}: the cameras are called {cameras}, the files {found}; {remedy}",
     "several-of-each": "{camera} has {count} ({files}): a capture is one shot, leave one of each camera",
+    "camera-pixels-many": "the files of {camera} have {pixels:,} pixels together; at most {most:,} are accepted: send fewer plates or smaller pictures",
+    "picture-metadata-large": "has more metadata than {megabytes} MB, or than a camera writes: save it again without",
     "picture-large": "is {width} x {height} pixels; at most {most:,} are read",
     "picture-damaged": "is damaged: its pixels cannot be decoded",
     "picture-of-kind": "is of the kind {kind}, whatever its name ends in: save it as PNG, JPEG, TIFF, WebP, BMP or PPM",

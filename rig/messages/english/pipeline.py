@@ -128,7 +128,6 @@ TEMPLATES = {
     "depth-contradictory": "the photographs contradict each other about where the surface is: check cameras.json, and that nothing moved",
     "albedo-without-texture": "there is no texture that light could be taken off",
     "albedo-without-face": "too little of the face is seen, or it is black: no light can be told",
-    "old-setting": "{setting} is read as it was meant; write outputs.formats in its place",
     "model-without-layout": "no texture can be laid out for this model, whose surface is not one piece with one open border at the neck: its head has vertex colours alone",
     "camera-gain": "{camera} is {factor:.2f} times as bright as the others: check its exposure",
     "cameras-uneven": "{count} cameras are {least:.2f} to {most:.2f} times as bright as the others ({cameras}): set one exposure and one white balance in all, by hand",

@@ -202,6 +202,7 @@ def bulk(page: Page, event: BulkForm) -> Message | None:
             change = service.captures.untag
         done = each(ids, lambda capture: change(capture, tags))
     elif action == "erase":
+        permit(page.caller, "erase")
         done = each(ids, service.captures.erase)
     else:
         done = each(ids, service.captures.check_unused)
@@ -242,8 +243,8 @@ CapturesPage.actions = {
     "edit": Action("capture", edit),
     "new_session": Action("capture", new_session),
     "edit_session": Action("capture", edit_consent),
-    "erase": Action("capture", erase),
-    "erase_capture": Action("capture", erase_capture),
+    "erase": Action("erase", erase),
+    "erase_capture": Action("erase", erase_capture),
     "remove": Action("capture", discard),
     "bulk": Action("capture", bulk),
     "sample": Action("capture", sample),

@@ -4,8 +4,9 @@ import { clock, size } from "/console/static/words.js";
 
 const MAY = {
   read: "look and fetch",
-  capture: "capture, upload, calibrate, erase",
+  capture: "capture, upload, calibrate",
   submit: "start and end jobs",
+  erase: "erase captures with their heads",
   admin: "everything, keys and storage too",
 };
 const HOLDS = {
@@ -48,8 +49,8 @@ export default spoken({
         <div class="line wrap"><input :value="secret" readonly ref="secret" aria-label="The key" class="mono grow" @focus="$event.target.select()"><button class="b" @click="copy">{{ say(copied ? 'Copied' : 'Copy') }}</button><button class="b main-action" @click="secret = ''; copied = false">I have it</button></div></div>
       <div v-if="!state.loading" class="columns wide" style="grid-template-columns: minmax(0, 1fr) minmax(0, 1fr)">
         <div class="panel pad scroll stack" tabindex="0" role="region" aria-label="API keys">
-          <div class="line"><h2 class="grow">API keys</h2><button v-if="state.admin" class="b main-action" id="new-key" @click="form = { label: '', scopes: state.open ? ['admin'] : ['read'] }">New key</button></div>
-          <p v-if="state.open" class="small warn">Without keys nobody but the people at this machine reaches the service. The first key closes it to whoever has none, in the browser, too.</p>
+          <div class="line"><h2 class="grow">API keys</h2><button v-if="state.admin && !state.open" class="b main-action" id="new-key" @click="form = { label: '', scopes: ['read'] }">New key</button></div>
+          <p v-if="state.open" class="small warn">Without keys nobody but the people at this machine reaches the service. The first key is made by eigenhead keys add NAME at the machine; it closes the service to whoever has none, in the browser, too.</p>
           <p v-else-if="!state.admin" class="small muted">Your key has no scope admin. Sign in with one that has, or use <code>eigenhead keys</code> at the machine.</p>
           <form v-if="form" class="panel pad stack" style="background: var(--raised)" aria-label="New key" @submit.prevent="act('add_key', form)">
             <label class="field">Name<input v-model="form.label" id="key-name" maxlength="200" required placeholder="who or what uses it"></label>

@@ -4,14 +4,12 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TypedDict
 
-from nicegui import app as pages
 from nicegui import ui
 from nicegui.events import GenericEventArguments
 from starlette.responses import RedirectResponse
 
 from rig.errors import InputError
 from rig.messages.message import Message, MessageDocument, compose
-from server.console.identity import KEY_ID
 from server.console.page import Action, Chosen, Page, remove_all_later, shared, show
 from server.errors import Conflict
 from server.services.keys import LOCAL, SCOPES, Caller
@@ -96,7 +94,6 @@ class ServicePage(Page, component="service.js"):
     async def _act(self, event: GenericEventArguments) -> None:
         await super()._act(event)
         if self.secret is not None:  # over the page's socket alone, and never in the state that a look makes
-            pages.storage.user[KEY_ID] = self.caller.key
             self.run_method("show_key", self.secret)
             self.secret = None
 
@@ -142,8 +139,7 @@ def _days(days: float | None) -> Message:
 
 
 def add_key(page: ServicePage, event: KeyForm) -> Message:
-    """Makes an API key. The first key closes an open service, so it must have the scope admin; the page continues with
-    it. Raises InputError naming every fault of the form."""
+    """Makes an API key. Raises InputError naming every fault of the form, and Forbidden where no key exists."""
     name, scopes = event["label"].strip(), [scope for scope in SCOPES if scope in event["scopes"]]
     faults = []
     if not name or len(name) > NAME_MOST:
@@ -152,14 +148,9 @@ def add_key(page: ServicePage, event: KeyForm) -> Message:
         faults.append(compose("key-name-with-control-characters"))
     if not scopes:
         faults.append(compose("key-scopes-wanted"))
-    if page.caller.key == LOCAL and "admin" not in scopes:
-        faults.append(compose("first-key-needs-admin"))
     if faults:
         raise InputError("key", faults)
-    page.secret = page.service.keys.add(name, tuple(scopes))
-    if page.caller.key == LOCAL:
-        page.caller = Caller(page.secret.split("_")[1], frozenset(scopes))
-        return compose("first-key-made", name=f"{name!r}")
+    page.secret = page.service.keys.add_for(page.caller, name, tuple(scopes))
     return compose("key-made", name=f"{name!r}")
 
 

@@ -39,11 +39,11 @@ async def make_calibration(service: ServiceOf, caller: Taker, request: Request, 
         wanted = _parsed(await _small_body(request))
         known, shots, label = service.calibrations, wanted.captures, wanted.label
         if wanted.source == "scene":
-            made = await service.threads.check(known.add_scene, shots, wanted.scale, label)
+            made = await service.threads.check(known.add_scene, shots, wanted.scale, label, key=caller.key)
         else:
-            made = await service.threads.check(known.add_shots, wanted.board or {}, shots, label)
+            made = await service.threads.check(known.add_shots, wanted.board or {}, shots, label, key=caller.key)
     else:
-        made = await receive_calibration_pictures(service, request)
+        made = await receive_calibration_pictures(service, request, caller.key)
     response.headers["Location"] = f"/v1/calibrations/{made.id}"
     return CalibrationOut.model_validate(made)
 

@@ -58,7 +58,7 @@ def take_capture(service: ServiceOf, caller: Taker, wanted: NewCapture, response
 )
 async def upload_capture(service: ServiceOf, caller: Taker, request: Request, response: Response) -> CaptureOut:
     """Receives a capture folder as an archive. If it has faults, 422 names all of them and nothing is stored."""
-    record, _ = await receive_capture(service, request)
+    record, _ = await receive_capture(service, request, caller.key)
     return _created(record, response)
 
 
@@ -77,7 +77,7 @@ async def import_capture(service: ServiceOf, caller: Taker, wanted: NewImport, r
             archive = await service.threads.disk(fetch)
         else:
             archive = await fetch_archive(service, wanted.url, folder)
-        record = await service.threads.check(service.captures.accept, archive, folder, about)
+        record = await service.threads.check(service.captures.accept, archive, folder, about, key=caller.key)
     return _created(record, response)
 
 
@@ -108,9 +108,8 @@ def list_captures(
 @router.post("/captures/bulk", responses=documented(400, 413, 415, 507))
 def change_captures(service: ServiceOf, caller: Taker, wanted: CaptureBulk) -> BulkOut:
     """Applies one action to many captures. Captures to which it cannot be applied are reported and do not stop the
-    others. ``reconstruct`` needs the scope ``submit``."""
-    if wanted.action == "reconstruct" and not caller.may("submit"):
-        raise Forbidden("scope-missing", compose("your-key-lacks-scope", scope="'submit'"))
+    others. ``reconstruct`` needs the scope ``submit``, too, and ``erase`` the scope ``erase``."""
+    caller.check_may({"reconstruct": "submit", "erase": "erase"}.get(wanted.action, "capture"))
     work = ReconstructionRequest(wanted.model, wanted.settings)
     work.check()
     actions: dict[str, Callable[[str], object]] = {
@@ -198,9 +197,10 @@ def delete_capture(
     """Removes a capture with its images. Its jobs and their results, which show the face, stay. 409 while a queued or
     running job needs it.
 
-    With ``erase`` its jobs are cancelled and removed with their results, too.
+    With ``erase`` its jobs are cancelled and removed with their results, too; that needs the scope ``erase``, too.
     """
     if erase:
+        caller.check_may("erase")
         service.captures.erase(capture_id)
     else:
         service.captures.remove(capture_id)
@@ -222,7 +222,7 @@ async def reconstruct_upload(
 ) -> JobOut:
     """Receives a capture and queues its job in one call. The same Idempotency-Key with the same files and settings
     returns the first job."""
-    record, fields = await receive_capture(service, request, (*ABOUT, *OF_JOB))
+    record, fields = await receive_capture(service, request, caller.key, (*ABOUT, *OF_JOB))
     try:
         name = (fields.get("name") or "")[:TEXT_MOST]
         place = fields.get("deliver_to") or None

@@ -10,6 +10,8 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse, StreamingResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from rig.errors import InputError
+from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
 from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Key, Limit, NewDelivery, Sought
 from server.http.schemas import Idempotency, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
@@ -65,15 +67,13 @@ def list_jobs(
     sort: JobOrder = "-created",
     limit: Limit = 100,
     cursor: Cursor = None,
-    offset: Annotated[int, Query(ge=0, le=1_000_000, deprecated=True)] = 0,
+    offset: Annotated[str | None, Query(include_in_schema=False)] = None,
 ) -> JobList:
     """Lists jobs in pages, newest first by default; ``q`` searches name, model, method, level, id and the capture's
-    words. ``offset`` serves older clients; a cursor neither repeats nor omits a job."""
+    words."""
+    if offset is not None:  # of clients before 0.3.0, which would read the first page again and again
+        raise InputError("offset", [compose("cursor-in-place-of-offset")])
     query = JobQuery(q, None if state is None else STATUSES[state], capture, session, batch, sort)
-    if offset:
-        old = service.jobs.find(state=state, capture=capture, session=session, limit=limit, offset=offset)
-        total = service.jobs.page(query, 1).total
-        return JobList(jobs=[JobOut.model_validate(job) for job in old], next=None, total=total)
     found = service.jobs.page(query, limit, cursor)
     return JobList(jobs=[JobOut.model_validate(job) for job in found.items], next=found.next, total=found.total)
 

@@ -102,8 +102,9 @@ def list_templates(service: ServiceOf, caller: Reader) -> TemplateList:
 
 @router.post("/v1/keys", status_code=201, tags=["access"], responses=documented(400, 413, 415, 507))
 def add_key(service: ServiceOf, caller: Admin, wanted: NewKey) -> NewKeyOut:
-    """Makes an API key. The answer is the only time that it is shown."""
-    key = service.keys.add(wanted.name, tuple(wanted.scopes))
+    """Makes an API key. The answer is the only time that it is shown. The first key is made by ``eigenhead keys add``;
+    without any, this is 403."""
+    key = service.keys.add_for(caller, wanted.name, tuple(wanted.scopes))
     return NewKeyOut(id=key.split("_")[1], key=key)
 
 

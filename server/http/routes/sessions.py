@@ -14,6 +14,7 @@ from server.wire.problems import documented
 router = APIRouter(prefix="/v1", tags=["sessions"])
 Reader = Annotated[Caller, Depends(require("read"))]
 Taker = Annotated[Caller, Depends(require("capture"))]
+Eraser = Annotated[Caller, Depends(require("erase"))]
 
 
 @router.post("/sessions", status_code=201, responses=documented(400, 413, 415, 507))
@@ -66,7 +67,7 @@ def edit_session(service: ServiceOf, caller: Taker, session_id: str, wanted: Ses
 
 
 @router.delete("/sessions/{session_id}", status_code=204, responses=documented(404))
-def erase_session(service: ServiceOf, caller: Taker, session_id: str) -> None:
+def erase_session(service: ServiceOf, caller: Eraser, session_id: str) -> None:
     """Erases a session for good: cancels its jobs, then removes images, results, caches and its data in the job
     database."""
     service.sessions.erase(session_id)

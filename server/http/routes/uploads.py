@@ -115,7 +115,7 @@ async def _append(
     if record.capture is None:
         here = await append(service.uploads, record, stream, checksum, service.threads)
     if here == record.length and record.capture is None:
-        record = await service.threads.check(_finish, service, record)
+        record = await service.threads.check(_finish, service, record, key=record.key)
     headers = {"Upload-Offset": str(here)}
     return Response(status_code=204, headers=COMMON | headers | _expires(record) | _location(record))
 

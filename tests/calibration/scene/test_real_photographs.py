@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibration.adjustment.gauge import image_distance
-from tests.laboratory.benchmarks.scene_calibration import buddha, studio
+from tests.support.scene_calibrations import buddha, studio
 
 
 @pytest.mark.slow

@@ -19,8 +19,7 @@ from pipeline.head_model.model import load_model, with_modes
 from rig.geometry import RigidTransform
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from tests.laboratory.benchmarks.silhouette_refinement import MODES, heads_of
-from tests.support.silhouette_subjects import captures_of, disturbed, rms
+from tests.support.silhouette_subjects import MODES, captures_of, disturbed, heads_of, rms
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, expect
 
+from tests.support.attacks import add_keys
 from tests.support.browser import keep_screenshots, violations, visit
 from tests.support.services import RunningService, uploaded_capture
 
@@ -88,7 +89,7 @@ def test_a_key_is_asked_for_and_stays_out_of_every_address(
     browser: Browser, service: RunningService, tmp_path: Path, screenshots: Path
 ) -> None:
     uploaded_capture(service, tmp_path)
-    made = httpx.post(service.url + "/v1/keys", json={"name": "console", "scopes": ["read"]}).json()["key"]
+    (made,) = add_keys(service, "read")
     v = visit(browser, service.url)
     v.page.goto(service.url + "/jobs")
     expect(v.page.get_by_label("API key")).to_be_visible(timeout=30_000)

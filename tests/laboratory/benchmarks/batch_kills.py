@@ -1,25 +1,23 @@
-"""What SIGKILLs leave of a batch; prints one JSON object.
+"""What SIGKILLs leave of a batch: of pinned work, or of heads of the studio at the level span.
 
-    python -m tests.laboratory.benchmarks.batch_kills pinned [CAPTURES] [KILLS] [PROCESSES]   pinned work: 500 captures, 20 kills
-    python -m tests.laboratory.benchmarks.batch_kills real [CAPTURES] [KILLS] [PROCESSES]     heads of the studio, level span: 60
+python -m tests.laboratory batch_kills pinned 500 20
+python -m tests.laboratory batch_kills real 60 20
 
-All processes that are killed have the whole of one folder. ``results``: complete ones at the end; ``bytes_differ``:
+Each process that is killed has a share of one folder. ``results``: complete ones at the end; ``bytes_differ``:
 files that are not those of an undisturbed run (but for seconds); ``left_over``: files that an undisturbed run does not
-have; ``begun_twice``: captures that two undisturbed processes side by side both began, of pinned work, where both have
-the whole folder (``1/1``), and where each has its shard (``1/2``, ``2/2``).
+have; ``begun_twice``: captures that two undisturbed processes with a share each (``1/2``, ``2/2``) both began, of
+pinned work.
 """
 
-import json
 import os
 import random
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rig.render.renderer import Renderer
 from tests.support.pinned_batch import everything_in, pinned_captures
@@ -55,13 +53,14 @@ def finish(running: "list[subprocess.Popen[bytes]]") -> float:
 def kill_often(kind: str, shots: Path, out: Path, *, kills: int, processes: int, seconds: float) -> None:
     """SIGKILL to one process after the other, each started again, spread over the time that the work takes."""
     rng = random.Random(SEED)
-    running = [start(kind, shots, out) for _ in range(processes)]
+    shares = [f"{number + 1}/{processes}" for number in range(processes)]
+    running = [start(kind, shots, out, shard=share) for share in shares]
     for number in range(kills):
         time.sleep(rng.uniform(0.5, 1.5) * seconds / kills)
         victim = running[number % processes]
         victim.send_signal(signal.SIGKILL)
         victim.wait()
-        running[number % processes] = start(kind, shots, out)
+        running[number % processes] = start(kind, shots, out, shard=shares[number % processes])
     finish(running)
 
 
@@ -74,20 +73,23 @@ def begun_twice(shots: Path, folder: Path, shards: tuple[str, str]) -> int:
     return sum(count > 1 for count in begun.values())
 
 
-def figures_of(kind: str, captures: int, kills: int, processes: int, folder: Path) -> dict[str, Any]:
-    shots = folder / "shots"
+def run(
+    kind: Literal["pinned", "real"], captures: int | None = None, kills: int = 20, processes: int = 2, *, scratch: Path
+) -> dict[str, Any]:
+    """Returns the figures of this module. ``captures``: 500 of pinned work, 60 of real work."""
+    shots, captures = scratch / "shots", captures or (500 if kind == "pinned" else 60)
     if kind == "pinned":
         pinned_captures(shots, captures)
     else:
         with Renderer.create() as renderer:
             small_studio_captures(shots, captures, renderer)
-    undisturbed, out = folder / "undisturbed" / "heads", folder / "killed" / "heads"
+    undisturbed, out = scratch / "undisturbed" / "heads", scratch / "killed" / "heads"
     seconds = finish([start(kind, shots, undisturbed)])
     began = time.monotonic()
     kill_often(kind, shots, out, kills=kills, processes=processes, seconds=seconds)
     killed_s = time.monotonic() - began
     wanted, found = everything_in(undisturbed), everything_in(out)
-    return {
+    figures = {
         "captures": captures,
         "kills": kills,
         "processes": processes,
@@ -97,24 +99,6 @@ def figures_of(kind: str, captures: int, kills: int, processes: int, folder: Pat
         "left_over": len(found.keys() - wanted.keys()),
         "seconds_undisturbed": round(seconds, 1),
         "seconds_with_kills": round(killed_s, 1),
-    } | ({"begun_twice": twice_of_all(shots, folder)} if kind == "pinned" else {})
-
-
-def twice_of_all(shots: Path, folder: Path) -> dict[str, int]:
-    found = {}
-    for shards in (("1/1", "1/1"), ("1/2", "2/2")):
-        both = folder / shards[0].replace("/", "-")
-        both.mkdir()
-        found[" and ".join(shards)] = begun_twice(shots, both, shards)
-    return found
-
-
-def main(kind: str, *numbers: str) -> None:
-    captures, kills, processes = [*map(int, numbers), *(500 if kind == "pinned" else 60, 20, 2)[len(numbers) :]]
-    with tempfile.TemporaryDirectory() as folder:
-        figures = figures_of(kind, captures, kills, processes, Path(folder))
-    sys.stdout.write(json.dumps({"figures": figures}, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+    }
+    twice = {"begun_twice": begun_twice(shots, scratch, ("1/2", "2/2"))} if kind == "pinned" else {}
+    return {"figures": figures | twice}

@@ -1,23 +1,18 @@
 """Captures in a row from the studio's devices: does anything pile up?
 
-    python tests/laboratory/benchmarks/capture_leaks.py [--captures 500] [--width 1024 --height 768] [--json]
+python -m tests.laboratory capture_leaks --captures 500 --width 1024 --height 768
 
 One session takes the captures and writes each folder over the last one. Printed are resident memory, threads and open
 descriptors of the process (studio and session together) every fiftieth capture, their growth from the first tenth to
 the end, and the seconds of a capture.
 """
 
-import argparse
 import gc
-import json
 import shutil
-import sys
-import tempfile
 import threading
 import time
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +23,7 @@ from rig.camera import Camera, Intrinsics
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.rig_toml import read_rig_config
 from rig.geometry import RigidTransform
+from rig.progress import Progress
 from rig.rig import Rig
 from rig.studio.devices.serve import StudioDevices
 from tests.support.textured_studio import NAMES, FlatStudio
@@ -47,31 +43,17 @@ def measure() -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Captures in a row: does anything pile up?")
-    parser.add_argument("--captures", type=int, default=500)
-    parser.add_argument("--width", type=int, default=320)
-    parser.add_argument("--height", type=int, default=240)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    result = run(options.captures, options.width, options.height, quiet=options.json)
-    sys.stdout.write(json.dumps(result, indent=None if options.json else 1) + "\n")
-
-
-def run(captures: int, width: int, height: int, *, quiet: bool) -> dict[str, object]:
-    folder = Path(tempfile.mkdtemp())
+def run(scratch: Path, report: Progress, *, captures: int = 500, width: int = 320, height: int = 240) -> dict[str, Any]:
+    """Takes the captures. Returns the figures of this module."""
     lens = Intrinsics(width, height, 2.0 * width, 2.0 * width, (width - 1) / 2, (height - 1) / 2)
     pose = RigidTransform(np.eye(3), np.array([0.0, 0.0, 1200.0]))
-    write_rig(Rig(tuple(Camera(name, lens, pose) for name in NAMES)), folder / "cameras.json")
+    write_rig(Rig(tuple(Camera(name, lens, pose) for name in NAMES)), scratch / "cameras.json")
     empty, seated = FlatStudio(False, width, height), FlatStudio(True, width, height)
-    try:
-        with StudioDevices(folder, NAMES, empty, seated, calibration="cameras.json") as studio:
-            return {"captures": captures, "size": [width, height], **_series(studio, captures, quiet)}
-    finally:
-        shutil.rmtree(folder)
+    with StudioDevices(scratch, NAMES, empty, seated, calibration="cameras.json") as studio:
+        return {"figures": {"captures": captures, "size": [width, height], **_series(studio, captures, report)}}
 
 
-def _series(studio: StudioDevices, captures: int, quiet: bool) -> dict[str, object]:
+def _series(studio: StudioDevices, captures: int, report: Progress) -> dict[str, object]:
     config = read_rig_config(studio.folder / "rig.toml")
     taken_s: list[float] = []
     refused: dict[str, int] = {}
@@ -94,8 +76,7 @@ def _series(studio: StudioDevices, captures: int, quiet: bool) -> dict[str, obje
             taken_s.append(time.monotonic() - started_s)
             if index % max(1, captures // 10) == 0:
                 marks.append({"capture": index, **measure()})
-                if not quiet:
-                    sys.stderr.write(f"{marks[-1]}\n")
+                report("captures", index / captures)
     growth = {key: round(marks[-1][key] - marks[0][key], 1) for key in ("resident_mb", "threads", "descriptors")}
     return {
         "complete": len(spreads_s),
@@ -106,7 +87,3 @@ def _series(studio: StudioDevices, captures: int, quiet: bool) -> dict[str, obje
         "last": marks[-1],
         "growth": growth,
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
-"""How long an operator waits at the console's pages, in Chromium; prints one JSON object. Seconds:
+"""How long an operator waits at the console's pages, in Chromium, in seconds.
 
-    python -m tests.laboratory.benchmarks.console_timings [--keep FOLDER] [--rounds N]
+python -m tests.laboratory console_timings --keep FOLDER --rounds 5
 
 - ``head``, ``bust``: from asking for a result's page to the first picture of its head; from the key B to the bust's;
 - ``done_to_picture``: from the end of a job, as the worker dates it, to the picture of its head that the service draws,
@@ -8,17 +8,14 @@
 - ``click``: on the page of features, from a click to the residual that follows from it, with 26 points in 11 views.
 
 A service is started with a sample capture of the simulated studio, whose head the first round makes with the default
-settings. ``--keep`` makes it once in FOLDER and uses it again. [median, slowest] of ``ROUNDS``; the first visit, which
+settings. ``--keep`` makes it once in FOLDER and uses it again. [median, slowest] of the rounds; the first visit, which
 fills the browser's cache as an operator's first one of the day does, stands by itself as ``head_first_visit``. Figures
 hold for a machine that does nothing else: ``load`` is its mean over the last one and five minutes.
 """
 
-import argparse
 import json
 import os
 import statistics
-import sys
-import tempfile
 import time
 from contextlib import ExitStack
 from datetime import datetime
@@ -33,7 +30,6 @@ from rig.formats.cameras.cameras_json import read_rig
 from tests.support.browser import LONG_MS, Visit, chromium, visit
 from tests.support.services import RunningService, await_state, running_service
 
-ROUNDS = 5
 JOB_S = 900.0
 
 # When (s since 1970) each surface of each job, and the service's picture, was first drawn: after the frame that did.
@@ -138,13 +134,10 @@ def time_clicks(v: Visit, service: RunningService, client: httpx.Client, capture
     return {"click": took, "points": len(points), "views": len(rig.names)}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--keep", type=Path)
-    parser.add_argument("--rounds", type=int, default=ROUNDS)
-    chosen = parser.parse_args()
+def run(scratch: Path, *, keep: Path | None = None, rounds: int = 5) -> dict[str, Any]:
+    """Returns the figures of this module."""
     with ExitStack() as stack:
-        folder = chosen.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder = keep or scratch
         folder.mkdir(exist_ok=True)
         work = "server.tasks.reconstruct:reconstruct_capture"
         service = stack.enter_context(running_service(folder / "data", work=work, poll_s="0.25", console="true"))
@@ -153,9 +146,9 @@ def main() -> None:
         job = first_head(client, capture)
         v = visit(stack.enter_context(chromium()), service.url)
         v.page.add_init_script(WATCH)
-        figures: dict[str, Any] = time_viewer(v, job, chosen.rounds)
-        figures |= time_clicks(v, service, client, capture, chosen.rounds)
-        figures |= time_opening(v, service, client, capture, chosen.rounds)
+        figures: dict[str, Any] = time_viewer(v, job, rounds)
+        figures |= time_clicks(v, service, client, capture, rounds)
+        figures |= time_opening(v, service, client, capture, rounds)
         bytes_of = {
             n: f["bytes"] for n, f in client.get(f"/v1/jobs/{job}").json()["files"].items() if n.endswith("glb")
         }
@@ -165,9 +158,4 @@ def main() -> None:
         for name, took in figures.items()
     }
     machine = {"cores": len(os.sched_getaffinity(0)), "load": [round(load, 1) for load in os.getloadavg()[:2]]}
-    figures_of_all = {"s [median, slowest]": timings, "bytes": bytes_of, "machine": machine}
-    sys.stdout.write(json.dumps(figures_of_all, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+    return {"figures": {"s [median, slowest]": timings, "bytes": bytes_of, "machine": machine}}

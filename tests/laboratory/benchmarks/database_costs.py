@@ -1,6 +1,6 @@
-"""What jobs cost their PostgreSQL: statements and bytes; prints one JSON object.
+"""What jobs cost their PostgreSQL: statements and bytes.
 
-    python -m tests.laboratory.benchmarks.database_costs [JOBS] [SECONDS] [LONG_JOBS]
+python -m tests.laboratory database_costs 200 20 8
 
 A service and its worker, each with its default pauses, are counted by pg_stat_statements (Debian's postgresql package
 brings it): idle for ``IDLE_S``; while JOBS pinned jobs of no length run; and while LONG_JOBS of SECONDS seconds run
@@ -10,11 +10,8 @@ counted, less those of an idle farm in that time; ``statements_a_job_second``: w
 that once all jobs were removed, as retention does it; ``capacity_statements_per_s``: what pgbench gets.
 """
 
-import json
 import re
 import subprocess
-import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -87,7 +84,8 @@ def capacity(url: str, folder: Path) -> float:
     return 3 * float(re.findall(r"tps = ([\d.]+)", done.stdout)[0])
 
 
-def figures_of(jobs: int, seconds: float, long_jobs: int, folder: Path) -> dict[str, Any]:
+def run(jobs: int = 200, seconds: float = 20.0, long_jobs: int = 8, *, scratch: Path) -> dict[str, Any]:
+    """Returns the figures of this module."""
     with ExitStack() as stack:
         url = stack.enter_context(running_postgres("-c shared_preload_libraries=pg_stat_statements"))
         settings: dict[str, Any] = {
@@ -96,11 +94,11 @@ def figures_of(jobs: int, seconds: float, long_jobs: int, folder: Path) -> dict[
             "work": "tests.support.tiny:work",
             "keep_jobs": "1000000",
         }
-        service = stack.enter_context(running_service(folder / "data", worker=False, **settings))
+        service = stack.enter_context(running_service(scratch / "data", worker=False, **settings))
         client = stack.enter_context(httpx.Client(base_url=service.url, timeout=120))
         database = Database(stack.enter_context(psycopg.connect(url, autocommit=True)))
         database.connection.execute("CREATE EXTENSION pg_stat_statements")
-        capture = uploaded_capture(service, folder)
+        capture = uploaded_capture(service, scratch)
         time.sleep(2.0)
         alone, alone_s = database.during(lambda: time.sleep(IDLE_S))
         service.environment["EIGENHEAD_CONCURRENCY"] = str(long_jobs)
@@ -116,10 +114,10 @@ def figures_of(jobs: int, seconds: float, long_jobs: int, folder: Path) -> dict[
         for job in client.get("/v1/jobs", params={"limit": 1000}).raise_for_status().json()["jobs"]:
             client.delete(f"/v1/jobs/{job['id']}").raise_for_status()
         left = database.rows()
-        most = capacity(url, folder)
+        most = capacity(url, scratch)
     a_job = (short.total() - idle_per_s * short_s) / jobs
     grown = after_short - empty
-    return {
+    figures = {
         "jobs": jobs,
         "idle_statements_per_s": {"service": round(alone.total() / alone_s, 1), "with a worker": round(idle_per_s, 1)},
         "statements_a_job": round(a_job, 1),
@@ -132,17 +130,8 @@ def figures_of(jobs: int, seconds: float, long_jobs: int, folder: Path) -> dict[
         "often, idle, per second": often(idle, idle_s),
         "often, of a job that runs, per second": often(long - alone, long_jobs * long_s),
     }
+    return {"figures": figures}
 
 
 def often(calls: Counter[str], by: float) -> dict[str, float]:
     return {" ".join(query.split())[:120]: round(count / by, 2) for query, count in calls.most_common(SHOWN)}
-
-
-def main(jobs: str = "200", seconds: str = "20", long_jobs: str = "8") -> None:
-    with tempfile.TemporaryDirectory(prefix="eigenhead-costs-") as folder:
-        figures = figures_of(int(jobs), float(seconds), int(long_jobs), Path(folder))
-    sys.stdout.write(json.dumps(figures, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

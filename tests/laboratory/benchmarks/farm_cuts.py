@@ -1,6 +1,6 @@
-"""Workers without a common folder, killed and cut off while they work; prints one JSON object.
+"""Workers without a common folder, killed and cut off while they work.
 
-    python -m tests.laboratory.benchmarks.farm_cuts [WORKERS] [JOBS] [SECONDS] [KILLS] [CUTS]
+python -m tests.laboratory farm_cuts 8 192 8 20 10    # workers, jobs, seconds, kills, cuts
 
 PostgreSQL and a whole S3 server (SeaweedFS), a service, and WORKERS workers, each with a data folder of its own and in
 a pid namespace of its own (so that each is another machine to the rest; needs root), ``SLOTS`` jobs at once. Captures
@@ -25,7 +25,6 @@ import socket
 import statistics
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -261,10 +260,13 @@ def running_farm(workers: int, folder: Path) -> Iterator[Farm]:
         yield farm
 
 
-def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, folder: Path) -> dict[str, Any]:
+def run(
+    workers: int = 4, jobs: int = 96, seconds: float = 8.0, kills: int = 8, cuts: int = 6, *, scratch: Path
+) -> dict[str, Any]:
+    """Returns the figures of this module."""
     slots = workers * SLOTS
     few = max(jobs // 4 // slots, 1) * slots  # no slot without a job while the last ones run
-    with running_farm(workers, folder) as farm:
+    with running_farm(workers, scratch) as farm:
         began = time.monotonic()
         farm.submit(few, seconds)
         farm.finish()
@@ -277,7 +279,7 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         took = time.monotonic() - began
         lost = farm.losses()
         found = farm.found(ids)
-    return {
+    figures = {
         "workers": workers,
         "slots": slots,
         "jobs": jobs,
@@ -292,15 +294,4 @@ def figures_of(workers: int, jobs: int, seconds: float, kills: int, cuts: int, f
         "efficiency_undisturbed": round(few * seconds / (slots * undisturbed_s), 3),
         "efficiency": round(jobs * seconds / (slots * took), 3),
     }
-
-
-def main(*numbers: str) -> None:
-    defaults = ("4", "96", "8", "8", "6")
-    workers, jobs, seconds, kills, cuts = (*numbers, *defaults[len(numbers) :])
-    with tempfile.TemporaryDirectory(prefix="eigenhead-farm-") as folder:
-        figures = figures_of(int(workers), int(jobs), float(seconds), int(kills), int(cuts), Path(folder))
-    sys.stdout.write(json.dumps(figures, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+    return {"figures": figures}

@@ -1,27 +1,23 @@
 """Seconds of a job's stages, from image files to result files, warm: medians and least of several rounds; peak memory.
 
-python -m tests.laboratory.benchmarks.image_stages --detail photo --surface head --json
-python -m tests.laboratory.benchmarks.image_stages --rounds 2 --steps depth    # the default job
+python -m tests.laboratory image_stages --detail photo --surface head --json
+python -m tests.laboratory image_stages --rounds 2 --steps depth    # the default job
 
 ``segmentation`` is eleven 1024 x 768 images, ``texture`` colours the model's full mesh from them. ``total`` is from
 opening the first file to the last one written. Processor seconds are those of all threads, which a busy machine
 stretches least; peak memory is the most that the process held in a stage, libraries and model included (Linux).
 """
 
-import argparse
-import json
 import re
-import sys
-import tempfile
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
 from pipeline.results.write import write_result
 from pipeline.settings import Settings
@@ -82,42 +78,31 @@ def one_round(
     return meter
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--capture", type=Path, default=Path("../shared/data/captures/scan-a"))
-    parser.add_argument("--detail", choices=("span", "kernel", "photo", "fine"), help="the default where none is asked")
-    parser.add_argument("--surface", choices=("head", "bust", "both"), help="both where nothing is asked")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--steps", action="append", default=[], help="stage whose steps have rows, as depth or bust")
-    parser.add_argument("--json", action="store_true")
-    arguments = parser.parse_args()
-    model, settings = load_model(), replace(Settings(), detail=arguments.detail or Settings().detail)
-    if arguments.surface:
-        settings = replace(settings, outputs=replace(settings.outputs, surface=arguments.surface))
-    with Renderer.create() as renderer, tempfile.TemporaryDirectory() as scratch:
-        inputs = (arguments.capture, Path(scratch), model, settings, renderer, arguments.steps)
-        rounds = [one_round(*inputs) for _ in range(1 + arguments.rounds)][1:]  # the first reads what was compiled
-    stages = list(rounds[0].wall)
-    found: dict[str, object] = {"rounds": arguments.rounds, "detail": arguments.detail or "default"}
-    for name, rows in (("s", [row.wall for row in rounds]), ("cpu_s", [row.cpu for row in rounds])):
+def run(
+    model: HeadModel,
+    renderer: Renderer,
+    scratch: Path,
+    *,
+    capture: Path = Path("../shared/data/captures/scan-a"),
+    detail: Literal["span", "kernel", "photo", "fine"] | None = None,
+    surface: Literal["head", "bust", "both"] | None = None,
+    rounds: int = 5,
+    steps: Annotated[Sequence[str], "stages whose steps have rows, as depth or bust"] = (),
+) -> dict[str, Any]:
+    """Returns medians and least seconds by stage, and peak memory."""
+    settings = replace(Settings(), detail=detail or Settings().detail)
+    if surface:
+        settings = replace(settings, outputs=replace(settings.outputs, surface=surface))
+    inputs = (capture, scratch, model, settings, renderer, steps)
+    measured = [one_round(*inputs) for _ in range(1 + rounds)][1:]  # the first reads what was compiled
+    stages = list(measured[0].wall)
+    found: dict[str, Any] = {"rounds": rounds, "detail": detail or "default"}
+    for name, rows in (("s", [row.wall for row in measured]), ("cpu_s", [row.cpu for row in measured])):
         found[f"median_{name}"] = {at: round(float(np.median([row[at] for row in rows])), 3) for at in stages}
         found[f"least_{name}"] = {at: round(min(row[at] for row in rows), 3) for at in stages}
-    found["peak_memory_mb"] = {at: round(max(row.peak_mb[at] for row in rounds)) for at in stages}
-    if arguments.json:
-        json.dump(found, sys.stdout)
-        sys.stdout.write("\n")
-    else:
-        sys.stdout.write(table(found, stages))
-
-
-def table(found: dict[str, Any], stages: list[str]) -> str:
-    """A row a stage."""
-    lines = [f"{'':<14}{'s':>8}{'least':>8}{'CPU s':>8}{'least':>8}{'peak MB':>9}\n"]
+    found["peak_memory_mb"] = {at: round(max(row.peak_mb[at] for row in measured)) for at in stages}
+    lines = [f"{'':<14}{'s':>8}{'least':>8}{'CPU s':>8}{'least':>8}{'peak MB':>9}"]
     for at in stages:
         row = [found[name][at] for name in ("median_s", "least_s", "median_cpu_s", "least_cpu_s")]
-        lines.append(f"{at:<14}" + "".join(f"{value:8.2f}" for value in row) + f"{found['peak_memory_mb'][at]:9}\n")
-    return "".join(lines)
-
-
-if __name__ == "__main__":
-    main()
+        lines.append(f"{at:<14}" + "".join(f"{value:8.2f}" for value in row) + f"{found['peak_memory_mb'][at]:9}")
+    return {"figures": found, "lines": lines}

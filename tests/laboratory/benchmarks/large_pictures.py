@@ -1,19 +1,18 @@
 """What a capture of large pictures costs: eleven photographs of 24 Mpx with a clean plate each, one command, time and
-peak memory. From the root:
+peak memory. They are drawn at 7 Mpx and enlarged: detail costs, truth does not.
 
-python -m tests.laboratory.benchmarks.large_pictures write CAPTURE        drawn at 7 Mpx and enlarged: detail costs, truth does not
-python -m tests.laboratory.benchmarks.large_pictures time CAPTURE [--detail photo --surface head]
+python -m tests.laboratory large_pictures write CAPTURE
+python -m tests.laboratory large_pictures time CAPTURE --detail photo --surface head
 """
 
-import argparse
 import json
 import resource
 import subprocess
-import sys
-import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -27,10 +26,29 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import simulate
 from rig.studio.sensor.preset import PRESET
-from server.processes import python_environment
+from server.processes import python_command, python_environment
 from server.tasks.subjects import drawn_subject
 
 DRAWN, WRITTEN = 3.0, 5.5234375  # times 1024 x 768: 7 Mpx, and 5656 x 4242 = 24 Mpx
+
+
+TIME_LIMIT_S = 1800
+
+
+def run(
+    what: Literal["write", "time"],
+    capture: Path,
+    scratch: Path,
+    *,
+    detail: Literal["span", "kernel", "photo", "fine"] | None = None,
+    surface: Literal["head", "bust", "both"] | None = None,
+) -> dict[str, Any]:
+    """Writes a capture, or returns what a job on it costs."""
+    if what == "write":
+        rig = write(capture)
+        return {"figures": {"cameras": len(rig), "width": rig.cameras[0].intrinsics.width}}
+    options = [f"--{name}={value}" for name, value in (("detail", detail), ("surface", surface)) if value]
+    return {"figures": cost(capture, scratch, options)}
 
 
 def write(folder: Path, seed: int = 1) -> Rig:
@@ -54,28 +72,12 @@ def _enlarged(picture: ImageRgb, size: tuple[int, int]) -> ImageRgb:
     return cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
 
 
-def cost(capture: Path, *options: str) -> tuple[float, float, float]:
+def cost(capture: Path, scratch: Path, options: Sequence[str]) -> dict[str, float]:
     """Seconds, seconds of all cores together, and GB of memory at most, of ``eigenhead reconstruct``. The job's trace
     says what it took at most: the kernel's figure for children begins with what this process had."""
-    with tempfile.TemporaryDirectory() as folder:
-        trace = Path(folder, "trace.json")
-        command = [sys.executable, "-m", "server.cli", "reconstruct", str(capture), "--out", f"{folder}/head"]
-        start = time.perf_counter()
-        subprocess.run([*command, "--trace", str(trace), *options], check=True, env=python_environment())
-        took = time.perf_counter() - start
-        peak_mb = json.loads(trace.read_text())["peak_memory_mb"]
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return took, used.ru_utime + used.ru_stime, peak_mb / 1024
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("write", "time"))
-    parser.add_argument("capture", type=Path)
-    arguments, options = parser.parse_known_args()
-    if arguments.what == "write":
-        found = write(arguments.capture)
-        sys.stdout.write(f"{len(found)} cameras of {found.cameras[0].intrinsics.width} pixels across\n")
-    else:
-        took_s, cpu_s, most_gb = cost(arguments.capture, *options)
-        sys.stdout.write(f"{took_s:.1f} s, {cpu_s:.1f} s of all cores together, {most_gb:.2f} GB\n")
+    trace, start = scratch / "trace.json", time.perf_counter()
+    words = [*python_command("cli", "reconstruct"), str(capture), "--out", str(scratch / "head"), "--trace", str(trace)]
+    subprocess.run([*words, *options], check=True, env=python_environment(), timeout=TIME_LIMIT_S)
+    took, used = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    peak_mb = json.loads(trace.read_text())["peak_memory_mb"]
+    return {"seconds": took, "cpu_s": used.ru_utime + used.ru_stime, "peak_gb": peak_mb / 1024}

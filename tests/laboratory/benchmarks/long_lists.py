@@ -1,8 +1,6 @@
-"""How long every list takes with a hundred thousand captures, two hundred thousand jobs and five hundred batches;
-prints one JSON object.
+"""How long every list takes with a hundred thousand captures, two hundred thousand jobs and five hundred batches.
 
-    python -m tests.laboratory.benchmarks.long_lists [--captures N] [--jobs N] [--batches N] [--rounds N]
-        [--postgres] [--keep FOLDER]
+python -m tests.laboratory long_lists --captures 5000 --jobs 10000 --rounds 20 --postgres
 
 A database and a data folder are filled behind the service's back (records without pictures, the engine's rows copied
 from one real job), then a service is started and its lists are asked for over HTTP, each so many rounds; the figures
@@ -10,12 +8,9 @@ are the median, the 95th percentile and the slowest. With ``--postgres`` the sam
 ``--keep`` fills FOLDER once and uses it again.
 """
 
-import argparse
 import base64
 import json
 import pickle
-import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -205,35 +200,28 @@ def measured(url: str, captures: int, batch_count: int, rounds: int) -> dict[str
     return seconds
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--captures", type=int, default=100_000)
-    parser.add_argument("--jobs", type=int, default=200_000)
-    parser.add_argument("--batches", type=int, default=500)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--postgres", action="store_true")
-    parser.add_argument("--keep", type=Path)
-    chosen = parser.parse_args()
+def run(
+    scratch: Path,
+    *,
+    captures: int = 100_000,
+    jobs: int = 200_000,
+    batches: int = 500,
+    rounds: int = 5,
+    postgres: bool = False,
+    keep: Path | None = None,
+) -> dict[str, Any]:
+    """Returns the figures of this module."""
     with ExitStack() as stack:
-        folder = chosen.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        extra: dict[str, Any] = {"database_url": stack.enter_context(running_postgres())} if chosen.postgres else {}
+        folder = keep or scratch
+        extra: dict[str, Any] = {"database_url": stack.enter_context(running_postgres())} if postgres else {}
         settings = ServiceSettings(data=folder / "data", jobs_per_key=10**6, **extra)
         if not (folder / "data").is_dir():
-            filled(settings, chosen.captures, chosen.jobs, chosen.batches)
+            filled(settings, captures, jobs, batches)
         began = time.monotonic()
         with running_service(settings.data, worker=False, terminal=None, silent_s="100000", **extra) as service:
             started = round(time.monotonic() - began, 1)
-            figures = measured(service.url, chosen.captures, chosen.batches, chosen.rounds)
-    database = "postgresql" if chosen.postgres else "sqlite"
-    counts = {"captures": chosen.captures, "jobs": chosen.jobs, "batches": chosen.batches}
-    figures_of_all = {
-        "database": database,
-        **counts,
-        "start_s": started,
-        "list_s [median, 95th percentile, slowest]": figures,
-    }
-    sys.stdout.write(json.dumps(figures_of_all, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+            figures = measured(service.url, captures, batches, rounds)
+    database = "postgresql" if postgres else "sqlite"
+    counts = {"captures": captures, "jobs": jobs, "batches": batches}
+    seconds = {"start_s": started, "list_s [median, 95th percentile, slowest]": figures}
+    return {"figures": {"database": database, **counts, **seconds}}

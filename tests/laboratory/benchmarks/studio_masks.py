@@ -1,8 +1,8 @@
 """Masks of the simulated studio's preset against the truth: contour RMS, IoU, and whether bad views say so.
 
-python -m tests.laboratory.benchmarks.studio_masks --captures 20
-python -m tests.laboratory.benchmarks.studio_masks --captures 10 --bare
-python -m tests.laboratory.benchmarks.studio_masks --captures 4 --fault shadow --fault camouflage --fault exposure=0.1
+python -m tests.laboratory studio_masks --captures 20
+python -m tests.laboratory studio_masks --captures 10 --bare
+python -m tests.laboratory studio_masks --captures 4 --fault shadow --fault camouflage --fault exposure=0.1
 
 ``--bare`` strips the captures of their clean plates.
 
@@ -13,9 +13,9 @@ Coverage of the subject is the truth: the contour is judged where it is one half
 overlap at the lens's own (see tests/pipeline/segmentation/test_segment_studio.py).
 """
 
-import argparse
 import itertools
-import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -23,43 +23,47 @@ from pipeline.segmentation.segment import segment
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
+from rig.progress import Progress, discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.sensor.faults import fault_from_text
 from rig.studio.sensor.preset import PRESET
 from tests.pipeline.segmentation.test_segment import true_mask
-from tests.pipeline.segmentation.test_segment_studio import RESOLUTION_PX, coverage, iou, rms, take
+from tests.pipeline.segmentation.test_segment_studio import RESOLUTION_PX, coverage, iou, photograph, rms, segmented
 from tests.support.shared_data import shared
 
 WORST_PX, LEAST_IOU = 0.8, 0.995
 RENDERED = ("scan-a", "draw-b")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--captures", type=int, default=20)
-    parser.add_argument("--bare", action="store_true", help="without clean plates")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first capture")
-    parser.add_argument("--fault", action="append", default=[], help="KIND[:CAMERA][=AMOUNT]; may be repeated")
-    arguments = parser.parse_args()
-    faults = [(fault_from_text(text),) for text in arguments.fault] or [()]
-    captures = range(arguments.first, arguments.first + arguments.captures)
+def run(
+    renderer: Renderer,
+    report: Progress,
+    *,
+    captures: int = 20,
+    bare: Annotated[bool, "without clean plates"] = False,
+    first: Annotated[int, "seed of the first capture"] = 0,
+    fault: Annotated[Sequence[str], "KIND[:CAMERA][=AMOUNT]; may be repeated"] = (),
+) -> dict[str, Any]:
+    """Returns the figures of this module, and lines about views beyond the limits."""
+    faults = [(fault_from_text(text),) for text in fault] or [()]
     rows = []
-    with Renderer.create() as renderer:
-        for seed, planted in itertools.product(captures, faults):
-            taken, silhouettes = take(seed, renderer, *planted)
-            if arguments.bare:
-                bare = Capture(taken.capture.images)
-                silhouettes = segment(bare, taken.rig, SegmentationSettings(), report=lambda *_: None)
-            kind = "".join(f" {fault.kind}" for fault in planted)
-            for name, silhouette in silhouettes.items():
-                off = rms(silhouette, coverage(taken, name, RESOLUTION_PX))
-                overlap = iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5)
-                said = "; ".join(map(str, (*silhouette.quality.warnings, *silhouette.quality.doubts)))
-                rows.append((off, overlap, f"{seed}{kind} {name}", said))
+    for seed, planted in itertools.product(range(first, first + captures), faults):
+        report(f"capture {seed}", (seed - first) / captures)
+        taken = photograph(seed, renderer, *planted)
+        silhouettes = segmented(taken)
+        if bare:
+            shot = Capture(taken.capture.images)
+            silhouettes = segment(shot, taken.rig, SegmentationSettings(), report=discard_progress)
+        kind = "".join(f" {each.kind}" for each in planted)
+        for name, silhouette in silhouettes.items():
+            off = rms(silhouette, coverage(taken, name, RESOLUTION_PX))
+            overlap = iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5)
+            said = "; ".join(map(str, (*silhouette.quality.warnings, *silhouette.quality.doubts)))
+            rows.append((off, overlap, f"{seed}{kind} {name}", said))
     off, overlap = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     bad = (off > WORST_PX) | (overlap < LEAST_IOU)
     lines = [
-        f"{len(rows)} views of {arguments.captures * len(faults)} captures",
+        f"{len(rows)} views of {captures * len(faults)} captures",
         f"contour RMS px: median {np.median(off):.3f}, 90 % {np.quantile(off, 0.9):.3f}, worst {off.max():.2f}",
         f"IoU: median {np.median(overlap):.4f}, worst {overlap.min():.4f}; {(overlap >= 0.99).mean():.1%} reach 0.99",
     ]
@@ -71,8 +75,13 @@ def main() -> None:
     lines += [f"  {name}: {off:.2f} px, IoU {share:.4f}, {said}" for off, share, name, said in alarmed]
     lines.append("beyond:")
     lines += [f"  {name}: {off:.2f} px, IoU {share:.4f}, {said or 'nothing said'}" for off, share, name, said in wrong]
-    lines += [f"{folder}: {rendered(folder, bare=arguments.bare)}" for folder in RENDERED]
-    sys.stdout.write("\n".join(lines) + "\n")
+    lines += [f"{folder}: {rendered(folder, bare=bare)}" for folder in RENDERED]
+    figures = {
+        "views": len(rows), "contour_px_median": float(np.median(off)), "contour_px_worst": float(off.max()),
+        "iou_median": float(np.median(overlap)), "iou_worst": float(overlap.min()),
+        "beyond": len(wrong), "beyond_silent": silent, "within_alarmed": len(alarmed),
+    }  # fmt: skip
+    return {"figures": figures, "lines": lines}
 
 
 def rendered(folder: str, *, bare: bool) -> str:
@@ -82,7 +91,3 @@ def rendered(folder: str, *, bare: bool) -> str:
     silhouettes = segment(shot, rig, SegmentationSettings(), report=lambda *_: None)
     overlap = [iou(silhouette, true_mask(name, folder)) for name, silhouette in silhouettes.items()]
     return f"IoU: median {np.median(overlap):.4f}, worst {min(overlap):.4f} of {len(overlap)} views"
-
-
-if __name__ == "__main__":
-    main()

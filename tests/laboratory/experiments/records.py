@@ -1,11 +1,16 @@
-"""Keeps the rows of long experiments as they are computed, so that a stopped run can continue."""
+"""Defines the result of an experiment, and keeps the rows of long ones as they are computed, so that a stopped run can
+continue."""
 
 import hashlib
 import inspect
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any, NotRequired, TypedDict
+
+import numpy as np
 
 from pipeline.contour_fit import (
     clutter,
@@ -24,13 +29,33 @@ from pipeline.estimation import levenberg_marquardt, terms
 from pipeline.geometry import projection_kernels
 from pipeline.imaging import sampling_kernels
 from rig.atomic_write import write_atomically
-from tests.laboratory.experiments.outcome import Row
+from rig.progress import Progress, discard_progress
 
 # What rows of the contour solver depend on, for keys.
 CONTOUR = (
     *(levenberg_marquardt, terms, contour, problem, head_problem, rim_term, feature_term, prior_term),
     *(clutter, noise_model, rim, rim_kernels, rim_jacobian_kernels, projection_kernels, sampling_kernels),
 )
+
+
+Row = dict[str, Any]  # of one subject: each experiment has its own quantities
+
+
+class Outcome(TypedDict):
+    """Holds the result of an experiment.
+
+    ``figures`` is flat and has every number that README and docs quote. ``markdown`` and ``pictures`` go to files; the
+    rest is printed, with ``lines`` instead of the figures for people.
+    """
+
+    figures: dict[str, float]
+    rows: list[Row] | dict[str, list[Row]]
+    markdown: NotRequired[str]
+    lines: NotRequired[list[str]]
+    pictures: NotRequired[dict[str, np.ndarray]]
+    machine: NotRequired[str]
+    planned_directions_deg: NotRequired[list[tuple[int, int]]]
+    wrong: NotRequired[list[int]]
 
 
 class Records:
@@ -60,3 +85,15 @@ def key_of(*parts: object) -> str:
     everything else by its text."""
     texts = [inspect.getsource(part) if isinstance(part, ModuleType) else str(part) for part in parts]
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Holds what experiments report their progress to, and the folder that keeps their rows (None: nothing is kept)."""
+
+    report: Progress = discard_progress
+    folder: Path | None = None
+
+    def records(self, name: str, key: str) -> Records:
+        """Returns the kept rows of this name, see ``Records``."""
+        return Records(self.folder, name, key)

@@ -1,12 +1,16 @@
 """Finds the captures with a truth and the foreign head model that the experiments read beside the checkout."""
 
 from pathlib import Path
+from typing import Annotated
 
 from pipeline.applications.model_building.sources.imports import import_model
 from pipeline.head_model.data_folder import models_folder
 from pipeline.head_model.model import HeadModel, assemble, load_model
 from pipeline.head_model.model_names import model_path
 from rig.errors import InputError
+
+SHARED = Path("../shared/data")
+Shared = Annotated[Path, "where captures/ and ict-facekit/ are"]
 
 
 def truths(shared: Path) -> dict[str, Path]:
@@ -17,7 +21,7 @@ def truths(shared: Path) -> dict[str, Path]:
     return found
 
 
-def facekit(shared: Path) -> HeadModel:
+def facekit(*, shared: Shared = SHARED) -> HeadModel:
     """Returns ICT-FaceKit: the user's own import, or the compact copy in the shared folder. Raises InputError if
     there is neither."""
     if (models_folder() / "ict-facekit.npz").is_file():

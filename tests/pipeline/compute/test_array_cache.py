@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pipeline.compute import array_cache
-from pipeline.compute import jit as compiled
 from pipeline.compute.array_cache import UNUSED_S
+from rig import jit as compiled
 from rig.mesh import vertex_normals
 from server.processes import python_environment
 

@@ -17,7 +17,7 @@ from pipeline.settings import FittingSettings
 from rig.geometry import Similarity, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from tests.laboratory.experiments.paper.robustness import OVER_EARS, spoiled
+from tests.support.spoilt_captures import OVER_EARS, spoiled
 from tests.support.subjects import binary_silhouettes, exact, mean_error_mm, random_subjects, worn_silhouettes
 
 SETTINGS = FittingSettings()

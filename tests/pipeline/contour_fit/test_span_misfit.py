@@ -43,6 +43,7 @@ def test_what_two_fits_differ_by_is_misfit(span: HeadModel, wider: HeadModel) ->
     assert found.sliding_mm == 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.gl
 def test_a_head_beyond_the_span_is_said_to_be_farther_off(span, wider, renderer) -> None:
     """Two bare heads, one of them bent by the kernel: the deviation follows the true error of each."""

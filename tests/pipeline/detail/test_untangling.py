@@ -31,6 +31,7 @@ from tests.support.subdivided_spheres import subdivided_sphere
 
 COARSE_SEEDS = 10
 SEEDS_A_TEST = 10  # a slow test has five minutes, also beside others
+EVERY_CHANGE = (2, 102)  # first seeds: twenty heads; the night has two hundred
 EXPRESSIONS = 5  # at once, each up to its full weight
 HOSTILE_MM, LENGTH_MM = 1.5, 5.0  # standard deviation of a displacement along the normals, twice what the fine stage
 # takes for likely, and over which it fades, the fine stage's own
@@ -160,7 +161,13 @@ def test_random_heads_and_expressions_come_out_clean_on_a_coarse_level(wide_mode
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(2, 202, SEEDS_A_TEST))
+@pytest.mark.parametrize(
+    "first",
+    [
+        pytest.param(first, marks=[] if first in EVERY_CHANGE else pytest.mark.nightly)
+        for first in range(2, 202, SEEDS_A_TEST)
+    ],
+)
 def test_two_hundred_random_heads_and_expressions_come_out_clean(
     wide_model: HeadModel, hostile: Displacement, first: int
 ) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.evidence.gaze import angles_deg, pupil_distance, pupils
 from pipeline.faces.irises import BEHIND_MM, Iris, UnseenEye
-from pipeline.results.eye_report import eyes_document
+from pipeline.results.report import eyes_document
 from pipeline.results.report_types import EyeReport
 from rig.geometry import Similarity, rotation_from_vector
 

@@ -156,6 +156,7 @@ def test_eyes_help_each_other_unless_they_squint() -> None:
     assert looking_together(*squint, np.eye(3)) == squint
 
 
+@pytest.mark.slow
 def test_the_gaze_turns_with_the_world() -> None:
     turn = rotation_from_vector(np.array([0.3, -1.1, 0.4]))
     motion = RigidTransform(turn, np.array([30.0, -500.0, 90.0]))

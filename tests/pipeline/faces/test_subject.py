@@ -81,6 +81,7 @@ def test_the_same_pictures_give_the_same_bytes(networks: FaceNetworks, pictures:
     assert first.covariances.tobytes() == second.covariances.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roll", [90.0, 180.0])
 def test_cameras_on_their_side_or_head_find_the_same(networks: FaceNetworks, roll: float) -> None:
     rig = studio(roll)
@@ -98,6 +99,7 @@ def test_a_poster_alone_is_nobody(networks: FaceNetworks) -> None:
     assert found.matched is None
 
 
+@pytest.mark.slow
 def test_a_poster_behind_the_subject_is_passed_over(networks: FaceNetworks) -> None:
     rig = studio()
     walls = {camera.name: photographed_face(camera, POSTER, flat=True) for camera in rig}
@@ -141,6 +143,7 @@ def test_one_view_alone_tells_how_the_face_is_turned(networks: FaceNetworks, pic
     assert np.linalg.norm(placed.translation[:2] - HEAD.apply(np.zeros((1, 3)))[0, :2]) < 25.0
 
 
+@pytest.mark.slow
 def test_small_faces_are_found_where_none_is_large(networks: FaceNetworks) -> None:
     """At twice the distance in pictures of twice the size: a sixteenth of their width."""
     cameras = []

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.compute.jit import njit
 from pipeline.geometry.projection import packed_camera, packed_lens, project_points
 from pipeline.geometry.projection_kernels import LENS, NOWHERE, distorted, pinhole, placed, project, projection_slopes
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import look_at, vector_from_rotation
+from rig.jit import njit
 
 LENSES = [
     Distortion(),

@@ -9,7 +9,7 @@ from pipeline.imaging.colour_chart import Chart, chart_correction, chart_normal,
 from rig.camera import Camera, Intrinsics
 from rig.colour_space import srgb_from_linear
 from rig.geometry import look_at
-from tests.laboratory.experiments.surface.chart import HEIGHT_MM, WIDTH_MM, chart_picture
+from tests.support.colour_chart_pictures import HEIGHT_MM, WIDTH_MM, chart_picture
 
 TINT = np.array([[0.62, 0.05, 0.01], [0.03, 0.80, 0.04], [0.02, 0.06, 0.55]])
 

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from pipeline.compute.jit import njit
 from pipeline.imaging.sampling_kernels import INSIDE, bilinear_slopes, cell, held, sample, sample_row
+from rig.jit import njit
 
 HEIGHT, WIDTH = 23, 31
 IMAGE = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH))

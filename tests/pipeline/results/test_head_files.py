@@ -14,12 +14,10 @@ import trimesh
 
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import load_model
-from pipeline.results.head_files import write_head
-from pipeline.results.printable import printable
+from pipeline.results.head_files import printable, write_head
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
-from pipeline.results.write import head_mesh
-from pipeline.results.write_expression import write_expression
+from pipeline.results.write import head_mesh, write_result
 from pipeline.settings import OutputSettings, Settings, settings_from_document
 from pipeline.texturing.albedo import Albedo
 from pipeline.texturing.layout.model_layout import model_layout
@@ -28,6 +26,7 @@ from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.light import Light
 from pipeline.texturing.sets.specular import Specular
 from pipeline.texturing.sets.texture_sets import SetTextures
+from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
@@ -47,7 +46,9 @@ def result() -> Reconstruction:
     return textured_result(mesh, Atlas(model_layout(model).layout, image))
 
 
-def with_reduced_layout(result: Reconstruction) -> Reconstruction:
+@pytest.fixture(scope="module")
+def reduced_result(result: Reconstruction) -> Reconstruction:
+    """Its layout is reduced once, in half a minute of a free core."""
     texturing = result.texturing
     assert texturing.atlas is not None
     reduced = reduced_layout(load_model(), texturing.atlas.layout)
@@ -62,12 +63,11 @@ def written(result: Reconstruction, folder: Path, **outputs: object) -> set[str]
 
 def test_every_format_is_written_and_no_other(result: Reconstruction, tmp_path: Path) -> None:
     pytest.importorskip("pxr")
-    for name in ("default", "all", "old", "image"):
+    for name in ("default", "all", "image"):
         (tmp_path / name).mkdir()
     assert written(result, tmp_path / "default") == {"head.ply", "head.glb"}
     every = {"head.ply", "head.glb", "head.obj", "head.mtl", "head.png", "head.usdz", "head.stl", "head.3mf"}
     assert written(result, tmp_path / "all", formats=ALL) == every
-    assert "head.obj" in written(result, tmp_path / "old", obj=True)
     assert written(result, tmp_path / "image", formats=("ply",), ply_texture=True) == {"head.ply", "head.png"}
     assert b"comment TextureFile head.png\n" in (tmp_path / "image" / "head.ply").read_bytes()[:2000]
     plain, named = (read_head_ply(tmp_path / name / "head.ply")[0] for name in ("default", "image"))
@@ -200,14 +200,18 @@ def test_wrong_outputs_are_named() -> None:
     with pytest.raises(InputError) as found:
         settings_from_document({"outputs": {"formats": ["glb", "fbx"], "texture_size": 1000}})
     assert len(found.value.faults) == 2
-    assert settings_from_document({"outputs": {"obj": True}}).outputs.written == ("glb", "ply", "obj")
+
+
+@pytest.mark.parametrize("name", ["obj", "atlas"])
+def test_outputs_of_versions_before_0_3_are_refused_by_name(name: str) -> None:
+    with pytest.raises(InputError, match=f"unknown key 'outputs.{name}'"):
+        settings_from_document({"outputs": {name: True}})
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)  # the layout is reduced once, in half a minute of a free core
-def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(result: Reconstruction, tmp_path: Path) -> None:
-    assert result.texturing.atlas is not None
-    mapped = with_reduced_layout(result)
+@pytest.mark.timeout(900)
+def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(reduced_result: Reconstruction, tmp_path: Path) -> None:
+    mapped = reduced_result
     written(mapped, tmp_path)
     document, payload = opened_glb(tmp_path / "head.glb")
     primitive, head = document["meshes"][0]["primitives"][0], head_mesh(mapped)
@@ -224,17 +228,18 @@ def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(result: Reconstr
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("kind", ["jpeg", "png", "webp", "normal map", "morphs"])
 def test_the_khronos_validator_has_nothing_to_say(
-    kind: str, result: Reconstruction, tmp_path: Path, gltf_validator: Path
+    kind: str, result: Reconstruction, tmp_path: Path, gltf_validator: Path, request: pytest.FixtureRequest
 ) -> None:
     assert result.texturing.atlas is not None
     name = "head.glb"
     if kind == "normal map":
-        written(with_sets(with_reduced_layout(result)), tmp_path, image="webp")
+        written(with_sets(request.getfixturevalue("reduced_result")), tmp_path, image="webp")
     elif kind == "morphs":
         model, name = load_model(), "posed.glb"
         blendshape_rig = build_blendshape_rig(model, result.head.fit.world_from_head, result.mesh_world, ())
-        chosen = replace(result, settings=Settings(outputs=OutputSettings(morphs=True, neutral=True)))
-        write_expression(tmp_path, chosen, blendshape_rig)
+        evidence = replace(result.evidence, blendshape_rig=blendshape_rig)
+        settings = Settings(outputs=OutputSettings(morphs=True, neutral=True))
+        write_result(tmp_path, replace(result, evidence=evidence, settings=settings), Capture({}))
         assert validated(tmp_path / "neutral.glb", gltf_validator) == (0, 0, [])
     else:
         written(result, tmp_path, image=kind)

@@ -61,7 +61,7 @@ def scene() -> tuple[Reconstruction, Capture]:
         measurements={"nose_length": Measurement(52.0, float("nan"))},
         name="ellipsoid",
         front="cam03",
-        settings=Settings(outputs=OutputSettings(obj=True)),
+        settings=Settings(outputs=OutputSettings(formats=("glb", "ply", "obj"))),
         seconds={"segmentation": 0.5, "fitting": 1.5},
         warnings=(compose("view-left-out", remark="cam03: left out"),),
     )

@@ -4,6 +4,8 @@ Strands of hair are thinner than the lens resolves, so that the contour is judge
 a mask has (defocus 0.7 px, the pixel, alpha's smoothing and the strands' own spacing: 1.5 px), is one half.
 """
 
+from dataclasses import dataclass, field
+
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import segment
 from pipeline.segmentation.view_consistency import judge_agreement
 from pipeline.settings import SegmentationSettings
+from pipeline.view_checks.usable_views import view_warnings
+from rig.capture import Capture
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
@@ -23,20 +27,23 @@ from rig.studio.sensor.preset import PRESET
 
 pytestmark = [pytest.mark.slow, pytest.mark.gl, pytest.mark.timeout(900)]
 RESOLUTION_PX = 1.5  # chosen with the results in view: at the lens's own 0.7 px strands make it 0.9 to 2.3 px RMS
-CAPTURES = 5
+CAPTURES = 3, 5  # of every change, and of the night
 GROSS_PX = 1.5  # of the contour: beyond it more is wrong than strands of hair, and a view must say so
 
 
-def take(
+def photograph(
     seed: int, renderer: Renderer, *faults: Fault, weights: dict[str, float] | None = None
-) -> tuple[SimulatedCapture, dict[str, Silhouette]]:
+) -> SimulatedCapture:
     model, rng = load_model(), np.random.default_rng(seed)
     vertices = model.posed_vertices(rng.normal(0, 0.8, 60), weights or {})
     marks = {name: vertices[row] for name, row in model.landmarks.items()}
     full = model.levels["full"]
     subject = Subject(Mesh(vertices, full.faces), marks, full.face_region, f"subject {seed}")
-    taken = simulate(subject, default_layout(), PRESET, rng, renderer=renderer, faults=faults)
-    return taken, segment(taken.capture, taken.rig, SegmentationSettings(), report=lambda *_: None)
+    return simulate(subject, default_layout(), PRESET, rng, renderer=renderer, faults=faults)
+
+
+def segmented(taken: SimulatedCapture) -> dict[str, Silhouette]:
+    return segment(taken.capture, taken.rig, SegmentationSettings(), report=lambda *_: None)
 
 
 def coverage(taken: SimulatedCapture, name: str, blur_px: float) -> np.ndarray:
@@ -62,44 +69,70 @@ def iou(silhouette: Silhouette, mask: np.ndarray) -> float:
     return np.count_nonzero(silhouette.mask & mask) / np.count_nonzero(silhouette.mask | mask)
 
 
-@pytest.fixture(scope="module")
-def measured(renderer: Renderer) -> tuple[np.ndarray, np.ndarray]:
-    """IoU and RMS of the contour (px) of every view of the first captures, in order and none left out."""
-    overlap, off = [], []
-    for seed in range(CAPTURES):
-        taken, silhouettes = take(seed, renderer)
-        for name, silhouette in silhouettes.items():
-            overlap.append(iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5))
-            off.append(rms(silhouette, coverage(taken, name, RESOLUTION_PX)))
-    return np.array(overlap), np.array(off)
+@dataclass
+class Measured:
+    """Holds IoU and RMS of the contour (px) of every view, in order and none left out."""
+
+    iou: list[float] = field(default_factory=list)
+    rms_px: list[float] = field(default_factory=list)
+
+    def add(self, taken: SimulatedCapture, name: str, silhouette: Silhouette) -> None:
+        self.iou.append(iou(silhouette, coverage(taken, name, PRESET.defocus_px) >= 0.5))
+        self.rms_px.append(rms(silhouette, coverage(taken, name, RESOLUTION_PX)))
 
 
-@pytest.mark.parametrize("seed", [11, 12, 13])
+@pytest.fixture(scope="module", params=[CAPTURES[0], pytest.param(CAPTURES[1], marks=pytest.mark.nightly)])
+def measured(request: pytest.FixtureRequest, renderer: Renderer) -> tuple[Measured, Measured, list[str]]:
+    """The first captures with their plates, three of them without, and of these the views that are wrong without a
+    word."""
+    plates, bare, silent = Measured(), Measured(), []
+    for seed in range(request.param):
+        taken = photograph(seed, renderer)
+        for name, silhouette in segmented(taken).items():
+            plates.add(taken, name, silhouette)
+        if seed >= CAPTURES[0]:
+            continue
+        stripped = segment(Capture(taken.capture.images), taken.rig, SegmentationSettings(), report=lambda *_: None)
+        warned = " ".join(warning.text for warning in view_warnings(stripped))
+        for name, silhouette in stripped.items():
+            bare.add(taken, name, silhouette)
+            silent += [f"{seed} {name}"] if bare.iou[-1] < 0.95 and f"{name}:" not in warned else []
+    return plates, bare, silent
+
+
+@pytest.mark.parametrize("seed", [11, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (12, 13))])
 def test_a_smile_is_no_reason_to_doubt_a_view(seed: int, renderer: Renderer) -> None:
     """Somebody who laughs once had a view left out: of its mask "1.5 % is where the others see nothing"."""
     laugh = {"mouthSmileLeft": 0.9, "mouthSmileRight": 0.9, "jawOpen": 0.3, "cheekSquintLeft": 0.6, "cheekPuff": 0.3}
-    taken, silhouettes = take(seed, renderer, weights=laugh)
-    agreed = judge_agreement(silhouettes, taken.rig, SegmentationSettings())
+    taken = photograph(seed, renderer, weights=laugh)
+    agreed = judge_agreement(segmented(taken), taken.rig, SegmentationSettings())
     for name, silhouette in agreed.items():
         assert silhouette.quality.usable, (name, silhouette.quality)
         assert silhouette.quality.figures["strange_share"] == 0.0
 
 
-def test_the_median_view_of_the_preset(measured: tuple[np.ndarray, np.ndarray]) -> None:
-    overlap, off = measured
-    assert np.median(overlap) >= 0.995
-    assert np.median(off) <= 0.35
+def test_the_median_view_of_the_preset(measured: tuple[Measured, Measured, list[str]]) -> None:
+    plates, _, _ = measured
+    assert np.median(plates.iou) >= 0.995
+    assert np.median(plates.rms_px) <= 0.35
+
+
+def test_the_preset_without_its_plates(measured: tuple[Measured, Measured, list[str]]) -> None:
+    _, bare, silent = measured
+    assert (np.array(bare.iou) >= 0.99).mean() >= 0.9
+    assert np.median(bare.rms_px) <= 0.6
+    assert silent == []
 
 
 @pytest.mark.xfail(
     strict=True,
     reason="not reached: some views stay beyond 0.8 px, mostly grey coats before grey walls and small real gaps in "
-    "hair (python -m tests.laboratory.benchmarks.studio_masks prints them)",
+    "hair (python -m tests.laboratory studio_masks prints them)",
 )
-def test_the_worst_view_of_the_preset(measured: tuple[np.ndarray, np.ndarray]) -> None:
-    overlap, off = measured
-    assert overlap.min() >= 0.995
-    assert off.max() <= 0.8
+def test_the_worst_view_of_the_preset(measured: tuple[Measured, Measured, list[str]]) -> None:
+    plates, _, _ = measured
+    assert min(plates.iou) >= 0.995
+    assert max(plates.rms_px) <= 0.8
 
 
 FAULTS = [
@@ -110,11 +143,20 @@ FAULTS = [
     (4, Fault("camouflage")),
     (4, Fault("dark", "cam05")),
 ]
+FAULTS_EVERY_CHANGE = ("shadow 3", "chair 4", "dark 4")
 
 
-@pytest.mark.parametrize(("seed", "fault"), FAULTS, ids=[f"{fault.kind} {seed}" for seed, fault in FAULTS])
+@pytest.mark.parametrize(
+    ("seed", "fault"),
+    [
+        pytest.param(seed, fault, id=name, marks=[] if name in FAULTS_EVERY_CHANGE else pytest.mark.nightly)
+        for seed, fault in FAULTS
+        for name in [f"{fault.kind} {seed}"]
+    ],
+)
 def test_the_mask_is_right_or_the_view_says_so(seed: int, fault: Fault, renderer: Renderer) -> None:
-    taken, silhouettes = take(seed, renderer, fault)
+    taken = photograph(seed, renderer, fault)
+    silhouettes = segmented(taken)
     for name, silhouette in silhouettes.items():
         if silhouette.quality.warnings:
             continue

@@ -1,23 +1,49 @@
 """Small pictures are segmented as large ones are: contours are compared in pixels of the whole size."""
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.segmentation.segment import segment_view
 from pipeline.settings import SegmentationSettings
-from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
-from tests.laboratory.benchmarks.plate_masks import Row, compare_view, smaller
+from tests.pipeline.segmentation.test_segment import true_mask
 from tests.support.shared_data import shared
 
 
+@dataclass(frozen=True)
+class Row:
+    """One view: overlap, distances from the true contour to the mask's (px of the whole size), and the share of the
+    contour that the program calls weak."""
+
+    overlap: float
+    off_px: np.ndarray
+    weak: float
+
+
 def row(folder: str, view: str, size: float) -> Row:
-    """One view, seen alone."""
-    capture, rig = read_capture(shared(f"data/captures/{folder}"))
-    one = Capture({view: capture.images[view]}, backgrounds={view: capture.backgrounds[view]})
-    small, _ = smaller(one, rig, size)
-    silhouette = segment_view(small.images[view], small.backgrounds[view], SegmentationSettings())
-    return compare_view(folder, view, silhouette)
+    """One view, seen alone, its pictures as means over areas; ``size`` must leave whole pixels."""
+    capture, _ = read_capture(shared(f"data/captures/{folder}"))
+    pictures = [
+        cv2.resize(picture, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
+        for picture in (capture.images[view], *capture.backgrounds[view])
+    ]
+    silhouette = segment_view(pictures[0], tuple(pictures[1:]), SegmentationSettings())
+    truth = true_mask(view, folder)
+    at = (contour_points(truth) + 0.5) * size - 0.5
+    x, y = (np.ascontiguousarray(at[:, k], np.float32)[None] for k in (0, 1))
+    off = np.abs(cv2.remap(silhouette.distance, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]) / size
+    small = cv2.resize(truth.astype(np.float32), silhouette.mask.shape[::-1], interpolation=cv2.INTER_AREA) >= 0.5
+    overlap = np.count_nonzero(silhouette.mask & small) / np.count_nonzero(silhouette.mask | small)
+    return Row(overlap, off, float(np.asarray(silhouette.quality.figures.get("weak_share", 1.0))))
+
+
+def contour_points(mask: np.ndarray) -> np.ndarray:
+    """Points half-way between neighbours that a mask separates, (x, y)."""
+    across, down = np.argwhere(mask[:, 1:] != mask[:, :-1]), np.argwhere(mask[1:] != mask[:-1])
+    return np.concatenate([across[:, ::-1] + (0.5, 0.0), down[:, ::-1] + (0.0, 0.5)])
 
 
 @pytest.mark.parametrize("view", ["cam07", "cam10"])

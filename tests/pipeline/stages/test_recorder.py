@@ -1,13 +1,14 @@
 """Stages are run in order, under their own names, and leave warnings and seconds behind."""
 
 import time
+from dataclasses import replace
 
 import pytest
 
 from pipeline.head_model.model import load_model
 from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
-from pipeline.stages.recorder import Recorder, Staged, stage
+from pipeline.stages.recorder import Recorder, Staged
 from rig.capture import Capture
 from rig.errors import Cancelled
 from rig.messages.message import compose
@@ -18,16 +19,19 @@ PAUSE_S = 0.02
 DIM, BESIDE = compose("view", remark="cam00: dim"), compose("view", remark="cam01: dim")
 
 
-@stage("measure")
 def measure(context: ReconstructionContext, number: int) -> Staged[int]:
     context.progress("what the room beneath calls itself", 0.5)
     time.sleep(PAUSE_S)
     return Staged(number + 1, [DIM])
 
 
-@stage("double")
 def double(context: ReconstructionContext, number: int, *, times: int) -> Staged[int]:
     return Staged(number * times)
+
+
+def run_measure(run: Recorder) -> int:
+    with run.stage("measure") as stage:
+        return stage.keep(measure(stage.context, 1))
 
 
 @pytest.fixture
@@ -41,16 +45,19 @@ def test_products_pass_on_and_progress_has_the_name_of_the_stage(context: Recons
     def note(name: str, fraction: float) -> None:
         seen.append((name, fraction))
 
-    run = Recorder(note)
-    assert run(double, _told_to(context, note), run(measure, _told_to(context, note), 1), times=3) == 6
+    run = Recorder(replace(context, progress=note))
+    with run.stage("measure") as stage:
+        number = stage.keep(measure(stage.context, 1))
+    with run.stage("double") as stage:
+        assert stage.keep(double(stage.context, number, times=3)) == 6
     assert seen == [("measure", 0.0), ("measure", 0.5), ("double", 0.0)]
     assert run.warnings == (DIM,)
 
 
 def test_two_visits_of_a_stage_share_its_seconds(context: ReconstructionContext) -> None:
-    run = Recorder(lambda name, fraction: None)
+    run = Recorder(context)
     for _ in range(2):
-        run(measure, context, 1)
+        run_measure(run)
     seconds = run.seconds()
     assert list(seconds) == ["measure", "total"]
     assert 2 * PAUSE_S <= seconds["measure"] <= seconds["total"]
@@ -60,20 +67,13 @@ def test_a_cancelled_job_begins_no_stage(context: ReconstructionContext) -> None
     def cancel(name: str, fraction: float) -> None:
         raise Cancelled
 
-    run = Recorder(cancel)
+    run = Recorder(replace(context, progress=cancel))
     with pytest.raises(Cancelled):
-        run(measure, context, 1)
+        run_measure(run)
     assert list(run.seconds()) == ["total"]
     assert run.warnings == ()
 
 
-def _told_to(context: ReconstructionContext, progress) -> ReconstructionContext:
-    return ReconstructionContext(
-        context.capture, context.rig, context.model, context.settings, context.renderer, progress
-    )
-
-
-@stage("slowly")
 def slowly(context: ReconstructionContext, pauses: int, done: list[int]) -> Staged[int]:
     for pause in range(pauses):
         context.progress("within", pause / pauses)
@@ -87,12 +87,12 @@ def test_a_stage_beside_others_has_the_seconds_that_were_waited_for_it(
 ) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", "2")
     reported: list[str] = []
-    run, done = Recorder(lambda name, fraction: reported.append(name)), list[int]()
-    with run.beside(slowly, context, 5, done) as pending:
-        run(measure, context, 1)
+    run, done = Recorder(replace(context, progress=lambda name, _: reported.append(name))), list[int]()
+    with run.beside("slowly", lambda quiet: slowly(quiet, 5, done)) as pending:
+        run_measure(run)
     assert pending.product == 5
     assert done == [*range(5)]
-    assert reported == ["measure"], "only what the job waits for tells how far it is"
+    assert {*reported} == {"measure"}, "only what the job waits for tells how far it is"
     assert run.warnings == (DIM, BESIDE)
     seconds = run.seconds()
     assert seconds["slowly"] + seconds["measure"] <= seconds["total"] + 1e-3
@@ -103,8 +103,9 @@ def test_a_failed_block_stops_the_stage_beside_it(
     context: ReconstructionContext, monkeypatch: pytest.MonkeyPatch, threads: str
 ) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", threads)
-    run, done = Recorder(lambda name, fraction: None), list[int]()
-    with pytest.raises(Cancelled), run.beside(slowly, context, 200 if threads == "2" else 2, done):
+    run, done = Recorder(context), list[int]()
+    pauses = 200 if threads == "2" else 2
+    with pytest.raises(Cancelled), run.beside("slowly", lambda quiet: slowly(quiet, pauses, done)):
         raise Cancelled
     assert len(done) < 100
     held = len(done)
@@ -117,6 +118,6 @@ def test_what_fails_beside_fails_the_job(
     context: ReconstructionContext, monkeypatch: pytest.MonkeyPatch, threads: str
 ) -> None:
     monkeypatch.setenv("EIGENHEAD_THREADS", threads)
-    run = Recorder(lambda name, fraction: None)
-    with pytest.raises(TypeError), run.beside(double, context, 1, times=None):  # pyright: ignore[reportArgumentType]
+    run = Recorder(context)
+    with pytest.raises(ZeroDivisionError), run.beside("divide", lambda _: Staged(1 // 0)):
         pass

@@ -16,9 +16,9 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.mesh import Mesh
-from tests.laboratory.experiments.surface.colour_difference import difference_2000, lab_from_srgb
-from tests.laboratory.experiments.surface.light import face_texels, texels
 from tests.pipeline.texturing.test_paint import without_neck
+from tests.support.colour_difference import difference_2000, lab_from_srgb
+from tests.support.face_texels import face_texels, texels
 from tests.support.photographs import SCREEN
 from tests.support.scenes import SEMI_AXES, ellipsoid, fan, pattern, pixel_grid, ray_ellipsoid
 

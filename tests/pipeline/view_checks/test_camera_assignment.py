@@ -9,8 +9,8 @@ from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.view_checks.camera_assignment import _miss_px, find_assignment, own_misfit, rings
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from tests.laboratory.experiments.paper.robustness import knocked
 from tests.support.silhouette_subjects import captures_of, disturbed
+from tests.support.spoilt_captures import knocked
 
 CALIBRATION_PX = 0.3
 

@@ -12,8 +12,8 @@ from pipeline.view_checks.camera_drift import _judge, find_drift
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from tests.laboratory.experiments.faults.drift import close_up, loosened
 from tests.support.silhouette_subjects import dressed_head
+from tests.support.spoilt_captures import close_up, loosened
 
 
 @pytest.fixture(scope="module")

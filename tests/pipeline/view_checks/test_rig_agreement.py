@@ -166,6 +166,7 @@ def test_turned_pictures_whose_cameras_had_width_and_height_exchanged_are_named(
     assert word in str(wrong_rig(silhouettes(turned), written))
 
 
+@pytest.mark.slow
 def test_the_calibration_of_another_rig_is_named(seen):
     _, _, of_all = seen
     for name in ARRANGEMENTS_DEG:
@@ -175,6 +176,7 @@ def test_the_calibration_of_another_rig_is_named(seen):
         assert "calibrate it again" in found.text
 
 
+@pytest.mark.slow
 def test_principal_points_of_the_whole_picture_are_named_where_it_was_cropped(seen):
     rig, _, of_all = seen
     changed = [lensed(c, cx=c.intrinsics.cx + 60, cy=c.intrinsics.cy + 40) for c in rig]

@@ -108,7 +108,7 @@ def test_firmware_speaks_the_protocol(simulator: Simulator) -> None:
             box._command("ARMOUR 1")
         box.arm(0.5)
         assert box.status().state == "ARMED"
-        box.disarm()
+        box._command("DISARM")
         assert box.status().state == "IDLE"
         box.arm(0.05)
         first = box.synchronise()

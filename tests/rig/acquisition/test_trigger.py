@@ -111,7 +111,7 @@ def test_fire_needs_arming_and_arming_is_used_up(port: Path, outputs: Outputs) -
         with pytest.raises(TriggerRefused, match="NOT-ARMED"):
             box.fire(1, 1000)
         box.arm(5.0)
-        box.disarm()
+        box._command("DISARM")
         with pytest.raises(TriggerRefused, match="NOT-ARMED"):
             box.fire(1, 1000)
         box.arm(0.05)

@@ -18,13 +18,13 @@ from rig.drivers.base import (
     Driver,
     DriverMissing,
     GrabTimeout,
-    grab_frame,
 )
 from rig.drivers.opencv import VideoCaptureDriver
 from rig.drivers.registry import driver_for
 from rig.drivers.simulated import SimulatedDriver
 from rig.formats.rig_toml import CameraConfig
 from rig.studio.devices.serve import StudioDevices
+from tests.support.frames import grab_frame
 from tests.support.textured_studio import FlatStudio
 
 Make = Callable[[], Driver]

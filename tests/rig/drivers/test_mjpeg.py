@@ -15,10 +15,10 @@ from rig.drivers.base import (
     CameraLost,
     CameraNotFound,
     GrabTimeout,
-    grab_frame,
 )
 from rig.drivers.registry import driver_for
 from rig.formats.rig_toml import CameraConfig
+from tests.support.frames import grab_frame
 
 
 def serve_bytes(answer: bytes, pause_s: float = 0.0) -> tuple[int, Callable[[], None]]:

@@ -9,7 +9,7 @@ import pytest
 
 from rig.acquisition.commands import capture_with, check, take_plates
 from rig.acquisition.session import RigSession
-from rig.drivers.base import CameraNotFound, grab_frame
+from rig.drivers.base import CameraNotFound
 from rig.drivers.registry import driver_for
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.meshes.ply import write_ply
@@ -23,6 +23,7 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import Scene, build_scene
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
+from tests.support.frames import grab_frame
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]
 

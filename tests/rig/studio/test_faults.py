@@ -33,6 +33,7 @@ TABLE: dict[str, tuple[DeviceFault, set[tuple[str, str | None]]]] = {
 CANNOT_SHOW = {("unplugged", kind) for kind in ("dropped", "late-trigger", "late-output")} | {
     ("late-trigger", "late-output")
 }
+NEIGHBOURS = {*itertools.pairwise(TABLE), ("dropped", "unplugged")}  # each fault twice; all 45 pairs each night
 TIMEOUT_S = 1.0
 # A shot ends after its timeout, one look at the live view before it (3 periods of 0.25 s), and the checks.
 LIMIT_S = 8.0
@@ -120,7 +121,13 @@ def test_a_fault_alone_is_named_and_nothing_else_is(studio: StudioDevices, sessi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("one", "other"), list(itertools.combinations(TABLE, 2)))
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        pytest.param(*pair, marks=[] if pair in NEIGHBOURS else pytest.mark.nightly)
+        for pair in itertools.combinations(TABLE, 2)
+    ],
+)
 def test_two_faults_are_both_named(studio: StudioDevices, config: RigConfig, one: str, other: str) -> None:
     shot, took_s = shoot_with(studio, config, [TABLE[one][0], TABLE[other][0]])
     expected = TABLE[one][1] | TABLE[other][1]

@@ -34,12 +34,12 @@ def crash(how: str, **number: int) -> WorkFailed:
     ],
 )
 def test_kind_and_words(error: EigenheadError | OSError, origin: Origin | None, kind: str, words: str) -> None:
-    failure = failure_of(error, Path("shots/anna"), "token", origin)
-    assert (failure.kind, failure.attempt, failure.origin) == (kind, "token", origin)
+    failure = failure_of(error, Path("shots/anna"), origin)
+    assert (failure.kind, failure.origin) == (kind, origin)
     assert words in failure.message.text
 
 
 def test_faults_and_traces_are_kept() -> None:
     fault = compose("settings-no-table")
-    assert failure_of(InputError("x", [fault]), Path(), "t", ORIGIN).faults == (fault,)
-    assert failure_of(WorkFailed("bug", "boom", (), "line 3"), Path(), "t", ORIGIN).trace == "line 3"
+    assert failure_of(InputError("x", [fault]), Path(), ORIGIN).faults == (fault,)
+    assert failure_of(WorkFailed("bug", "boom", (), "line 3"), Path(), ORIGIN).trace == "line 3"

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from rig.messages.message import compose
-from server.batch.folder import BatchFolder, FailureRecord, ForeignFiles, Origin, file_name
+from server.batch.folder import BatchFolder, FailureRecord, ForeignFiles, Origin, ShareTaken, file_name
+from server.batch.shards import WHOLE, Shard
 
 ORIGIN = Origin("11" * 32, "22" * 32, "33" * 32, "0.1.0")
 
@@ -18,7 +19,7 @@ def folder(tmp_path: Path) -> BatchFolder:
 
 
 def publish(folder: BatchFolder, name: str, content: bytes = b"mesh", origin: Origin = ORIGIN) -> None:
-    attempt = folder.new_attempt("token")
+    attempt = folder.new_attempt(WHOLE)
     (attempt / "result" / "head.ply").write_bytes(content)
     (attempt / "result" / "overlays").mkdir()
     (attempt / "result" / "overlays" / "cam00.png").write_bytes(b"png")
@@ -63,7 +64,7 @@ def test_a_new_result_takes_the_place_of_the_old_one_as_a_whole(folder: BatchFol
 
 def test_of_two_who_publish_the_second_is_refused(folder: BatchFolder) -> None:
     """Where both found nothing there; a folder with files is never replaced by a rename."""
-    first, second = folder.new_attempt("a"), folder.new_attempt("b")
+    first, second = folder.new_attempt(Shard(1, 2)), folder.new_attempt(Shard(2, 2))
     for attempt in (first, second):
         (attempt / "result" / "report.json").write_text("{}")
     folder.publish("anna", first, ORIGIN)
@@ -88,7 +89,7 @@ def test_the_version_is_no_reason_to_make_a_head_again() -> None:
 
 
 def test_a_failure_is_kept_until_the_capture_is_done(folder: BatchFolder) -> None:
-    failure = FailureRecord("token", "input", compose("batch-list-empty"), (compose("settings-no-table"),), ORIGIN)
+    failure = FailureRecord("input", compose("batch-list-empty"), (compose("settings-no-table"),), ORIGIN)
     folder.note_failure("anna", failure)
     assert folder.failure("anna") == failure
     assert folder.failure("bert") is None
@@ -96,30 +97,24 @@ def test_a_failure_is_kept_until_the_capture_is_done(folder: BatchFolder) -> Non
     assert folder.failure("anna") is None
 
 
-def test_attempts_of_the_dead_and_empty_folders_go(folder: BatchFolder) -> None:
-    one, two = folder.new_attempt("a"), folder.new_attempt("a")
-    three = folder.new_attempt("b")
-    assert len({one, two, three}) == 3
-    folder.remove_attempts(lambda token: token == "b")
-    assert list(folder.attempts.iterdir()) == [three]
-    folder.remove_empty_folders()
-    assert folder.work.exists()
-    folder.remove_attempts(lambda token: False)
-    folder.remove_empty_folders()
+def test_attempts_of_ended_shares_and_empty_folders_go(folder: BatchFolder) -> None:
+    first, second = Shard(1, 2), Shard(2, 2)
+    with folder.share(second):
+        with folder.share(first):
+            alive = folder.new_attempt(second)
+            assert folder.new_attempt(first) != folder.new_attempt(first)
+        assert list(folder.attempts.iterdir()) == [alive]
+        dead = folder.new_attempt(first)  # as a kill leaves it: the lock went with the process
+        (folder.work / "1-of-2.lock").touch()
+    assert not dead.exists()
     assert not folder.work.exists()
 
 
-def test_empty_folders_stay_while_somebody_is_at_work(folder: BatchFolder) -> None:
-    owner = folder.claims / "owners" / "other.json"
-    for path in (owner.parent, folder.attempts, folder.work / "failures"):
-        path.mkdir(parents=True)
-    owner.write_text("{}")
-    folder.remove_empty_folders()
-    assert folder.attempts.exists()
-    assert (folder.work / "failures").exists()
-    owner.unlink()
-    folder.remove_empty_folders()
-    assert not folder.work.exists()
+def test_a_share_is_of_one_process(folder: BatchFolder) -> None:
+    with folder.share(WHOLE), pytest.raises(ShareTaken, match="share 1/1"), folder.share(WHOLE):
+        pass
+    with folder.share(WHOLE):
+        pass
 
 
 def test_file_names_are_short_readable_and_apart() -> None:

@@ -39,14 +39,6 @@ def test_the_last_capture_has_one_worker_however_many_there_are() -> None:
     assert (progress.share(), progress.remaining_s()) == (1.0, 0.0)
 
 
-def test_a_capture_that_another_process_has_is_not_at_work_here() -> None:
-    progress = BatchProgress(2, 1, 10.0, Clock())
-    progress.start("a")
-    progress.leave("a")
-    progress.report("a", 0.9)
-    assert (progress.share(), progress.remaining_s()) == (0.0, 20.0)
-
-
 @pytest.mark.parametrize(("seconds", "words"), [(0, "0 s"), (89, "89 s"), (840, "14 min"), (9000, "2.5 h")])
 def test_times_in_words(seconds: float, words: str) -> None:
     assert told_time(seconds) == words

@@ -6,16 +6,12 @@ import random
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from rig.messages.message import compose
-from server.batch.claims import Claims
-from server.batch.folder import BatchFolder, FailureRecord, file_name
-from server.batch.run import Outcome
+from server.batch.folder import ShareTaken
 from server.batch.shards import Shard
 from tests.support.pinned_batch import Silent, everything_in, pinned_capture, pinned_captures, run_pinned
 from tests.support.pinned_work import LOG, SECONDS
@@ -104,69 +100,29 @@ def test_shards_are_one_whole(tmp_path: Path) -> None:
     assert (out / "heads.csv").read_text().count(",done,") == 7  # the last one's table has the others' heads
 
 
-def test_what_another_process_has_is_waited_for_and_taken_as_it_comes(tmp_path: Path) -> None:
-    """Two processes with the same share, started at once: nobody begins what another has begun."""
+def test_shares_side_by_side_begin_nothing_twice_and_a_share_has_one_process(tmp_path: Path) -> None:
     shots, out, log = pinned_captures(tmp_path / "shots", 12), tmp_path / "heads", tmp_path / "log"
     environment = os.environ | {SECONDS: "0.15", LOG: str(log)}
-    command = [*COMMAND, str(shots), str(out), "2", "1/1"]
-    both = [subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE) for _ in range(2)]
-    printed = [json.loads(process.communicate(timeout=120)[0]) for process in both]
-    assert [process.returncode for process in both] == [0, 0]
-    for name in (f"s{k:04}" for k in range(12)):
-        assert sorted(states[name] for states in printed) == ["kept", "made"]
-    begun = [line.split()[2] for line in log.read_text().splitlines() if "begins" in line]
-    assert sorted(begun) == [f"s{k:04}" for k in range(12)]
+    begun = []
+    for share in ("1/2", "2/2"):
+        command = [*COMMAND, str(shots), str(out), "2", share]
+        begun.append(subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE))
+        await_lock(out / ".batch" / f"{share.replace('/', '-of-')}.lock")
+    with pytest.raises(ShareTaken, match="share 1/2"):
+        run_pinned(shots, out, shard=Shard(1, 2))
+    printed = [json.loads(process.communicate(timeout=120)[0]) for process in begun]
+    states_of_all = [state for states in printed for state in states.values()]
+    assert states_of_all == ["made"] * 12
+    assert sorted(line.split()[2] for line in log.read_text().splitlines() if "begins" in line) == sorted(
+        f"s{k:04}" for k in range(12)
+    )
+    assert (out / "heads.csv").read_text().count(",done,") == 12
     assert not (out / ".batch").exists()
 
 
-def test_a_failure_of_another_process_is_told_and_not_tried_twice(tmp_path: Path) -> None:
-    """This process begins while another one has the capture, which then fails."""
-    shots, out, log = tmp_path / "shots", tmp_path / "heads", tmp_path / "log"
-    pinned_capture(shots / "bad", 1, "fail")
-    folder = BatchFolder(out)
-    other = Claims(folder.claims)
-    with other.beating():
-        assert other.take(file_name("bad"))
-        command, environment = [*COMMAND, str(shots), str(out)], os.environ | {LOG: str(log)}
-        running = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE)
-        deadline = time.monotonic() + 60
-        while len(list((folder.claims / "owners").glob("*.json"))) < 2:
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        time.sleep(0.5)
-        folder.note_failure("bad", FailureRecord(other.token, "refused", compose("batch-list-empty"), (), None))
-        other.release(file_name("bad"))
-        printed = running.communicate(timeout=60)[0]
-    assert json.loads(printed) == {"bad": "failed"}
-    assert not log.exists()
-
-
-def test_a_process_that_was_taken_for_dead_lays_nothing_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As one that was stopped for long: another has its capture when its work is done."""
-    shots, out, log = pinned_captures(tmp_path / "shots", 1), tmp_path / "heads", tmp_path / "log"
-    monkeypatch.setenv(SECONDS, "1.0")
-    monkeypatch.setenv(LOG, str(log))
-    folder, claim, ended = BatchFolder(out), file_name("s0000"), list[Outcome]()
-    runner = threading.Thread(target=lambda: ended.extend(run_pinned(shots, out)))
-    other = Claims(folder.claims)
-    with other.beating():
-        runner.start()
-        await_line(log, "begins s0000")
-        (folder.claims / claim).unlink()
-        assert other.take(claim)
-        await_line(log, "ends s0000")
-        time.sleep(0.5)
-        assert not folder.result("s0000").exists()
-        assert not list(folder.attempts.iterdir())
-        other.release(claim)
-        runner.join(60)
-    assert states(ended) == {"s0000": "made"}  # nobody had made it meanwhile
-    assert log.read_text().count("ends s0000") == 2
-
-
-def await_line(log: Path, words: str) -> None:
+def await_lock(lock: Path) -> None:
     deadline = time.monotonic() + 60
-    while not log.exists() or words not in log.read_text():
+    while not lock.exists():
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
@@ -183,8 +139,9 @@ def test_kills_at_any_moment_change_no_byte(tmp_path: Path, processes: int, kill
     command = [*COMMAND, str(shots), str(out), "2"]
     for _ in range(kills):
         quiet = {"cwd": ROOT, "env": environment, "stdout": subprocess.DEVNULL}
-        running = [subprocess.Popen(command, **quiet) for _ in range(processes)]
-        time.sleep(rng.uniform(0.0, 1.8))
+        shares = [f"{k + 1}/{processes}" for k in range(processes)]
+        running = [subprocess.Popen([*command, share], **quiet) for share in shares]
+        time.sleep(rng.uniform(0.0, 0.5))  # 60 captures take 3 s without a kill
         for process in running:
             process.send_signal(signal.SIGKILL)
             process.wait()

@@ -49,7 +49,7 @@ def test_a_head_is_a_row() -> None:
 
 
 def test_what_failed_and_what_is_missing_have_rows_too() -> None:
-    failure = FailureRecord("t", "crash", compose("batch-worker-killed"), (), FROM)
+    failure = FailureRecord("crash", compose("batch-worker-killed"), (), FROM)
     failed = row_of(CAPTURE, COLUMNS, failure=failure)
     assert (failed["state"], failed["failure_kind"]) == ("failed", "crash")
     assert "fewer --workers" in str(failed["failure"])

@@ -10,7 +10,7 @@ from server.batch.folder import FailureRecord
 from server.batch.run import Outcome
 from server.cli.batch_display import BatchDisplay
 
-FAILURE = FailureRecord("t", "input", compose("batch-list-empty"), (), None)
+FAILURE = FailureRecord("input", compose("batch-list-empty"), (), None)
 
 
 class Terminal(io.StringIO):
@@ -24,7 +24,6 @@ def go_through(display: BatchDisplay) -> None:
         display.start(name)
         display.report(name, 0.5)
     display.end(Outcome("anna", "made", 21.4))
-    display.leave("carl")
     display.end(Outcome("bert", "failed", 1.0, FAILURE))
     display.start("carl")
     display.end(Outcome("carl", "kept"))

@@ -14,6 +14,7 @@ from tests.server.cli.test_main import run
 from tests.support.textured_wedge import wedge_rig, write_photographs
 
 
+@pytest.mark.slow
 def test_photographs_become_cameras_and_a_page(tmp_path: Path) -> None:
     photos = write_photographs(tmp_path / "photos", wedge_rig().subset(["cam00", "cam01", "cam02"]))
     out = tmp_path / "new" / "cameras.json"

@@ -57,9 +57,12 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
     assert (wrong.exit_code, requested) == (2, [])
     assert "'fbx' is none of glb, ply, obj, usdz, stl, 3mf" in " ".join(wrong.stderr.replace("│", " ").split())
     assert CliRunner().invoke(app, [*arguments, "--formats", "glb, usdz"]).exit_code == 0
-    for option in ("--albedo", "--delight"):  # its name, and that of earlier versions
-        assert CliRunner().invoke(app, [*arguments, option]).exit_code == 0
-    assert requested == [{"formats": ["glb", "usdz"]}, {"delight": True}, {"delight": True}]
+    assert CliRunner().invoke(app, [*arguments, "--albedo"]).exit_code == 0
+    assert requested == [{"formats": ["glb", "usdz"]}, {"delight": True}]
+    for option in ("--obj", "--atlas", "--delight"):  # of versions before 0.3.0
+        refused = CliRunner().invoke(app, [*arguments, option])
+        assert refused.exit_code == 2
+        assert f"No such option: {option}" in refused.stderr
 
 
 def test_a_cap_reaches_the_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -53,6 +53,7 @@ def test_every_command_has_help_with_an_example(command: str) -> None:
     assert f"Example: eigenhead {command}" in done.stdout or "eigenhead worker" in done.stdout
 
 
+@pytest.mark.usefixtures("real_exec")
 def test_help_is_quick() -> None:
     """CPU time, which a busy machine does not stretch."""
     began = time.perf_counter()
@@ -70,6 +71,17 @@ def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path) -> None:
     done = run(*arguments, EIGENHEAD_DATA=str(tmp_path))
     assert done.returncode == 2
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [([], "NAME"), (["limit", "--subjects", "3", "--json"], "limit"), (["--json", "real"], "real")],
+)
+def test_experiments_are_in_the_laboratory(arguments: list[str], name: str) -> None:
+    done = run("experiments", *arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"python -m tests.laboratory {name} [--json]" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.applications.model_building.correspondence.scans import write_landmarks
 from pipeline.applications.verification.limits import Limits
 from pipeline.head_model.model import load_model
 from rig.errors import InputError
@@ -18,6 +17,7 @@ from rig.formats.meshes.ply import write_ply
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh
 from server.cli.verify import read_limits, verify_captures
+from tests.support.landmark_files import write_landmarks
 from tests.support.measured_heads import mannequin
 from tests.support.services import ROOT, small_capture
 

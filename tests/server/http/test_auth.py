@@ -20,7 +20,7 @@ import pytest
 
 from rig.formats.captures.archive import pack_folder
 from server.address import is_loopback
-from server.services.keys import KeylessAddress, Keys, check_address
+from server.services.keys import SCOPES, KeylessAddress, Keys, check_address
 from server.settings import ServiceSettings
 from server.storage.database import open_database
 from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture
@@ -31,7 +31,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningS
     """A service with one key for each scope."""
     data = tmp_path_factory.mktemp("guarded") / "data"
     engine = open_database(ServiceSettings(data=data))
-    keys = {scope: Keys(engine).add(scope, (scope,)) for scope in ("read", "capture", "submit", "admin")}
+    keys = {scope: Keys(engine).add(scope, (scope,)) for scope in SCOPES}
     engine.dispose()
     with running_service(data, jobs_per_key="3") as service:
         yield service, keys
@@ -52,6 +52,7 @@ def test_each_scope_does_what_it_may_and_no_more(
         "read": lambda client: client.get("/v1/jobs"),
         "capture": lambda client: client.post("/v1/captures/uploads", files=files),
         "submit": lambda client: client.post("/v1/jobs", json={"capture_id": "0" * 28}),
+        "erase": lambda client: client.delete("/v1/sessions/" + "0" * 28),
         "admin": lambda client: client.get("/v1/keys"),
     }
     for holder, key in keys.items():
@@ -66,6 +67,32 @@ def test_each_scope_does_what_it_may_and_no_more(
                 assert refused.status_code == 401
                 assert refused.json()["type"].endswith("key-missing" if key is None else "key-invalid")
             assert client.get("/healthz").status_code == 200
+
+
+def test_erasing_captures_with_their_heads_needs_the_scope_erase(
+    guarded: tuple[RunningService, dict[str, str]],
+) -> None:
+    service, keys = guarded
+    with client_of(service, keys["capture"]) as client:
+        refused = client.delete("/v1/captures/" + "0" * 28, params={"erase": "true"})
+        assert (refused.status_code, refused.json()["type"].rpartition(":")[2]) == (403, "scope-missing")
+        assert client.delete("/v1/captures/" + "0" * 28).status_code == 404
+        bulk = {"action": "erase", "ids": ["0" * 28]}
+        assert client.post("/v1/captures/bulk", json=bulk).status_code == 403
+
+
+def test_the_first_key_is_not_made_over_http(service: RunningService) -> None:
+    with client_of(service, None) as client:
+        refused = client.post("/v1/keys", json={"name": "mine", "scopes": ["admin"]})
+        assert (refused.status_code, refused.json()["type"].rpartition(":")[2]) == (403, "first-key")
+        assert client.get("/v1/jobs").status_code == 200  # it is as open as before
+
+
+def test_every_answer_has_the_headers_that_browsers_heed(service: RunningService) -> None:
+    with client_of(service, None) as client:
+        for answer in (client.get("/healthz"), client.get("/v1/nowhere"), client.get("/docs")):
+            assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
+            assert answer.headers["x-content-type-options"] == "nosniff"
 
 
 def test_a_json_body_is_not_awaited_from_nobody(guarded: tuple[RunningService, dict[str, str]]) -> None:

@@ -42,6 +42,12 @@ def test_lists_refuse_what_they_cannot_do(http: httpx.Client, path: str, query: 
     assert answer.headers["content-type"] == "application/problem+json"
 
 
+def test_jobs_refuse_the_offset_of_versions_before_0_3(http: httpx.Client) -> None:
+    answer = http.get("/v1/jobs", params={"offset": 0})
+    assert answer.status_code == 422
+    assert [error["code"] for error in answer.json()["error_messages"]] == ["cursor-in-place-of-offset"]
+
+
 def test_many_captures_take_one_action_and_those_that_cannot_are_named(http: httpx.Client, captures: list[str]) -> None:
     def act(path: str, **body: object) -> dict:
         answer = http.post(path, json=body)

@@ -13,7 +13,7 @@ from tests.support.services import await_state, running_service, uploaded_captur
 
 def test_a_signal_to_the_whole_group_ends_both_without_a_word_of_dying(tmp_path: Path) -> None:
     """As `timeout`, a container's runtime or a supervisor sends it."""
-    with running_service(tmp_path / "data") as service:
+    with running_service(tmp_path / "data", forked=False) as service:
         assert service.process is not None
         deadline = time.monotonic() + 60.0
         while "worker ready" not in service.log_end():

@@ -9,14 +9,14 @@ from server.services.presets import PRESETS, Preset, settings_of
 
 
 @pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset.id or "standard")
-def test_no_preset_is_warned_of_as_an_old_setting(preset: Preset) -> None:
+def test_no_preset_is_warned_of(preset: Preset) -> None:
     _, warnings = find_layout(load_model(), settings_from_document(preset.settings))
     assert [warning.text for warning in warnings] == []
 
 
 def test_renderers_get_the_formats_that_they_read() -> None:
     settings = settings_from_document(settings_of("texture"))
-    assert {"obj", "usdz"} <= set(settings.outputs.written)
+    assert {"obj", "usdz"} <= set(settings.outputs.formats)
     assert settings.outputs.textured
 
 

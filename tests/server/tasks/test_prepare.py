@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.compute import jit as compiled
 from pipeline.compute import kernel_list
 from pipeline.compute.kernel_list import Kernel
+from rig import jit as compiled
 from server.processes import python_environment
 from server.tasks.prepare import prepare_kernels
 from tests.support.disks import small_disk

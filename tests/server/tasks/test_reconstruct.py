@@ -21,6 +21,8 @@ from server.tasks.child import WorkerContext
 from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.subjects import drawn_subject
 
+pytestmark = [pytest.mark.slow, pytest.mark.gl]
+
 
 @pytest.fixture(scope="module")
 def shot(renderer: Renderer) -> SimulatedCapture:
@@ -30,7 +32,6 @@ def shot(renderer: Renderer) -> SimulatedCapture:
     return simulate(drawn_subject(load_model(), rng), rig, PRESET, rng, renderer=renderer)
 
 
-@pytest.mark.gl
 def test_a_capture_folder_becomes_a_head_and_its_report(
     renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
 ) -> None:
@@ -70,7 +71,6 @@ def test_a_capture_folder_becomes_a_head_and_its_report(
     assert any((tmp_path / "cache").rglob("*"))  # the silhouettes, for the next job
 
 
-@pytest.mark.gl
 def test_an_empty_studio_is_refused_and_leaves_no_result(
     renderer: Renderer, shot: SimulatedCapture, tmp_path: Path
 ) -> None:

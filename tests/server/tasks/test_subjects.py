@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.applications.model_building.correspondence.scans import write_landmarks
 from rig.formats.meshes.obj import obj_bytes
 from rig.studio.scene.subject import Subject
 from server.tasks.subjects import subject_of, turn_eyes
+from tests.support.landmark_files import write_landmarks
 from tests.support.measured_heads import mannequin, marks, model
 
 

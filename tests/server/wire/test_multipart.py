@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -244,7 +245,10 @@ def pictures_of(folder: Path, *fields: bytes) -> tuple[str, bytes, str]:
         accept_photographs=taken_as("scene"),
     )
     request = SimpleNamespace(headers={"content-type": TYPE, "content-length": str(len(data))}, stream=stream)
-    received_pictures = asyncio.run(receive_calibration_pictures(cast(Service, service), cast(Request, request)))
+    request.receive = partial(asyncio.sleep, 60)  # the client stays
+    received_pictures = asyncio.run(
+        receive_calibration_pictures(cast(Service, service), cast(Request, request), "local")
+    )
     return cast(tuple[str, bytes, str], received_pictures)
 
 

@@ -24,7 +24,7 @@ from server.settings import ServiceSettings
 from tests.support.postgres import running_postgres
 from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture, worker_pids
 
-JOBS, KILLS = 100, 30
+NIGHTLY = pytest.mark.nightly
 
 
 @contextmanager
@@ -66,7 +66,9 @@ def submit(service: RunningService, capture: str, number: int, settings: dict[st
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_a_hundred_jobs_survive_thirty_kills(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("total", "kills"), [(12, 4), pytest.param(100, 30, marks=NIGHTLY)])
+def test_jobs_survive_kills(kind: str, total: int, kills: int, tmp_path: Path) -> None:
+    """Every third kill takes the service, the others its workers."""
     rng = random.Random(20240501)
     with (
         database(kind) as settings,
@@ -76,19 +78,19 @@ def test_a_hundred_jobs_survive_thirty_kills(kind: str, tmp_path: Path) -> None:
         jobs = [submit(service, capture, 0)]
         with httpx.Client(base_url=service.url) as client:
             undisturbed = await_state(client, jobs[0], ("succeeded",), 60)["files"]
-        jobs += [submit(service, capture, number) for number in range(1, JOBS // 2)]
-        for number in range(KILLS):
+        jobs += [submit(service, capture, number) for number in range(1, total // 2)]
+        for number in range(kills):
             time.sleep(rng.uniform(0.2, 2.0))
-            if number < JOBS // 2:
-                jobs.append(submit(service, capture, JOBS // 2 + number))
+            if number < total // 2:
+                jobs.append(submit(service, capture, total // 2 + number))
             if number % 3 == 2:
                 service.kill()
                 service.start()
             else:
                 for pid in worker_pids(service):
                     os.kill(pid, signal.SIGKILL)
-        jobs += [submit(service, capture, number) for number in range(JOBS // 2 + KILLS, JOBS)]
-        assert len(set(jobs)) == JOBS
+        jobs += [submit(service, capture, number) for number in range(total // 2 + kills, total)]
+        assert len(set(jobs)) == total
         with httpx.Client(base_url=service.url, timeout=30) as client:
             for job in jobs:
                 done = await_state(client, job, ("succeeded", "failed", "cancelled"), 240)
@@ -105,9 +107,10 @@ def test_a_hundred_jobs_survive_thirty_kills(kind: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.gl
 @pytest.mark.timeout(900)
-def test_real_heads_survive_kills_to_the_last_byte(tmp_path: Path) -> None:
-    """Five reconstructions of a simulated shot, four SIGKILLs into one that runs: every second one takes the service
-    too. report.json tells times of its own; every other file is the undisturbed one."""
+@pytest.mark.parametrize(("total", "kills"), [(2, 2), pytest.param(5, 4, marks=NIGHTLY)])
+def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_path: Path) -> None:
+    """Reconstructions of a simulated shot, SIGKILLs into one that runs: every second one takes the service, too.
+    report.json tells times of its own; every other file is the undisturbed one."""
     rng = random.Random(4)
     with (
         running_service(
@@ -120,8 +123,8 @@ def test_real_heads_survive_kills_to_the_last_byte(tmp_path: Path) -> None:
         first = submit(service, capture, 0, settings)
         undisturbed = files_of(await_state(client, first, ("succeeded", "failed"), 240))
         assert {"head.ply", "head.glb", "contact_sheet.png"} <= undisturbed.keys()
-        jobs = [submit(service, capture, number, settings) for number in range(1, 6)]
-        for number in range(4):
+        jobs = [submit(service, capture, number, settings) for number in range(1, total + 1)]
+        for number in range(kills):
             await_running(client, jobs)
             time.sleep(rng.uniform(0.2, 3.0))
             if number % 2:
@@ -131,8 +134,8 @@ def test_real_heads_survive_kills_to_the_last_byte(tmp_path: Path) -> None:
             if number % 2:
                 service.start()
         ended = [await_state(client, job, ("succeeded", "failed", "cancelled"), 240) for job in jobs]
-        assert [job["state"] for job in ended] == ["succeeded"] * 5
-        assert [files_of(job) for job in ended] == [undisturbed] * 5
+        assert [job["state"] for job in ended] == ["succeeded"] * total
+        assert [files_of(job) for job in ended] == [undisturbed] * total
 
 
 def files_of(job: dict[str, Any]) -> dict[str, str]:

@@ -3,7 +3,7 @@ x."""
 
 import numpy as np
 
-from pipeline.compute.jit import njit
+from rig.jit import njit
 
 CELL_MM = 2.0
 CELLS_ROUND = 288  # 2 mm at 92 mm from the axis

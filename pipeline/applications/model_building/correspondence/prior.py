@@ -19,7 +19,7 @@ from pipeline.head_model.subdivision import edges_of
 
 GLOBAL, LOCAL = 0.8, 0.6  # factors of both parts' standard deviations; their squares add up to 1
 LENGTH_MM = 60.0  # of the Gaussian of the distance between vertices
-# Localised modes; with 300 the held-out error is a tenth larger (tests/laboratory/benchmarks/correspondence.py).
+# Localised modes; with 300 the held-out error is a tenth larger (tests/laboratory/notes/head-models.md).
 KEPT = 700
 _SPARE = 100  # directions of the sketch beyond those kept
 _BLOCK = 600

@@ -95,12 +95,6 @@ def read_landmarks(path: Path) -> dict[str, Float[np.ndarray, " 3"]]:
     return known
 
 
-def write_landmarks(path: Path, landmarks: Mapping[str, Float[np.ndarray, " 3"]]) -> None:
-    """Writes landmarks in the ``.json`` form."""
-    points = {name: [round(float(x), 4) for x in point] for name, point in landmarks.items()}
-    path.write_text(json.dumps({"format": "eigenhead-landmarks/1", "points": points}, indent=1), encoding="utf-8")
-
-
 def plain_name(name: str) -> str:
     """Returns the name in lower case with underscores."""
     return "_".join(name.strip().lower().replace("-", " ").replace("_", " ").split())

@@ -1,7 +1,8 @@
 """Fits a model directly to a surface: Gauss-Newton on point-to-plane distances, pose and coefficients together.
 
 It measures the best fit that a model can reach (tests/laboratory/notes/head-models.md), transfers landmarks from one
-model to another, and starts correspondence. Point-to-plane steps follow Chen and Medioni (1992); the prior is z ~ N(0, I)."""
+model to another, and starts correspondence. Point-to-plane steps follow Chen and Medioni (1992); the prior is
+z ~ N(0, I)."""
 
 from dataclasses import dataclass, replace
 

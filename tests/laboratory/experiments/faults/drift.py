@@ -12,15 +12,13 @@ random camera is turned by ``TURN_DEG`` about an axis across its view. Condition
 A camera may be named as moved (its view is left out), or as one that moved or has a loose mask (the view is kept).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 
 from pipeline.head_model.model import HeadModel, with_modes
-from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview import tangency
 from pipeline.view_checks import camera_drift
 from pipeline.view_checks.camera_drift import find_drift
@@ -30,29 +28,23 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.paper.robustness import knocked
-from tests.laboratory.experiments.records import Records, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.support.spoilt_captures import LOOSE_PX, close_up, knocked, loosened
 from tests.support.subjects import Planted, off_by, random_subjects, worn_silhouettes
 
 TURN_DEG = 0.2
-LOOSE_PX = 2
 CALIBRATION_PX = 0.11  # prior of ``off_by``: a head moves by 0.2 px (2D RMS) in each image
 CUT_VIEWS, CUT_SHARE = 3, 0.3  # of width and height: how far such a view is aimed beside the subject
-CLOSE_UP, CLOSE_UP_SHARE = 2.0, 0.3  # focal length; of the height: how far down the head is, so that its crown is whole
 CONDITIONS = ("turned", "good", "loose", "loose_one", "cut_off", "close_up", "close_up_loose")
 
 
-def drift(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def drift(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 20) -> Outcome:
     """Runs this module's experiment. Returns the share of turned cameras that are named, and of good cameras that are,
     by condition and by warning."""
-    records = Records(folder, "drift", key_of(model.sha256, camera_drift, tangency, TURN_DEG, LOOSE_PX))
+    records = bench.records("drift", key_of(model.sha256, camera_drift, tangency, TURN_DEG, LOOSE_PX))
     span, rows = with_modes(model, 60), []
     for i, subject in enumerate(random_subjects(subjects, seed=17)):
-        report(subject.name, i / subjects)
+        bench.report(subject.name, i / subjects)
         rng = np.random.default_rng([17, i])
         rows.append(records.row(subject.name, lambda s=subject, r=rng: {"name": s.name} | draw(span, s, renderer, r)))
     found = figures(rows)
@@ -90,20 +82,6 @@ def draw(model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.
 def said_of(silhouettes: Mapping[str, Silhouette], rig: Rig) -> dict[str, str]:
     """Returns the codes of the warnings about cameras, by camera."""
     return {found.camera: found.code for found in find_drift(silhouettes, rig)}
-
-
-def loosened(silhouettes: Mapping[str, Silhouette]) -> dict[str, Silhouette]:
-    """Returns silhouettes whose masks are dilated by ``LOOSE_PX``."""
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * LOOSE_PX + 1, 2 * LOOSE_PX + 1))
-    masks = {name: cv2.dilate(s.mask.view(np.uint8), disk).view(bool) for name, s in silhouettes.items()}
-    return {name: silhouette_from_mask(mask) for name, mask in masks.items()}
-
-
-def close_up(camera: Camera) -> Camera:
-    """Returns the camera with a lens of ``CLOSE_UP`` times the focal length, aimed higher."""
-    k = camera.intrinsics
-    down = k.cy + CLOSE_UP_SHARE * k.height
-    return replace(camera, intrinsics=replace(k, fx=CLOSE_UP * k.fx, fy=CLOSE_UP * k.fy, cy=down))
 
 
 def aimed_beside(camera: Camera, rng: np.random.Generator) -> Camera:

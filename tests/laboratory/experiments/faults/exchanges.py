@@ -12,7 +12,6 @@ it is also recorded whether the capture ended like the unexchanged one without t
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -33,16 +32,8 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
-from tests.support.subjects import (
-    Planted,
-    binary_silhouettes,
-    mean_error_mm,
-    off_by,
-    random_subjects,
-    worn_silhouettes,
-)
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Records, Row, key_of
+from tests.support.subjects import Planted, binary_silhouettes, mean_error_mm, off_by, random_subjects, worn_silhouettes
 
 CALIBRATION_PX = 0.11  # prior of ``off_by``: a head moves by 0.2 px (2D RMS) in each image
 WORST_RATIO = 1.1  # of the fit's error after an exchange to that without
@@ -51,14 +42,11 @@ KINDS = ("pair", "triple", "duplicate")
 ASKED = (camera_assignment, rig_agreement, image_assignment, tangency)
 
 
-def exchanges(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 12,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def exchanges(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 12) -> Outcome:
     """Simulates captures whose pictures are filed under the wrong cameras. Returns the shares of these exchanges that
     are detected and repaired, by kind of exchange."""
-    records = Records(folder, "exchanges", key_of(model.sha256, *ASKED, *CONTOUR))
-    rows = _rows(_exchanged_row, model, renderer, records, report, seed=18, subjects=subjects)
+    records = bench.records("exchanges", key_of(model.sha256, *ASKED, *CONTOUR))
+    rows = _rows(_exchanged_row, model, renderer, records, bench.report, seed=18, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}
     for kind in KINDS:
         for quantity in ("named", "repaired"):
@@ -69,14 +57,11 @@ def exchanges(
     return {"figures": found, "rows": rows}
 
 
-def false_alarms(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 50,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def false_alarms(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 50) -> Outcome:
     """Simulates good captures. Returns how many get a warning that pictures are exchanged, or that a camera moved or
     has a loose mask."""
-    records = Records(folder, "false_alarms", key_of(model.sha256, *ASKED, camera_drift))
-    rows = _rows(_warnings_of_good, model, renderer, records, report, seed=19, subjects=subjects)
+    records = bench.records("false_alarms", key_of(model.sha256, *ASKED, camera_drift))
+    rows = _rows(_warnings_of_good, model, renderer, records, bench.report, seed=19, subjects=subjects)
     found: dict[str, float] = {"captures": len(rows)}
     found |= {code: sum(code in row["codes"] for row in rows) for code in GOOD_CODES}
     return {"figures": found, "rows": rows, "markdown": markdown.of_figures(found)}
@@ -149,11 +134,7 @@ def _assigned(capture: Capture, rig: Rig) -> ImageAssignment:
 def _planted(kind: str, rig: Rig, rng: np.random.Generator) -> dict[str, str]:
     """For each camera whose file is another's, that other."""
     one, two, three = rng.choice(rig.names, 3, replace=False).tolist()
-    return {
-        "pair": {one: two, two: one},
-        "triple": {one: two, two: three, three: one},
-        "duplicate": {one: two},
-    }[kind]
+    return {"pair": {one: two, two: one}, "triple": {one: two, two: three, three: one}, "duplicate": {one: two}}[kind]
 
 
 def _is_named(kind: str, filed: Mapping[str, str], found: ImageAssignment) -> bool:

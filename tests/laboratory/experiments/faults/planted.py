@@ -26,13 +26,11 @@ from rig.errors import EigenheadError
 from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.mesh import Mesh, boundary_edges
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, surface_error
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.visible import seen_of
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
@@ -43,31 +41,26 @@ SPIKE_MM = 5.0  # seen surface farther from what two cameras see: hair's own rou
 SEED = 400
 
 
-def planted(
-    model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = 2, folder: Path | None = None
-) -> Outcome:
+def planted(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 2) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is ``<fault>_<quantity>``,
     the mean over the subjects whose job had a result; ``refused`` is the share of those without one.
 
     Args:
         model: fitted; heads are drawn from it, too.
         renderer: for the studio.
-        report: called with subject, fault and the share done.
         subjects: number of heads, each with every fault.
-        folder: keeps rows, so that a stopped run can continue, and a picture of every job.
     """
-    records = Records(folder, "planted", key_of(model.sha256, Settings()))
+    records = bench.records("planted", key_of(model.sha256, Settings()))
     rows = []
     for number in range(subjects):
         known = photographed(model, IN_SPAN_MODES, IN_SPAN_SPREAD, SEED + number, renderer=renderer)
         for done, (kind, plant) in enumerate(PLANTS.items()):
-            report(f"{number} {kind}", (number + done / len(PLANTS)) / subjects)
+            bench.report(f"{number} {kind}", (number + done / len(PLANTS)) / subjects)
             rng = np.random.default_rng((SEED, number))
             spoilt = plant(known, rng)
-            picture = None if folder is None else folder / f"planted-{number}-{kind}.jpg"
+            picture = None if bench.folder is None else bench.folder / f"planted-{number}-{kind}.jpg"
             row = records.row(f"{number} {kind}", lambda s=spoilt, p=picture: planted_row(s, model, renderer, p))
             rows.append({"subject": number, "fault": kind, **row})
-    report("done", 1.0)
     return {"figures": _figures(rows), "rows": rows}
 
 

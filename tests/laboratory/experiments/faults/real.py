@@ -6,8 +6,11 @@ estimated from all photographs; the surface from the eleven alone.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -27,11 +30,15 @@ from pipeline.stages.context import ReconstructionContext
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
+from rig.formats.captures.capture_folder import capture_root
+from rig.formats.captures.outlines_json import read_outlines
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from tests.laboratory.experiments.outcome import Outcome, Row
+from server.tasks.photographs import read_or_calibrate
+from server.tasks.prepare import prepare_kernels
+from tests.laboratory.experiments.records import Bench, Outcome, Row
 
 USED = 11
 SIDE_DEG = 100.0  # from the front view's direction: the eleven, and the views they are judged by, look from there
@@ -52,13 +59,28 @@ class RealCapture:
 
 
 def real(
-    model: HeadModel, captures: list[RealCapture], *, renderer: Renderer, settings: Settings, report: Progress
+    folders: Sequence[Path],
+    model: HeadModel,
+    *,
+    renderer: Renderer,
+    bench: Bench,
+    front: Annotated[str | None, "the view that the subject faces"] = None,
+    outlines: Annotated[Path | None, "outlines drawn by hand, outlines.json, of a single folder"] = None,
 ) -> Outcome:
-    """Runs this module's experiment. Returns a row for every capture, and their figures. Raises InputError if a folder
-    has no more views than are used."""
-    rows: list[Row] = []
+    """Runs this module's experiment. Returns a row for every folder, and their figures. By default a folder's own
+    outlines.json is read. Estimated cameras are written to ``folder``. Raises InputError if a folder has no more views
+    than are used, or ``outlines`` is given for several folders."""
+    if outlines is not None and len(folders) > 1:
+        raise InputError("--outlines", ["belongs to one folder; put outlines.json into each of several"])
+    settings, rows = Settings(), list[Row]()
+    prepare_kernels(bench.report, settings)
+    with TemporaryDirectory() as scratch:
+        captures = [
+            read_real_capture(each, (bench.folder or Path(scratch)) / each.name, front, outlines, bench.report)
+            for each in folders
+        ]
     for one in captures:
-        rows.append({"name": one.name, **judge(model, one, renderer=renderer, settings=settings, report=report)})
+        rows.append({"name": one.name, **judge(model, one, renderer=renderer, settings=settings, report=bench.report)})
     figures = {
         f"{row['name']}_{key}": float(value)
         for row in rows
@@ -66,6 +88,20 @@ def real(
         if isinstance(value, float | int) and not isinstance(value, bool)
     }
     return {"figures": figures, "rows": rows}
+
+
+def read_real_capture(
+    folder: Path, kept: Path, front: str | None, outlines: Path | None, report: Progress
+) -> RealCapture:
+    """Reads a folder. Its masks and drawn outlines serve as the reference, its feature points are not used. Estimated
+    cameras are written to ``kept``. Raises InputError."""
+    prepared = read_or_calibrate(folder, kept, front=front, report=report)
+    default = capture_root(folder) / "outlines.json"
+    path = outlines or (default if default.is_file() else None)
+    drawn = {} if path is None else read_outlines(path, prepared.rig)
+    # A mask that the folder has serves as reference too; an outline drawn by hand replaces it.
+    drawn = {**prepared.capture.masks, **drawn}
+    return RealCapture(folder.name, replace(prepared.capture, features={}), prepared.rig, drawn, front)
 
 
 def judge(

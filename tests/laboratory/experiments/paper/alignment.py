@@ -7,9 +7,7 @@ its true vertices, and the distance of their means.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -24,23 +22,19 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, worn_silhouettes
 
 TURN_DEG, OFF_MM = (30.0, 15.0, 15.0), 60.0  # yaw, pitch, roll; any direction
 RIGHT_DEG, RIGHT_MM = 2.0, 3.0
 
 
-def alignment(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 200,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def alignment(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 200) -> Outcome:
     """Returns the share of right alignments, their errors, and the seconds of the search."""
-    records = Records(folder, "alignment", key_of(model.sha256, Settings(), *CONTOUR, silhouette_search))
+    records = bench.records("alignment", key_of(model.sha256, Settings(), *CONTOUR, silhouette_search))
     span, rows = with_modes(model, 60), []
     for seed in range(subjects):
-        report(f"draw {seed}", seed / subjects)
+        bench.report(f"draw {seed}", seed / subjects)
         rows.append({"draw": seed} | records.row(str(seed), lambda s=seed: draw(span, s, renderer)))
     right = [row for row in rows if row["right"]]
     figures = {

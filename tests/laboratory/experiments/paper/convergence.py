@@ -6,9 +6,6 @@ over the face is below 0.3 mm. A second set of heads is drawn from the model, z 
 off.
 """
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 
 from pipeline.contour_fit.contour import fit_contour
@@ -18,8 +15,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
 
 ARRIVED_MM = 0.3
@@ -27,12 +23,9 @@ KINDS = {"section52": 0.8, "normal": None}  # coefficients within this, or not b
 SHARES = {"section52": 1.0, "normal": 0.2}  # of the draws
 
 
-def convergence(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 500,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def convergence(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 500) -> Outcome:
     """Runs this module's experiment. Returns, for both sets of heads, the share that converges and the errors."""
-    records = Records(folder, "convergence", key_of(model.sha256, FittingSettings(), *CONTOUR))
+    records = bench.records("convergence", key_of(model.sha256, FittingSettings(), *CONTOUR))
     span, rig = with_modes(model, 60), exact(default_layout())
     jobs: list[tuple[str, Planted]] = []
     for kind, most in KINDS.items():
@@ -40,7 +33,7 @@ def convergence(
         jobs += [(kind, subject) for subject in random_subjects(count, seed=500, most=most)]
     rows = []
     for i, (kind, subject) in enumerate(jobs):
-        report(f"{kind} {subject.name}", i / len(jobs))
+        bench.report(f"{kind} {subject.name}", i / len(jobs))
         row = records.row(f"{kind} {subject.name}", lambda s=subject: _row(span, s, rig, renderer))
         rows.append({"kind": kind, "name": subject.name} | row)
     figures, table = {}, []

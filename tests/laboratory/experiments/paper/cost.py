@@ -6,9 +6,7 @@ contour, eq. (4) does. So the contour solver runs with its robust scale, and wit
 weight. The simplex has the true alignment. Errors are over the face, mm.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal, TypedDict
 
 import numpy as np
@@ -27,8 +25,7 @@ from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, exact, mean_error_mm, random_subjects, worn_silhouettes
 
 
@@ -46,19 +43,13 @@ SIMPLEX: dict[str, SimplexCost] = {
     "simplex_eq5": {"speaking": "all", "weighted": True},
     "simplex_eq5_face": {"speaking": "face", "weighted": True},
 }
-FORGIVING = {
-    "contour_unforgiving": replace(FittingSettings(), robust_px=UNFORGIVING_PX),
-    "contour": FittingSettings(),
-}
+FORGIVING = {"contour_unforgiving": replace(FittingSettings(), robust_px=UNFORGIVING_PX), "contour": FittingSettings()}
 
 
-def cost(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def cost(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 3) -> Outcome:
     """Runs this module's experiment. Returns the errors by solver and cost, and those of the mean head."""
     sources = (*CONTOUR, objective, schedule, simplex)
-    records = Records(folder, "cost", key_of(model.sha256, FittingSettings(), STYLE, *sources))
+    records = bench.records("cost", key_of(model.sha256, FittingSettings(), STYLE, *sources))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []
     for i, subject in enumerate(random_subjects(subjects, seed=44)):
@@ -66,7 +57,7 @@ def cost(
         mean_head = Fit("", np.zeros(60), subject.world_from_head, 0, "")
         row: Row = {"name": subject.name, "mean_head": mean_error_mm(span, mean_head, subject)}
         for name in (*FORGIVING, *SIMPLEX):
-            report(f"{subject.name} {name}", i / subjects)
+            bench.report(f"{subject.name} {name}", i / subjects)
             kept = records.row(
                 f"{subject.name} {name}",
                 lambda n=name, s=subject, seen=silhouettes: {"error_mm": _error(n, span, s, seen, rig, renderer)},

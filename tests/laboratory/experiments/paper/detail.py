@@ -47,7 +47,7 @@ from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.mesh import Mesh
-from rig.progress import Progress, discard_progress
+from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -56,9 +56,8 @@ from rig.studio.scene.subject import Subject
 from rig.studio.scene.visible import VisiblePoints
 from rig.studio.sensor.faults import Fault
 from rig.studio.sensor.preset import PRESET, Preset
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Records, Row
+from tests.laboratory.experiments.records import Bench, Outcome, Row
 from tests.laboratory.experiments.surface.visible_surface import read_visible
 
 Level = Literal["span", "kernel", "photo"]
@@ -102,12 +101,9 @@ def run(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     others: HeadModel | None = None,
-    draws: int = 20,
-    in_span: int = 10,
-    held_out: bool = True,
-    folder: Path | None = None,
+    subjects: int | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
     ``<subject>_<model>_<level>_<quantity>``.
@@ -116,14 +112,11 @@ def run(
         models: by the name in the figures; the first one is used for random heads, faults and left-out cameras.
         captures: folders with a truth beside them.
         renderer: for the studio.
-        report: progress.
         others: the population from which random heads are drawn.
-        draws: number of random heads of it.
-        in_span: number of random heads of the first model's span.
-        held_out: whether cameras are left out and predicted.
-        folder: keeps rows, which are not computed again.
+        subjects: number of random heads of it (20 by default), and of the first model's span (10 by default).
     """
-    records = Records(folder, "detail", _key(models, others))
+    draws, in_span = subjects or 20, subjects or 10
+    records = bench.records("detail", _key(models, others))
     label, model = next(iter(models.items()))
     jobs: list[Job] = []
     for name, path in captures.items():
@@ -133,22 +126,21 @@ def run(
     if others is not None:
         drawn = partial(photographed, others, len(others.modes), 1.0, renderer=renderer)
         jobs += [(f"draw-{i:02}_{label}", partial(known_row, partial(drawn, i), model, renderer)) for i in range(draws)]
-        for kind, fault in FAULTS.items() if draws else ():
+        for kind, fault in FAULTS.items():
             jobs.append((f"{kind}_{label}", partial(known_row, partial(drawn, 0, fault=fault), model, renderer)))
     photographed_in_span = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, renderer=renderer)
     jobs += [
         (f"inspan-{i:02}_{label}", partial(known_row, partial(photographed_in_span, i), model, renderer))
         for i in range(in_span)
     ]
-    for name, path in captures.items() if held_out else ():
+    for name, path in captures.items():
         for camera in read_capture(path)[1].names:
             compute = partial(held_out_row, path, camera, model, renderer)
             jobs.append((f"heldout-{name}-{camera}_{label}", compute))
     rows = []
     for done, (name, compute) in enumerate(jobs):
-        report(name, done / len(jobs))
+        bench.report(name, done / len(jobs))
         rows.append({"name": name, **records.row(name, compute)})
-    report("done", 1.0)
     return {"figures": figures(rows), "rows": rows}
 
 
@@ -207,15 +199,13 @@ def every_level(
 ) -> dict[Level, Fitted]:
     """Fits every level of detail to a capture; masks and alignment are computed once for all."""
     context = ReconstructionContext(capture, rig, model, Settings(), renderer)
-    run = Recorder(discard_progress)
-    views = run(find_views, context)
-    faces = run(find_faces, context, views.capture)
-    alignment = run(align_head, context, views, faces)
+    views = find_views(context).product
+    alignment = align_head(context, views, find_faces(context, views.capture).product).product
     fitted = {}
     for level in levels:
         began = time.perf_counter()
         at_level = replace(context, settings=replace(context.settings, detail=level))
-        _, head = fit_shape(run, at_level, views, alignment)
+        _, head = fit_shape(Recorder(at_level), views, alignment)
         fitted[level] = Fitted(head.fit, head.model, head.detail.level, time.perf_counter() - began)
     return fitted
 

@@ -8,8 +8,6 @@ has levels of its own.
 """
 
 import time
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
@@ -24,8 +22,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
 
 FULL, MIDDLE, COARSE = HierarchyLevel("full", 1.0), HierarchyLevel("p95", 0.5), HierarchyLevel("p99", 0.25)
@@ -40,24 +37,21 @@ FULL_SUBJECTS = 1
 SCALES = {"full images": 1.0, "half images": 0.5, "quarter images": 0.25}
 
 
-def levels(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def levels(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 3) -> Outcome:
     """Runs this module's experiment. Returns seconds, evaluations and errors by hierarchy."""
     sources = (*CONTOUR, objective, schedule, simplex)
-    records = Records(folder, "levels", key_of(model.sha256, FittingSettings(), *sources))
+    records = bench.records("levels", key_of(model.sha256, FittingSettings(), *sources))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []
     for i, subject in enumerate(random_subjects(subjects, seed=55)):
         for name, scale in SCALES.items():
-            report(f"{subject.name} contour, {name}", i / subjects)
+            bench.report(f"{subject.name} contour, {name}", i / subjects)
             row = records.row(f"{subject.name} {name}", lambda s=subject, x=scale: _contour(span, s, rig, x, renderer))
             rows.append({"solver": "contour", "levels": name} | row)
         for name, hierarchy in HIERARCHIES.items():
             if FULL in hierarchy and i >= FULL_SUBJECTS:
                 continue
-            report(f"{subject.name} simplex, {name}", i / subjects)
+            bench.report(f"{subject.name} simplex, {name}", i / subjects)
             row = records.row(
                 f"{subject.name} {name}", lambda s=subject, h=hierarchy: _simplex(span, s, rig, h, renderer)
             )

@@ -28,7 +28,7 @@ from rig.mesh import vertex_normals
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from tests.laboratory.experiments.outcome import Outcome, Row
+from tests.laboratory.experiments.records import Outcome, Row
 from tests.support.subjects import Planted, exact, exact_silhouettes, face_errors, random_subjects
 
 NOISES_PX, CORRELATION_PX = (0.3, 1.0), 2.0

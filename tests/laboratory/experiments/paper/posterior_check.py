@@ -11,9 +11,7 @@ coefficients, pose and scale. Half a cost is a negative log density. Chains run 
 contours made from it, since a step must take less than a tenth of a second.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -25,9 +23,8 @@ from pipeline.head_model.model import HeadModel, with_modes
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.limit import CORRELATION_PX, UNROBUST_PX, settings_for, with_noise
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, exact, exact_silhouettes, face_rows, random_subjects
 
 NOISE_PX = 0.3
@@ -44,17 +41,14 @@ class Chain:
     accepted: float
 
 
-def posterior_check(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 3,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def posterior_check(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 3) -> Outcome:
     """Runs this module's experiment. Returns the chain's standard deviations divided by the Laplace ones: of
     coefficients and pose, and of the face's points along the axes."""
-    records = Records(folder, "posterior", key_of(model.sha256, *CONTOUR, STEPS, BETA))
+    records = bench.records("posterior", key_of(model.sha256, *CONTOUR, STEPS, BETA))
     span, rig = with_modes(model, 60), exact(default_layout())
     rows = []
     for i, subject in enumerate(random_subjects(subjects, seed=22)):
-        report(subject.name, i / subjects)
+        bench.report(subject.name, i / subjects)
         rows.append(records.row(subject.name, lambda s=subject, n=i: _row(span, s, rig, renderer, n)))
     figures: dict[str, float] = {"subjects": len(rows)}
     for quantity in rows[0]:

@@ -20,12 +20,9 @@ fault.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import lru_cache, partial
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
 
 from pipeline.contour_fit.contour import fit_contour
 from pipeline.head_model.model import HeadModel, with_modes
@@ -36,15 +33,14 @@ from pipeline.settings import FittingSettings, Settings
 from pipeline.view_checks import camera_drift as drift
 from pipeline.view_checks.usable_views import without_moved_cameras
 from rig.capture import Capture
-from rig.geometry import RigidTransform, rotation_from_vector
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper import limit
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
+from tests.support.spoilt_captures import OVER_EARS, knocked, spoiled
 from tests.support.subjects import (
     Planted,
     binary_silhouettes,
@@ -58,27 +54,22 @@ from tests.support.subjects import (
     worn_silhouettes,
 )
 
-OVER_EARS = HairStyle(thickness_mm=18.0, over_ears=True)
 FRINGE = HairStyle(thickness_mm=14.0, fringe_mm=16.0)
-WRONG_SHARE, WRONG_RADII_PX = 0.2, (6.0, 18.0)
 CALIBRATIONS_PX, CONTOUR_NOISE_PX = (0.1, 0.2, 0.5), 0.3
 KNOCKS_DEG = (1.0, 5.0)
 
 
-def robustness(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 20,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def robustness(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 20) -> Outcome:
     """Returns the contour solver's errors under each condition of this module, their ratios to those of perfect input
     and to the best possible error (the Cramer-Rao bound), and how often faulty cameras are found."""
-    records = Records(folder, "robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
+    records = bench.records("robustness", key_of(model.sha256, Settings(), *CONTOUR, limit, agreement, drift))
     span = with_modes(model, 60)
     rows = []
     planted = random_subjects(subjects, seed=66)
     for i, subject in enumerate(planted):
         row: Row = {"name": subject.name}
         for j, (name, condition) in enumerate(CONDITIONS.items()):
-            report(f"{subject.name} {name}", (i + j / len(CONDITIONS)) / subjects)
+            bench.report(f"{subject.name} {name}", (i + j / len(CONDITIONS)) / subjects)
             rng = np.random.default_rng([66, i, j])
             compute = partial(condition, span, subject, renderer, rng)
             row[name] = records.row(f"{subject.name} {name}", compute)
@@ -123,28 +114,6 @@ def wrong_contours(model: HeadModel, subject: Planted, renderer: Renderer, rng: 
     return fitted(model, subject, {n: silhouette_from_mask(spoiled(s.mask, rng)) for n, s in clean.items()}, rig)
 
 
-def spoiled(mask: Bool[np.ndarray, "h w"], rng: np.random.Generator) -> Bool[np.ndarray, "h w"]:
-    """Returns the mask with disks added or cut out until ``WRONG_SHARE`` of its contour is wrong."""
-    edge = mask & ~_eroded(mask)
-    at = np.argwhere(edge)
-    wrong, out = np.zeros(len(at), bool), mask.copy()
-    rows, columns = np.ogrid[: mask.shape[0], : mask.shape[1]]
-    while wrong.mean() < WRONG_SHARE:
-        y, x = at[rng.integers(len(at))]
-        radius = rng.uniform(*WRONG_RADII_PX)
-        out[(rows - y) ** 2 + (columns - x) ** 2 < radius**2] = bool(rng.integers(2))
-        wrong |= ((at - (y, x)) ** 2).sum(axis=1) < radius**2
-    return out
-
-
-def _eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    inner = mask.copy()
-    for axis in (0, 1):
-        for step in (1, -1):
-            inner &= np.roll(mask, step, axis)
-    return inner
-
-
 def calibration(
     error_px: float, known: bool, model: HeadModel, subject: Planted, renderer: Renderer, rng: np.random.Generator
 ) -> Row:
@@ -185,14 +154,6 @@ def faulty(kind: str, model: HeadModel, subject: Planted, renderer: Renderer, rn
     left_out = sorted(name for name, silhouette in silhouettes.items() if not silhouette.quality.usable)
     row = fitted(model, subject, silhouettes, rig)
     return row | {"bad": bad, "left_out": left_out, "found": set(bad) <= set(left_out)}
-
-
-def knocked(rig: Rig, name: str, turn_deg: float, rng: np.random.Generator) -> Rig:
-    """Returns the rig with one camera turned about a random axis across its view."""
-    around = rng.uniform(0.0, 2.0 * np.pi)
-    turn = np.radians(turn_deg) * np.array([np.cos(around), np.sin(around), 0.0])
-    motion = RigidTransform(rotation_from_vector(turn), np.zeros(3))
-    return Rig(tuple(replace(c, camera_from_world=motion @ c.camera_from_world) if c.name == name else c for c in rig))
 
 
 CONDITIONS: dict[str, Condition] = {

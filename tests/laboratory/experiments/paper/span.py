@@ -22,7 +22,7 @@ from rig.errors import InputError
 from rig.formats.meshes.mesh_file import read_mesh
 from rig.geometry import rigid_fit
 from rig.progress import Progress
-from tests.laboratory.experiments.outcome import Outcome
+from tests.laboratory.experiments.records import Outcome
 
 SIGMA_MM = 1.5  # residual that weighs as much as one standard deviation of a coefficient, per cm² of face
 POINTS = 4000  # points of the truth in a fit; all of them count in the figures

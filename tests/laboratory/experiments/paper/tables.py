@@ -8,7 +8,7 @@ nearest of the other, both ways, mm. The paper does not state its units; its dat
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -19,18 +19,16 @@ from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import xor_cost
 from pipeline.settings import FittingSettings
 from pipeline.simplex import hierarchy as schedule
-from pipeline.simplex import nelder_mead as simplex
+from pipeline.simplex import nelder_mead
 from pipeline.simplex import xor_objective as objective
 from pipeline.simplex.hierarchy import fit_simplex
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import arrangement, default_layout
 from tests.laboratory.experiments import markdown, pictures
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, binary_silhouettes, exact, subjects_of_section_5_2
 
 STATISTICS = {"min": np.min, "max": np.max, "mean": np.mean, "median": np.median, "std": np.std}
@@ -55,23 +53,12 @@ def table1(
     model: HeadModel,
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     subjects: int = 100,
-    simplex_subjects: int = 100,
-    folder: Path | None = None,
+    simplex: Annotated[int, "how many the simplex fits too"] = 100,
 ) -> Outcome:
-    """Returns tables 1 and 2 and pictures like figures 4 and 5. ``simplex_subjects``: how many the simplex fits too."""
-    rows = _rows(
-        model,
-        default_layout(),
-        "table1",
-        subjects,
-        simplex_subjects,
-        renderer=renderer,
-        report=report,
-        folder=folder,
-        all_too=True,
-    )
+    """Returns tables 1 and 2 and pictures like figures 4 and 5. ``simplex``: how many the simplex fits too."""
+    rows = _rows(model, default_layout(), "table1", subjects, simplex, renderer=renderer, bench=bench, all_too=True)
     figures: dict[str, float] = {"subjects": len(rows), "simplex_subjects": sum("simplex" in row for row in rows)}
     for method in METHODS:
         done = [row[method] for row in rows if method in row]
@@ -104,23 +91,12 @@ def table2(
     model: HeadModel,
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     subjects: int = 100,
-    simplex_subjects: int = 100,
-    folder: Path | None = None,
+    simplex: Annotated[int, "how many the simplex fits too"] = 100,
 ) -> Outcome:
     """Returns table 2 alone, from table 1's rows."""
-    rows = _rows(
-        model,
-        default_layout(),
-        "table1",
-        subjects,
-        simplex_subjects,
-        renderer=renderer,
-        report=report,
-        folder=folder,
-        all_too=True,
-    )
+    rows = _rows(model, default_layout(), "table1", subjects, simplex, renderer=renderer, bench=bench, all_too=True)
     figures = _correlations(rows)
     return {"figures": {"subjects": len(rows)} | figures, "rows": rows, "markdown": _table2_markdown(figures)}
 
@@ -129,18 +105,15 @@ def table3(
     model: HeadModel,
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     subjects: int = 100,
-    simplex_subjects: int = 25,
-    folder: Path | None = None,
+    simplex: Annotated[int, "how many the simplex fits too"] = 25,
 ) -> Outcome:
     """Computes table 3: the accuracy with the four arrangements of cameras of section 5.3."""
     figures, rows, table = {}, {}, []
     for name in ARRANGEMENTS:
         rig = arrangement(name)
-        rows[name] = _rows(
-            model, rig, f"table3-{name}", subjects, simplex_subjects, renderer=renderer, report=report, folder=folder
-        )
+        rows[name] = _rows(model, rig, f"table3-{name}", subjects, simplex, renderer=renderer, bench=bench)
         for method in ("contour", "simplex"):
             done = [row[method] for row in rows[name] if method in row]
             if done:
@@ -199,25 +172,24 @@ def _rows(
     rig: Rig,
     name: str,
     subjects: int,
-    simplex_subjects: int,
+    simplex: int,
     *,
     renderer: Renderer,
-    report: Progress,
-    folder: Path | None,
+    bench: Bench,
     all_too: bool = False,
 ) -> list[Row]:
     """One row a subject; the solvers' rows are kept apart, so that a change of one does not cost the other's.
     ``all_too``: the contour solver with every mode of the model as well."""
     key = (model.sha256, FittingSettings())
-    ours = Records(folder, name, key_of(*key, *CONTOUR))
-    wide = Records(folder, f"{name}-all", key_of(*key, *CONTOUR))
-    theirs = Records(folder, f"{name}-simplex", key_of(*key, objective, schedule, simplex))
+    ours = bench.records(name, key_of(*key, *CONTOUR))
+    wide = bench.records(f"{name}-all", key_of(*key, *CONTOUR))
+    theirs = bench.records(f"{name}-simplex", key_of(*key, objective, schedule, nelder_mead))
     everyone, rig = subjects_of_section_5_2(model, 100), exact(rig)
     chosen = [everyone[i] for i in _evenly(len(everyone), subjects)]
-    slow = {chosen[i].name for i in _evenly(len(chosen), min(simplex_subjects, len(chosen)))}
+    slow = {chosen[i].name for i in _evenly(len(chosen), min(simplex, len(chosen)))}
     rows = []
     for i, subject in enumerate(chosen):
-        report(f"{name} {subject.name}", i / len(chosen))
+        bench.report(f"{name} {subject.name}", i / len(chosen))
         row = ours.row(subject.name, partial(_contour_row, model, subject, rig, renderer))
         if all_too:
             row = row | {"contour_all": wide.row(subject.name, partial(_all_row, model, subject, rig, renderer))}

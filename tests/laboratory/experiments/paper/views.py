@@ -9,7 +9,6 @@ the error of fits to heads with hair.
 """
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -25,9 +24,8 @@ from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import ARRANGEMENTS_DEG, rig_from_directions
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.limit import UNROBUST_PX, settings_for
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, exact, face_rows, mean_error_mm, random_subjects, worn_silhouettes
 
 CANDIDATES_DEG = tuple((a, e) for e in range(-40, 41, 20) for a in range(-90, 91, 15))
@@ -40,18 +38,15 @@ EXCHANGES = 3  # passes at most
 Information = Float[np.ndarray, "k p p"]
 
 
-def views(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 12,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def views(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 12) -> Outcome:
     """Runs this module's experiment. Returns the planned directions, and limit and error of every arrangement over
     ``subjects`` heads that were not used for planning."""
     span = with_modes(model, 60)
-    records = Records(folder, "views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
+    records = bench.records("views", key_of(model.sha256, *CONTOUR, CANDIDATES_DEG, STYLE))
     heads = random_subjects(CHOSEN_ON + subjects, seed=33)
     candidates = rig_from_directions(CANDIDATES_DEG)
     information = [
-        _information(span, head, candidates, report, i / len(heads)) for i, head in enumerate(heads[:CHOSEN_ON])
+        _information(span, head, candidates, bench.report, i / len(heads)) for i, head in enumerate(heads[:CHOSEN_ON])
     ]
     chosen = a_optimal(information, VIEWS, prior(span))
     directions = [CANDIDATES_DEG[k] for k in chosen]
@@ -59,7 +54,7 @@ def views(
     rigs |= {name: rig_from_directions(directions_deg) for name, directions_deg in ARRANGEMENTS_DEG.items()}
     rows = []
     for i, head in enumerate(heads[CHOSEN_ON:]):
-        report(head.name, (CHOSEN_ON + i) / len(heads))
+        bench.report(head.name, (CHOSEN_ON + i) / len(heads))
         for name, rig in rigs.items():
             key = f"{head.name} {name} {directions if name == 'planned' else ''}"
             row = records.row(key, lambda h=head, r=rig, n=i: _row(span, h, exact(r), renderer, n))

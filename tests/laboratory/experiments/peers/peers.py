@@ -23,12 +23,12 @@ from silhouettes to vertices, each solver warmed up, all on the same cores. Need
 # pyright: reportMissingImports=false
 # The peers' packages are a dependency group of their own: `uv sync --group peers`.
 
+import importlib.util
 import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,13 +45,13 @@ from pipeline.settings import FittingSettings
 from pipeline.simplex import xor_objective as objective
 from pipeline.simplex.hierarchy import HIERARCHY, LIMIT, MU, TOLERANCE
 from pipeline.simplex.xor_objective import SilhouetteObjective
+from rig.errors import EigenheadError
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.peers import soft_rasteriser
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, subjects_of_section_5_2
 
 MODES = 60
@@ -92,17 +92,24 @@ class Counted:
 Minimiser = Callable[[Counted, Float[np.ndarray, " m"], int], Float[np.ndarray, " m"]]
 
 
-def peers(
-    model: HeadModel, *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 10,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+class MissingPeers(EigenheadError):
+    """Reports that a package of the group ``peers`` is not installed."""
+
+    def __init__(self, package: str) -> None:
+        super().__init__(f"{package} is not installed: run `uv sync --group peers`")
+
+
+def peers(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 10) -> Outcome:
     """Runs this module's experiment. Returns seconds, evaluations and errors of every solver on ``subjects`` of section
-    5.2's hundred, taken at even steps."""
+    5.2's hundred, taken at even steps. Raises MissingPeers."""
+    for package in ("cma", "pybobyqa", "jax"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingPeers(package)
     span, rig = with_modes(model, MODES), exact(default_layout())
     everyone = subjects_of_section_5_2(model, 100)
     chosen = [everyone[i] for i in np.linspace(0, len(everyone) - 1, subjects).round().astype(int)]
     records = {
-        name: Records(folder, f"peers-{name}", key_of(model.sha256, FittingSettings(), machine(renderer), *sources))
+        name: bench.records(f"peers-{name}", key_of(model.sha256, FittingSettings(), machine(renderer), *sources))
         for name, (_, sources) in SOLVERS.items()
     }
     warm: set[str] = set()
@@ -111,7 +118,7 @@ def peers(
         task = Task(model, span, subject, binary_silhouettes(model, subject, rig, renderer), rig, renderer)
         row: Row = {"name": subject.name, "mean_head_mm": mean_error_mm(model, mean_head(subject), subject)}
         for j, (name, (solve, _)) in enumerate(SOLVERS.items()):
-            report(f"{subject.name} {name}", (i + j / len(SOLVERS)) / len(chosen))
+            bench.report(f"{subject.name} {name}", (i + j / len(SOLVERS)) / len(chosen))
             row[name] = records[name].row(subject.name, lambda n=name, s=solve, t=task: timed(n, s, t, warm))
         rows.append(row)
     found = figures(rows)

@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
-from pipeline.compute.jit import njit
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
 from rig.geometry import Similarity
+from rig.jit import njit
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 

@@ -11,13 +11,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
 from pipeline.contour_fit import expression_evidence
 from pipeline.detail import expression_reading
-from pipeline.head_model.expressions import no_expressions, plain_name
+from pipeline.head_model.expressions import no_expressions
 from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
@@ -29,20 +28,15 @@ from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.paper.detail import Known, surface_error
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
+from tests.support.drawn_expressions import drawn_weights
 
-SEED, SMILING, SMILES = 22, 0.6, ("mouthSmileLeft", "mouthSmileRight")
-FEW, MANY, WEIGHTS = 3, 7, (0.15, 0.8)
-JAW = 0.4  # of a drawn weight: a mouth that is half open is wide open
+SEED = 22
 LARGEST = 10
 
 
-def expressions(
-    models: Mapping[str, HeadModel], *, renderer: Renderer, report: Callable[[str, float], None], subjects: int = 4,
-    folder: Path | None = None,
-) -> Outcome:  # fmt: skip
+def expressions(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: Bench, subjects: int = 4) -> Outcome:
     """Runs this module's experiment. Returns distances by model: ``<model>_posed_median_mm``,
     ``<model>_neutral_before_median_mm`` and so on.
 
@@ -54,32 +48,15 @@ def expressions(
     """
     code = (*CONTOUR, expression_evidence, expression_reading)
     kept = {
-        label: Records(folder, f"expressions-{label}", key_of(model.sha256, Settings(), *code))
+        label: bench.records(f"expressions-{label}", key_of(model.sha256, Settings(), *code))
         for label, model in models.items()
     }
     rows: list[Row] = []
     for i, kind, (label, model) in product(range(subjects), ("posed", "neutral"), models.items()):
-        report(f"{label} {i} {kind}", (len(rows) + 1) / (2 * subjects * len(models)))
+        bench.report(f"{label} {i} {kind}", (len(rows) + 1) / (2 * subjects * len(models)))
         row = kept[label].row(f"{label}-{i:02} {kind}", partial(_subject, model, i, kind == "posed", renderer))
         rows.append({"model": label, "kind": kind, "subject": i} | row)
     return {"figures": _figures(rows, tuple(models)), "rows": rows, "markdown": _table(rows, tuple(models))}
-
-
-def drawn_weights(rng: np.random.Generator, names: tuple[str, ...]) -> dict[str, float]:
-    """Draws a few expressions at random; more often than not among them a smile about as strong on both sides."""
-    chosen = rng.choice(len(names), rng.integers(FEW, MANY), replace=False)
-    found = {names[k]: float(rng.uniform(*WEIGHTS)) for k in chosen}
-    if rng.random() < SMILING:
-        strength = rng.uniform(0.2, 0.7)
-        for name in names:
-            if plain_name(name) in SMILES:
-                found[name] = float(np.clip(strength + rng.normal(0.0, 0.08), 0.0, 1.0))
-    for name in ("jawOpen", "mouth-open"):
-        if name in found:
-            found[name] *= JAW
-    if "mouthClose" in found:  # of an open jaw: lips that close without one pass through each other
-        found["mouthClose"] = min(found["mouthClose"], 0.5 * found.get("jawOpen", 0.0))
-    return {name: weight for name, weight in found.items() if weight > 0.0}
 
 
 def _subject(model: HeadModel, number: int, posed: bool, renderer: Renderer) -> Row:
@@ -91,11 +68,7 @@ def _subject(model: HeadModel, number: int, posed: bool, renderer: Renderer) -> 
     sitter = Subject(Mesh(head, full.faces), marks, full.face_region, f"seed-{number}")
     shot = simulate(sitter, default_layout(), PRESET, np.random.default_rng((SEED, number, 1)), renderer=renderer)
     bare = replace(model, expressions=no_expressions(len(model.mean)), _bases={})
-    return {
-        "truth": weights,
-        "after": _delivered(model, shot, renderer),
-        "before": _delivered(bare, shot, renderer),
-    }
+    return {"truth": weights, "after": _delivered(model, shot, renderer), "before": _delivered(bare, shot, renderer)}
 
 
 def _delivered(model: HeadModel, shot: SimulatedCapture, renderer: Renderer) -> Row:

@@ -7,7 +7,6 @@ warning is right if it names exactly the eyes whose lids meet; half closed lids 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,8 +27,7 @@ from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Records
+from tests.laboratory.experiments.records import Bench, Outcome, Row
 
 Job = Callable[[Capture, Rig], Reconstruction]
 STATES: Mapping[str, float] = {"open": 0.0, "half": 0.5, "closed": 1.0}
@@ -40,14 +38,7 @@ PAINTED_MM = 0.6  # edges about an eye; those of ICT-FaceKit are 1.9, as wide as
 
 
 def eyes(
-    models: Mapping[str, HeadModel],
-    job: Job,
-    *,
-    renderer: Renderer,
-    report: Callable[[str, float], None],
-    key: str,
-    heads: int = HEADS,
-    folder: Path | None = None,
+    models: Mapping[str, HeadModel], job: Job, *, renderer: Renderer, key: str, bench: Bench, heads: int = HEADS
 ) -> Outcome:
     """Runs this module's experiment. Returns ``eyes_wrong`` of ``eyes_heads``, and ``eyes_<state>_wrong``.
 
@@ -55,19 +46,16 @@ def eyes(
         models: from which heads are drawn, by name.
         job: runs a whole job.
         renderer: for the studio.
-        report: called with the head and the share done.
         key: names everything that the rows depend on, as in ``Records``.
         heads: number for each model, each in all three states.
-        folder: keeps rows, so that a stopped run can continue.
     """
-    records, rows = Records(folder, "people-eyes", key), []
+    records, rows = bench.records("people-eyes", key), []
     cases = [*product(range(heads), models.items(), STATES)]
     for done, (number, (label, model), state) in enumerate(cases):
         name = f"{label}-{number:02} {state}"
-        report(name, done / len(cases))
+        bench.report(name, done / len(cases))
         row = records.row(name, partial(eye_row, model, number, state, job, renderer))
         rows.append({"name": name, "state": state, **row})
-    report("done", 1.0)
     return {"figures": figures(rows), "rows": rows, "markdown": table(rows), "lines": table(rows).splitlines()}
 
 

@@ -7,7 +7,6 @@ The face finder and the irises' own search run on the pictures.
 
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -23,7 +22,6 @@ from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import find_subject
 from pipeline.head_model.model import HeadModel
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.studio.scene import eyes as studio_eyes
 from rig.studio.scene.layout import default_layout
@@ -32,8 +30,7 @@ from rig.studio.scene.subject import Subject, with_gaze
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import REALISM, made_real
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.eyeballs import OPEN_TRIANGLES
 
 SEED, SPREAD = 387, 0.8
@@ -44,24 +41,16 @@ AIMS = {"iris_mm": 0.5, "gaze_deg": 3.0, "pupils_mm": 0.5}
 CODE: tuple[ModuleType, ...] = (finding, edges, fits, discs, studio_eyes)
 
 
-def gazes(
-    models: Mapping[str, HeadModel],
-    *,
-    renderer: Renderer,
-    report: Progress,
-    subjects: int = HEADS,
-    folder: Path | None = None,
-) -> Outcome:
+def gazes(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: Bench, subjects: int = HEADS) -> Outcome:
     """Returns for ``iris_mm``, ``gaze_deg`` and ``pupils_mm`` the ``_median``, ``_worst``, ``_met`` (share within the
     aim) and ``_stated`` (root mean square of the errors by their stated deviations), and ``seen`` (share of eyes)."""
     rows: list[Row] = []
     for number in range(subjects):
         for label, model in models.items():
             name = f"{label}-{number:02}"
-            report(name, len(rows) / (subjects * len(models)))
-            records = Records(folder, f"gazes-{label}", key_of(model.sha256, *CODE))
+            bench.report(name, len(rows) / (subjects * len(models)))
+            records = bench.records(f"gazes-{label}", key_of(model.sha256, *CODE))
             rows.append({"name": name} | records.row(name, partial(_row, model, number, renderer)))
-    report("done", 1.0)
     return {"figures": _figures(rows), "rows": rows, "markdown": _table(rows)}
 
 

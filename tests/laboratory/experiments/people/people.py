@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -25,16 +26,14 @@ from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from rig.capture import Capture
 from rig.errors import EigenheadError, InputError
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.span import weighted_quantile
 from tests.laboratory.experiments.people import eye_states, people_subjects, pose_error, view_subsets
 from tests.laboratory.experiments.people.people_subjects import EVIDENCE, Case, Person, capture_cases, studio_cases
 from tests.laboratory.experiments.people.pose_error import PoseError, pose_error_of_surfaces, pose_error_of_vertices
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 EYES = "eyes"
 SPEAKING = (
@@ -56,11 +55,10 @@ def people(
     captures: Sequence[Path],
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     subjects: int | None = None,
-    only: Sequence[str] = (),
-    detail: str | None = None,
-    folder: Path | None = None,
+    only: Annotated[Sequence[str], "kinds, subjects or evidence; or eyes; may be repeated"] = (),
+    detail: Literal["span", "kernel", "photo", "fine"] | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; ``figures`` is flat,
     ``<kind>_<evidence>_<quantity>`` and ``<quantity>`` over all rows, with ``eyes_wrong`` among them if eyes are
@@ -71,12 +69,10 @@ def people(
         others: another population to draw from, if there is one.
         captures: folders with a truth beside them.
         renderer: for the studio.
-        report: called with the case and the share done.
         subjects: heads in the studio for every kind (1 by default); for eyes, heads of each model (10 by default).
         only: kinds, subjects or evidence to run. A row must match one word of each sort that is given. ``eyes`` runs
             the eyes alone.
         detail: level of detail, None for the default.
-        folder: keeps rows, so that a stopped run can continue.
     """
     settings = replace(Settings(), detail=detail, outputs=OutputSettings(surface="head"))
     key = key_of(model.sha256, settings, people_subjects, pose_error, view_subsets, eye_states)
@@ -84,19 +80,18 @@ def people(
         models = {"default": model} if others is None else {"default": model, "ict": others}
         run = partial(run_job, model=model, settings=settings, renderer=renderer)
         heads = subjects or eye_states.HEADS
-        return eye_states.eyes(models, run, renderer=renderer, report=report, key=key, heads=heads, folder=folder)
+        return eye_states.eyes(models, run, renderer=renderer, bench=bench, key=key, heads=heads)
     every = [case for path in captures for case in capture_cases(path)]
     every += studio_cases(model, others, renderer, subjects or 1)
     cases = select_cases(every, only)
-    records = Records(folder, f"people-{detail or 'default'}", key)
+    records = bench.records(f"people-{detail or 'default'}", key)
     rows: list[Row] = []
     for done, case in enumerate(cases):
-        report(case.name, done / len(cases))
+        bench.report(case.name, done / len(cases))
         rows.append(
             {"name": case.name, "subject": case.subject, "kind": case.kind, "evidence": case.evidence}
             | records.row(case.name, partial(judge_case, case, model, settings, renderer))
         )
-    report("done", 1.0)
     text = f"{table(rows)}\n{summary_table(rows)}"
     return {"figures": figures(rows), "rows": rows, "markdown": text, "lines": text.splitlines()}
 

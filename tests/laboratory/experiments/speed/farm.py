@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
+from tests.laboratory.experiments.records import Outcome
 
 WORKERS = (1, 8, 32, 64, 128, 256, 512, 1024)
 JOBS_A_WORKER = 12
@@ -31,7 +31,7 @@ class Farm:
         job_s: seconds of a default job on two cores (``eigenhead reconstruct``), and the spread of the jobs (share).
         capture_bytes, result_bytes, result_files: of shared/data/captures/scan-a and its default head.
         job_statements, running_statements, idle_statements: statements of a job, of each second that it runs, and of
-            each second of a worker that looks for jobs (``python -m tests.laboratory.benchmarks.database_costs``), at a poll_s of
+            each second of a worker that looks for jobs (the benchmark database_costs), at a poll_s of
             ``measured_poll_s``.
         poll_s: EIGENHEAD_POLL_S of the farm.
         statements_per_s: what the database carries out (pgbench, the same command, two cores).

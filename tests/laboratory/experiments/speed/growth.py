@@ -17,7 +17,6 @@ import numpy as np
 from pipeline.head_model.model import HeadModel
 from rig.formats.captures.capture_folder import write_capture
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import DEFAULT_DIRECTIONS_DEG, HEIGHT, WIDTH, default_layout, rig_from_directions
@@ -25,8 +24,7 @@ from rig.studio.scene.simulate import simulate
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import Records, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.speed.scaling import JobCommand, run_job
 from tests.support.subjects import random_subjects
 
@@ -72,27 +70,20 @@ def sizes(only: Sequence[str] = ()) -> list[Size]:
 
 
 def growth(
-    model: HeadModel,
-    chosen: Sequence[Size],
-    *,
-    command: JobCommand,
-    renderer: Renderer,
-    report: Progress,
-    folder: Path | None = None,
+    model: HeadModel, chosen: Sequence[Size], *, command: JobCommand, renderer: Renderer, bench: Bench
 ) -> Outcome:
     """Returns processor seconds, by stage, and peak memory of a default job for each size.
 
     Raises JobFailed.
     """
-    records = Records(folder, "growth", key_of(model.sha256, SEED))
+    records = bench.records("growth", key_of(model.sha256, SEED))
     rows: list[Row] = []
     for done, size in enumerate(chosen):
-        report(size.name, done / len(chosen))
+        bench.report(size.name, done / len(chosen))
         rows.append(
             {"name": size.name, "kind": size.kind, "views": size.views, "megapixels": size.megapixels}
             | records.row(size.name, lambda size=size: _measured(size, model, command, renderer))
         )
-    report("done", 1.0)
     figures: dict[str, float] = {}
     for kind, quantity in (("views", "views"), ("pixels", "megapixels")):
         of_kind = [row for row in rows if row["kind"] == kind]

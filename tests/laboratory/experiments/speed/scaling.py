@@ -20,10 +20,8 @@ from pipeline.compute import threads as pool
 from pipeline.compute import trace
 from pipeline.compute.threads import THREADS
 from rig.errors import EigenheadError
-from rig.progress import Progress
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import Records, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.speed import critical_path
 from tests.laboratory.experiments.speed.critical_path import JobWork, work_of
 
@@ -48,27 +46,23 @@ class JobCommand:
     variables: Mapping[str, str]
 
 
-def scaling(
-    captures: Sequence[Path], *, command: JobCommand, report: Progress, folder: Path | None = None,
-    threads: int | None = None,
-) -> Outcome:  # fmt: skip
+def scaling(captures: Sequence[Path], *, command: JobCommand, bench: Bench, threads: int | None = None) -> Outcome:
     """Returns seconds and memory of each capture's default job with one thread and with ``threads`` (all CPUs).
 
     Raises JobFailed.
     """
     most = threads or len(os.sched_getaffinity(0))
-    records = Records(folder, "scaling", key_of(pool, trace, critical_path, CORES))
+    records = bench.records("scaling", key_of(pool, trace, critical_path, CORES))
     rows: list[Row] = []
     for done, capture in enumerate(captures):
         row: Row = {"name": capture.name}
         for share, count in enumerate(sorted({1, most})):
-            report(f"{capture.name}, threads: {count}", (done + share / 2) / len(captures))
+            bench.report(f"{capture.name}, threads: {count}", (done + share / 2) / len(captures))
             row[str(count)] = records.row(
                 f"{capture.resolve()} {count}",
-                lambda count=count, capture=capture: run_job(capture, command, count, folder),
+                lambda count=count, capture=capture: run_job(capture, command, count, bench.folder),
             )
         rows.append(row)
-    report("done", 1.0)
     figures: dict[str, float] = {}
     for row in rows:
         figures |= {(f"{row['name']}_" if len(rows) > 1 else "") + key: value for key, value in _figures(row).items()}

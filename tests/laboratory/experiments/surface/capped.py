@@ -9,7 +9,6 @@ takes it.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -31,7 +30,7 @@ from pipeline.stages.context import ReconstructionContext
 from rig.colour_space import linear_from_srgb
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
-from rig.progress import Progress, discard_progress
+from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import anatomy
 from rig.studio.scene.layout import default_layout
@@ -40,10 +39,9 @@ from rig.studio.scene.subject import Subject, random_look
 from rig.studio.scene.tight_cap import TightCap, above_edge_mm
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,19 +69,13 @@ SEED = 11
 
 
 def capped(
-    model: HeadModel,
-    *,
-    renderer: Renderer,
-    report: Progress,
-    others: HeadModel | None = None,
-    subjects: int = 4,
-    folder: Path | None = None,
+    model: HeadModel, *, renderer: Renderer, bench: Bench, others: HeadModel | None = None, subjects: int = 4
 ) -> Outcome:
     """Runs this module's experiment: ``subjects`` heads of the model's span and as many of ``others``, each with the
     next cap. Figures are ``<group>_<without|with>_<cranium|girth|stated>_mm``: means over the group (``own``,
     ``others``) of the median distance, of the absolute error of the girth, and of the median stated deviation."""
-    records = Records(
-        folder, "capped", key_of(model.sha256, Settings(), cap_finder, cap_outline, bare_outline, cap_points)
+    records = bench.records(
+        "capped", key_of(model.sha256, Settings(), cap_finder, cap_outline, bare_outline, cap_points)
     )
     populations = {"own": (model, IN_SPAN_MODES, IN_SPAN_SPREAD)}
     if others is not None:
@@ -93,23 +85,15 @@ def capped(
     for done, (group, number) in enumerate(jobs):
         worn = CAPS[number % len(CAPS)]
         name = f"{group}-{number:02}-{worn.stated}"
-        report(name, done / len(jobs))
+        bench.report(name, done / len(jobs))
         made = partial(_row, model, *populations[group], number, worn, renderer=renderer)
         rows.append({"name": name, "group": group, **records.row(name, made)})
-    report("done", 1.0)
     found = figures(rows)
     return {"figures": found, "rows": rows, "markdown": as_markdown(rows)}
 
 
 def _row(
-    model: HeadModel,
-    population: HeadModel,
-    modes: int,
-    spread: float,
-    number: int,
-    worn: Worn,
-    *,
-    renderer: Renderer,
+    model: HeadModel, population: HeadModel, modes: int, spread: float, number: int, worn: Worn, *, renderer: Renderer
 ) -> Row:
     """Returns one head's figures: ``{without|with: {quantity: value}}``."""
     rng = np.random.default_rng((SEED, number))

@@ -1,4 +1,4 @@
-"""Eyeballs behind the lids of a mesh with open eyes (``pipeline.applications.templates.eyeballs``): what of them crosses lids.
+"""Counts what of the eyeballs behind the lids of a mesh crosses lids (``pipeline.applications.templates.eyeballs``).
 
 The mesh is ICT-FaceKit's own head, whose eyes are open, with the model's true shapes, on heads of its population. An
 eyeball's triangles that cross a lid are counted at rest and for each of Apple's shapes at half and at full weight, as
@@ -7,7 +7,6 @@ the shapes come and once lids are lifted; then of eyes that look aside, up and d
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,10 +21,8 @@ from pipeline.head_model.model import HeadModel
 from pipeline.results.clay import clay
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.progress import Progress
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SEED, SPREAD = 38, 0.8
 HEADS = 5
@@ -43,17 +40,16 @@ CROSSING = ("crossing_rest", "crossing_before", "crossing_after", "crossing_turn
 SHOWN = ("eyeBlinkRight", "eyeBlinkLeft")
 
 
-def eyeballs(facekit: HeadModel, *, report: Progress, folder: Path | None = None) -> Outcome:
+def eyeballs(facekit: HeadModel, *, bench: Bench) -> Outcome:
     """Returns ``crossing_rest``, ``crossing_before`` and ``crossing_after`` (triangles of eyeballs over all heads,
     shapes and weights), ``crossing_turned`` (after, over all directions too, and at rest), and ``lift_worst_mm``."""
-    records, rows = Records(folder, "eyeballs", key_of(facekit.sha256, tested, placing)), []
+    records, rows = bench.records("eyeballs", key_of(facekit.sha256, tested, placing)), []
     for number in range(HEADS):
-        report(f"head {number}", number / HEADS)
+        bench.report(f"head {number}", number / HEADS)
         rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
-    report("done", 1.0)
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in CROSSING}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
-    pictures = {} if folder is None else {"eyes": _picture(facekit)}
+    pictures = {} if bench.folder is None else {"eyes": _picture(facekit)}
     return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}
 
 

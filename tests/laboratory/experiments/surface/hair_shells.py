@@ -22,13 +22,12 @@ from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.progress import Progress, discard_progress
+from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import read_known
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.templates import foreign
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
@@ -37,16 +36,10 @@ AZIMUTHS_DEG = (0.0, 60.0)
 
 
 def hair_shells(
-    model: HeadModel,
-    facekit: HeadModel,
-    captures: Mapping[str, Path],
-    *,
-    renderer: Renderer,
-    report: Progress,
-    folder: Path | None = None,
+    model: HeadModel, facekit: HeadModel, captures: Mapping[str, Path], *, renderer: Renderer, bench: Bench
 ) -> Outcome:
     """Runs this module's experiment on captures with a truth beside them. Returns ``<capture>_covered`` and so on."""
-    records = Records(folder, "hair-shell", key_of(model.sha256, facekit.sha256, SETTINGS))
+    records = bench.records("hair-shell", key_of(model.sha256, facekit.sha256, SETTINGS))
     pictures: dict[str, np.ndarray] = {}
     rows: list[Row] = []
 
@@ -55,7 +48,7 @@ def hair_shells(
         return row
 
     for number, (name, path) in enumerate(captures.items()):
-        report(name, number / len(captures))
+        bench.report(name, number / len(captures))
         rows.append({"capture": name} | records.row(name, lambda n=name, p=path: one(n, p)))
     figures = {f"{row['capture']}_{name}": value for row in rows for name, value in row.items() if name != "capture"}
     names = ("covered", "bare", "carried", "truth", "bust_truth", "highest_mm", "sunk_mm")

@@ -47,10 +47,9 @@ from rig.studio.scene.visible import PARTS
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import made_real
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 Level = Literal["span", "kernel", "photo", "fine"]
 HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm down the forehead
@@ -75,11 +74,10 @@ def hidden(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     others: HeadModel | None = None,
     subjects: int = 4,
     realism: tuple[str, ...] = (),
-    folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``. A figure is
     ``<group>_<level>_<seen|hidden>_<region>_<quantity>`` or ``<group>_<level>_<landmarks|measurements>_within_95``, the
@@ -90,16 +88,14 @@ def hidden(
         model: fitted; heads are drawn from it, too.
         captures: folders with a truth beside them, by name.
         renderer: for the studio.
-        report: called with the subject and the share done.
         others: another population, from which as many heads are drawn.
         subjects: heads of each population.
         realism: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
-        folder: keeps rows, so that a stopped run can continue.
     """
     key = key_of(
         model.sha256, others.sha256 if others else "", Settings(), posterior, span_misfit, photo_refine, measurements
     )
-    records = Records(folder, "hidden", key)
+    records = bench.records("hidden", key)
     seeds = range(FIRST_SEED, FIRST_SEED + subjects)
     jobs: list[tuple[str, str, Callable[[], Known]]] = []
     for suffix, names in (("", ()), ("-real", realism)) if realism else (("", ()),):
@@ -113,9 +109,8 @@ def hidden(
     jobs += [(name, name, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, read) in enumerate(jobs):
-        report(name, done / len(jobs))
+        bench.report(name, done / len(jobs))
         rows.append({"name": name, "group": group, **records.row(name, partial(known_row, read, model, renderer))})
-    report("done", 1.0)
     found = figures(rows)
     return {"figures": found, "rows": rows, "markdown": as_markdown(found)}
 
@@ -145,9 +140,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) 
 
 
 def landmark_figures(
-    true: Mapping[str, Float[np.ndarray, " 3"]],
-    found: Mapping[str, Landmark],
-    lengths: Mapping[str, Measurement],
+    true: Mapping[str, Float[np.ndarray, " 3"]], found: Mapping[str, Landmark], lengths: Mapping[str, Measurement]
 ) -> dict[str, float]:
     """Returns the median error and stated deviation (mm), and the share within 95 % intervals, of landmarks (by
     coordinate) and of measurements; empty if no landmark is known.
@@ -182,10 +175,7 @@ def landmark_figures(
 
 
 def skin_figures(
-    known: Known,
-    head_world: Mesh,
-    deviation_mm: Float[np.ndarray, " v"],
-    regions: Mapping[str, Bool[np.ndarray, " v"]],
+    known: Known, head_world: Mesh, deviation_mm: Float[np.ndarray, " v"], regions: Mapping[str, Bool[np.ndarray, " v"]]
 ) -> dict[str, float]:
     """Returns the median distance (mm), the share within the stated interval, and the median stated deviation (mm) of
     the true skin, by whether it is seen and by region; the region ``all`` is all of them together.

@@ -1,4 +1,4 @@
-"""Teeth and a tongue behind the lips of a mesh (``pipeline.applications.templates.inner_mouth``): what of the skin meets them.
+"""Counts skin that meets teeth and tongue of a mesh (``pipeline.applications.templates.inner_mouth``).
 
 The mesh is ICT-FaceKit's own head, whose lips part, with the model's true shapes, on heads of its population. Triangles
 of the skin that meet teeth or tongue are counted at rest and for each of Apple's shapes at half and at full weight, as
@@ -6,7 +6,6 @@ the shapes come and once lips are kept off the teeth.
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -27,10 +26,8 @@ from pipeline.head_model.model import HeadModel
 from pipeline.results.clay import SKIN, clay
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.progress import Progress
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.eyeballs import HEADS, OPEN_TRIANGLES, SEED, SPREAD
 
 SHOWN = (("jawOpen", 0.3), ("jawOpen", 0.7), ("tongueOut", 1.0), ("mouthFunnel", 1.0), ("mouthRollLower", 1.0))
@@ -38,18 +35,17 @@ MOUTH = (np.array([-34.0, -76.0, 66.0]), np.array([34.0, -16.0, 100.0]))  # head
 Moves = Mapping[str, Float[np.ndarray, "v 3"]]
 
 
-def inner_mouths(facekit: HeadModel, *, report: Progress, folder: Path | None = None) -> Outcome:
+def inner_mouths(facekit: HeadModel, *, bench: Bench) -> Outcome:
     """Returns ``meeting_rest``, ``meeting_before`` and ``meeting_after`` (triangles of the skin over all heads, shapes
     and weights), and ``lift_worst_mm``."""
-    records, rows = Records(folder, "inner-mouth", key_of(facekit.sha256, tested, inner_mouth_file)), []
+    records, rows = bench.records("inner-mouth", key_of(facekit.sha256, tested, inner_mouth_file)), []
     for number in range(HEADS):
-        report(f"head {number}", number / HEADS)
+        bench.report(f"head {number}", number / HEADS)
         rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
-    report("done", 1.0)
     names = ("meeting_rest", "meeting_before", "meeting_after")
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in names}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
-    pictures = {} if folder is None else {"mouths": _picture(facekit)}
+    pictures = {} if bench.folder is None else {"mouths": _picture(facekit)}
     return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}
 
 

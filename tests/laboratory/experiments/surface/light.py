@@ -15,10 +15,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 
 from pipeline.geometry.raster import depth_map
-from pipeline.geometry.raster_kernels import rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging import colour_chart
 from pipeline.imaging.masks import box_around
@@ -29,13 +28,11 @@ from pipeline.stages.context import ReconstructionContext
 from pipeline.texturing import albedo, chart_colours, decision
 from pipeline.texturing import light as fitted_light
 from pipeline.texturing.albedo import Albedo
-from pipeline.texturing.layout.uv_unwrap import Layout
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.errors import EigenheadError
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -43,17 +40,16 @@ from rig.studio.scene.lights import LAMPS, Lamp
 from rig.studio.scene.simulate import Scene, build_scene, shoot
 from rig.studio.scene.subject import Subject
 from rig.studio.sensor.preset import PRESET
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Records, key_of
-from tests.laboratory.experiments.surface.chart import chart_plate
-from tests.laboratory.experiments.surface.colour_difference import difference_2000, lab_from_srgb
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.texture import drawn_texture
+from tests.support.colour_chart_pictures import chart_plate
+from tests.support.colour_difference import difference_2000, lab_from_srgb
+from tests.support.face_texels import face_texels, texels
 
 Image = UInt8[np.ndarray, "s s 3"]
 SUBJECTS = 1
-GRID = 512  # texels that are compared: 0.7 mm a texel, beyond what two fits differ by
 PANEL = (540, 780)
 MIN_FACING = 0.3  # cosine: flatter, the patches of a chart run together
 LIGHTS: Mapping[str, tuple[Lamp, ...]] = {
@@ -70,35 +66,25 @@ LIGHTS: Mapping[str, tuple[Lamp, ...]] = {
 }
 
 
-def light(
-    model: HeadModel,
-    *,
-    renderer: Renderer,
-    report: Progress,
-    subjects: int = SUBJECTS,
-    folder: Path | None = None,
-) -> Outcome:
+def light(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = SUBJECTS) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``: means over subjects and pairs of
     lights, and a row for each subject.
 
     Args:
         model: fitted; heads are drawn from it, too.
         renderer: for the studio.
-        report: called with the subject and the share done.
         subjects: heads in the studio.
-        folder: keeps rows, so that a stopped run can continue, and a picture of every subject.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head", delight=True, texture_size=2048))
     code = (fitted_light, albedo, decision, chart_colours, colour_chart)
-    records = Records(folder, "light", key_of(model.sha256, settings, LIGHTS, *code))
+    records = bench.records("light", key_of(model.sha256, settings, LIGHTS, *code))
     rows = []
     for number in range(subjects):
         name = f"{number:02}"
-        report(name, number / subjects)
-        picture = None if folder is None else folder / f"light-{name}.png"
+        bench.report(name, number / subjects)
+        picture = None if bench.folder is None else bench.folder / f"light-{name}.png"
         compute = partial(row_of, model, 400 + number, renderer, settings, picture)
         rows.append({"name": name, **records.row(name, compute)})
-    report("done", 1.0)
     keys = [key for key, value in rows[0].items() if isinstance(value, float)]
     return {"figures": {key: float(np.mean([row[key] for row in rows])) for key in keys}, "rows": rows}
 
@@ -185,22 +171,6 @@ def with_chart_plates(capture: Capture, scene: Scene, lamps: tuple[Lamp, ...], r
             chart = chart_plate(scene, name, colour_chart.true_colours(), rng, turned_to=front, lamps=lamps)
             plates[name] = (*plates[name], chart)
     return replace(capture, backgrounds=plates)
-
-
-def face_texels(layout: Layout, seen: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, "s s"]:
-    """Tells which texels of the compared size belong to the face: all corners of the texel's triangle are ``seen``, and
-    so around it."""
-    texels, ones = GRID * layout.uv - 0.5, np.ones(len(layout.uv))
-    _, shown = rasterise(texels, ones, layout.faces, GRID, GRID)
-    whole = np.asarray(seen[layout.source[layout.faces]].all(axis=1))
-    inside = ((shown >= 0) & whole[shown]).astype(np.uint8)
-    return cv2.erode(inside, np.ones((3, 3), np.uint8)) > 0
-
-
-def texels(image: Image, where: Bool[np.ndarray, "g g"]) -> UInt8[np.ndarray, "n 3"]:
-    """Returns the colours of an image at the texels ``where``, after it is resized to the compared size."""
-    small = cv2.resize(np.ascontiguousarray(image), (GRID, GRID), interpolation=cv2.INTER_AREA)
-    return np.asarray(small)[where]
 
 
 def levelled(codes: UInt8[np.ndarray, "n 3"], to: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n 3"]:

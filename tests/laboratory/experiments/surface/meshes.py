@@ -26,10 +26,8 @@ from pipeline.settings import Settings
 from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import vertex_normals
-from rig.progress import Progress
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import Records, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SUBJECTS = 20  # heads of each model
 MAX_COEFFICIENT, EXPRESSIONS = 2.5, 5
@@ -38,12 +36,7 @@ COUNTS = ("turned", "folded", "crossing")
 
 
 def meshes(
-    models: Mapping[str, HeadModel],
-    folders: Sequence[Path],
-    *,
-    report: Progress,
-    subjects: int = SUBJECTS,
-    folder: Path | None = None,
+    models: Mapping[str, HeadModel], folders: Sequence[Path] = (), *, bench: Bench, subjects: int = SUBJECTS
 ) -> Outcome:
     """Runs this module's experiment. Returns the counts for random heads of the models, and for the head.ply of each
     folder. Raises InputError if a folder has none."""
@@ -51,12 +44,12 @@ def meshes(
     if missing:
         raise InputError(", ".join(missing), ["has no head.ply: name folders of results"])
     digests = [model.sha256 for model in models.values()]
-    records = Records(folder, "meshes", key_of(*digests, Settings(), untangling, crossings, crossing_kernels))
+    records = bench.records("meshes", key_of(*digests, Settings(), untangling, crossings, crossing_kernels))
     rows: list[Row] = []
     for i, (name, model) in enumerate(models.items()):
         drawn = RandomHeads(model_basis(model, Settings()))
         for k in range(subjects):
-            report(f"{name} {k + 1}", (i + k / subjects) / len(models))
+            bench.report(f"{name} {k + 1}", (i + k / subjects) / len(models))
             for kind in ("fitted", "displaced"):
                 key = f"{name} {kind} {k}"
                 rows.append({"heads": f"{name}, {kind}"} | records.row(key, lambda d=drawn, k=k, t=kind: d.row(k, t)))

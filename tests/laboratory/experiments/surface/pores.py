@@ -36,11 +36,9 @@ from rig.formats.pictures.images import write_image
 from rig.geometry import RigidTransform
 from rig.image import ImageRgb
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.pores_scene import CloseUp, photograph_close_up
 from tests.laboratory.experiments.surface.texture import drawn_texture, face_pixels, noise_power
 
@@ -51,31 +49,26 @@ MB, SAMPLED_S = 1e6, 0.05
 SHOWN_MM, SHOWN_SIDE = 0.1, 500  # a displacement that is shown white, and the side of a picture of it
 
 
-def pores(
-    model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = 1, folder: Path | None = None
-) -> Outcome:
+def pores(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = 1) -> Outcome:
     """Runs this module's experiment: heads of smooth skin, and of skin with painted spots as large as its furrows. A
     figure is ``<skin>_<quantity>``, the mean over the heads.
 
     Args:
         model: fitted; heads are drawn from it, too.
         renderer: for the studio.
-        report: called with the head and the share done.
         subjects: heads of each skin.
-        folder: keeps rows, so that a stopped run can continue, and pictures of the relief.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head"))
-    records = Records(folder, "pores", key_of(model.sha256, settings))
+    records = bench.records("pores", key_of(model.sha256, settings))
     rows: list[Row] = []
     jobs = [(skin, seed) for skin in SKINS for seed in range(1, subjects + 1)]
     for done, (skin, seed) in enumerate(jobs):
-        report(skin, done / len(jobs))
-        picture = None if folder is None else folder / f"pores-{skin}-{seed}.png"
+        bench.report(skin, done / len(jobs))
+        picture = None if bench.folder is None else bench.folder / f"pores-{skin}-{seed}.png"
         rows.append(
             {"name": f"{skin}-{seed}", "skin": skin}
             | records.row(f"{skin}-{seed}", partial(row_of, model, skin, seed, renderer, settings, picture=picture))
         )
-    report("done", 1.0)
     keys = [key for key, value in rows[0].items() if isinstance(value, float)]
     figures = {
         f"{skin}_{key}": float(np.mean([row[key] for row in rows if row["skin"] == skin]))
@@ -200,10 +193,7 @@ def banded(field: Field, texel_mm: float, shortest_mm: float, longest_mm: float)
 
 
 def fine_gain(
-    shot: CloseUp,
-    found: Reconstruction,
-    fine: UInt8[np.ndarray, "t t 3"],
-    face: Bool[np.ndarray, " v"],
+    shot: CloseUp, found: Reconstruction, fine: UInt8[np.ndarray, "t t 3"], face: Bool[np.ndarray, " v"]
 ) -> Row:
     """Returns by how many dB the error of the finer texture in the kept-back view is smaller, over waves of less than a
     millimetre, and the power of that picture and of the errors (codes squared)."""

@@ -28,13 +28,11 @@ from rig.errors import EigenheadError
 from rig.formats.captures.capture_folder import read_capture
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
 from tests.laboratory.experiments.people.view_subsets import azimuths_deg
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.local_means import means_within
 
 SMOOTH_MM = 3.0  # radius of the mean that relief departs from
@@ -63,32 +61,22 @@ class Relief:
         }
 
 
-def relief(
-    model: HeadModel,
-    captures: Mapping[str, Path],
-    *,
-    renderer: Renderer,
-    report: Progress,
-    folder: Path | None = None,
-) -> Outcome:
+def relief(model: HeadModel, captures: Mapping[str, Path], *, renderer: Renderer, bench: Bench) -> Outcome:
     """Runs the experiment on every capture; a figure is ``<capture>_<quantity>``.
 
     Args:
         model: fitted.
         captures: folders, by name.
         renderer: for the jobs.
-        report: called with the capture and the share done.
-        folder: keeps rows, so that a stopped run can continue.
 
     Raises:
         EigenheadError: a half has too few views for a head, or no skin in common with the other.
     """
-    records = Records(folder, "relief", key_of(model.sha256, Settings(), *CONTOUR, composition))
+    records = bench.records("relief", key_of(model.sha256, Settings(), *CONTOUR, composition))
     rows: list[Row] = []
     for done, (name, path) in enumerate(captures.items()):
-        report(name, done / len(captures))
+        bench.report(name, done / len(captures))
         rows.append({"name": name} | records.row(str(path.resolve()), lambda path=path: _row(path, model, renderer)))
-    report("done", 1.0)
     figures = {f"{row['name']}_{key}": row[key] for row in rows for key in row if key not in ("name", "halves")}
     columns = ("unrepeated_rms_mm", "unrepeated_median_mm", "unrepeated_p95_mm", "repeated_rms_mm", "places")
     header = ("capture", "relief not repeated, RMS, mm", "median", "p95", "repeated, RMS", "places")

@@ -6,15 +6,14 @@
 - ``clicked``: as ``noise``, with feature points that an operator clicks anew in each shot; the others have none.
 
 Each shot is reconstructed from its photographs; the heads are laid on each other rigidly over the face
-(``pipeline.applications.verification.repeatability``). Figures are the scatter, the deviation that the results state, and the error
-that every shot repeats: the distance of the mean head from the true surface. The aim is an RMS scatter of at most 0.10
+(``verification.repeatability``). Figures are the scatter, the deviation that the results state, and the error that
+every shot repeats: the distance of the mean head from the true surface. The aim is an RMS scatter of at most 0.10
 mm over the face, ``reposed_rms_mm`` and ``drift_rms_mm``.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -39,8 +38,7 @@ from rig.studio.scene.simulate import Scene, build_scene, shoot
 from rig.studio.scene.subject import Subject, random_look, random_pose
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome
-from tests.laboratory.experiments.records import CONTOUR, Records, Row, key_of
+from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.subjects import off_by
 
 SHOTS = 10
@@ -63,17 +61,13 @@ class Shot:
     warnings: frozenset[str]  # codes
 
 
-def repeat(
-    model: HeadModel, *, renderer: Renderer, report: Progress, subjects: int = SHOTS, folder: Path | None = None
-) -> Outcome:
+def repeat(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = SHOTS) -> Outcome:
     """Runs this module's experiment. Returns scatter, stated deviation and repeated error by condition. ``subjects`` is
     the number of shots, two or more."""
-    records = Records(
-        folder, "repeat", key_of(model.sha256, Settings(), subjects, *CONTOUR, composition, repeatability)
-    )
+    records = bench.records("repeat", key_of(model.sha256, Settings(), subjects, *CONTOUR, composition, repeatability))
     rows = []
     for i, condition in enumerate(CONDITIONS):
-        report_shots = partial(_of_condition, report, condition, i)
+        report_shots = partial(_of_condition, bench.report, condition, i)
         compute = partial(_row, model, condition, max(2, subjects), renderer, report_shots)
         rows.append({"condition": condition} | records.row(condition, compute))
     figures = {f"{row['condition']}_{name}": row[name] for row in rows for name in row if name != "condition"}

@@ -1,4 +1,4 @@
-"""Apple's shapes carried to foreign meshes (``pipeline.applications.templates.animated``), beside how these meshes truly move.
+"""Compares Apple's shapes carried to foreign meshes with how these meshes truly move (``templates.animated``).
 
 The meshes are made of a model's own surface (``foreign_meshes``), so that the true motion of every vertex is the
 model's. The last two have the shape of another person when they are registered; shapes are carried on the mean head.
@@ -6,7 +6,6 @@ An error is the root mean square over a mesh's vertices, divided by that of the 
 """
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -29,10 +28,8 @@ from pipeline.head_model.model import HeadModel
 from pipeline.results.clay import clay
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.progress import Progress
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.foreign_meshes import ForeignMesh, decimated_split, dual, shuffled
 
 SEED = 38
@@ -49,24 +46,24 @@ FACE = (np.array([-75.0, -115.0, 20.0]), np.array([75.0, 90.0, 110.0]))  # head 
 Moves = Mapping[str, Float[np.ndarray, "t 3"]]
 
 
-def shapes(default: HeadModel, facekit: HeadModel, *, report: Progress, folder: Path | None = None) -> Outcome:
+def shapes(model: HeadModel, facekit: HeadModel, *, bench: Bench) -> Outcome:
     """Returns ``<mesh>_carried_worst`` (error of the worst shape as carried), ``<mesh>_parted_worst`` (once lips and
     lids are kept apart), ``<mesh>_crossings`` and so on."""
     modules = (animated, carrying, contact, likeness, placement, registration, shape_carrying)
-    records = Records(folder, "shapes", key_of(default.sha256, facekit.sha256, *modules))
-    cases = _cases(default, facekit)
+    records = bench.records("shapes", key_of(model.sha256, facekit.sha256, *modules))
+    cases = _cases(model, facekit)
     rows: list[Row] = []
     pictures: dict[str, np.ndarray] = {}
-    for number, (name, (model, mesh, of_another)) in enumerate(cases.items()):
-        report(name, number / len(cases))
+    for number, (name, (other, mesh, of_another)) in enumerate(cases.items()):
+        bench.report(name, number / len(cases))
         made = mesh()
 
-        def compute(model: HeadModel = model, made: ForeignMesh = made, of_another: bool = of_another) -> Row:
+        def compute(model: HeadModel = other, made: ForeignMesh = made, of_another: bool = of_another) -> Row:
             return _case(model, made, of_another)
 
         row = records.row(name, compute)
         rows.append({"mesh": name} | {key: value for key, value in row.items() if key != "drawn"})
-        pictures[name] = _picture(model, made, row["drawn"])
+        pictures[name] = _picture(other, made, row["drawn"])
     figures = {f"{row['mesh']}_{key}": value for row in rows for key, value in row.items() if _is_figure(value)}
     return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}
 

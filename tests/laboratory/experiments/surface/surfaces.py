@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -36,13 +37,12 @@ from pipeline.stereo.depth_map import DepthMap, points_world
 from pipeline.stereo.estimate import estimate_depth
 from rig.errors import EigenheadError
 from rig.mesh import Mesh
-from rig.progress import Progress, discard_progress
+from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import Known, every_level, read_known, surface_error
 from tests.laboratory.experiments.peers.openmvs import PeerFailed, programs_in, surface_by_openmvs
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
 POISSON_DEPTH = 9  # of its octree: cells of 1 to 1.5 mm about a bust
@@ -88,9 +88,8 @@ def surfaces(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Progress,
-    openmvs: Path | None = None,
-    folder: Path | None = None,
+    bench: Bench,
+    openmvs: Annotated[Path | None, "the folder of that peer's programs"] = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is
     ``<capture>_<peer>_<quantity>``.
@@ -99,9 +98,7 @@ def surfaces(
         model: fitted.
         captures: folders with a truth beside them, by name.
         renderer: for the fit.
-        report: called with the capture and the program.
         openmvs: folder of the programs of OpenMVS; None leaves it out.
-        folder: keeps rows, so that a stopped run can continue.
 
     Raises InputError if ``openmvs`` lacks a program.
     """
@@ -120,13 +117,12 @@ def surfaces(
     for i, (name, path) in enumerate(captures.items()):
         shown = Shown(read_known(path), model, renderer)
         for j, (peer, make) in enumerate(makers.items()):
-            report(f"{name} {peer}", (i + j / len(makers)) / len(captures))
-            records = Records(folder, f"surfaces-{peer}", key_of(model.sha256, Settings(), str(openmvs)))
+            bench.report(f"{name} {peer}", (i + j / len(makers)) / len(captures))
+            records = bench.records(f"surfaces-{peer}", key_of(model.sha256, Settings(), str(openmvs)))
             rows.append(
                 {"name": name, "peer": peer, **records.row(name, partial(peer_row, shown.known, partial(make, shown)))}
             )
         rows += [{"name": name, "peer": peer, "left_out": why} for peer, why in left_out.items()]
-    report("done", 1.0)
     return {"figures": figures(rows), "rows": rows, "markdown": as_markdown(rows)}
 
 

@@ -10,8 +10,6 @@ that.
 """
 
 import time
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,36 +21,26 @@ from pipeline.applications.templates.registration import Registration, register
 from pipeline.head_model.model import HeadModel
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.mesh import vertex_normals
-from rig.progress import Progress
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SEED = 22
 OWN_SHAPE = 1.0  # standard deviations of the head that the third mesh has
 
 
-def templates(
-    models: Mapping[str, HeadModel],
-    facekit: HeadModel,
-    *,
-    report: Progress,
-    draws: int = 50,
-    folder: Path | None = None,
-) -> Outcome:
+def templates(model: HeadModel, facekit: HeadModel, *, bench: Bench, subjects: int = 50) -> Outcome:
     """Runs this module's experiment. Returns ``<model>_median_mm``, ``<model>_p95_mm`` and so on, over all vertices of
     all random heads. ``facekit_drawn`` is ICT-FaceKit with a mesh that has the shape of one random head; ``_marked``
     had the twelve landmarks for its registration."""
     modules = (carrying, likeness, placement, registration)
-    key = key_of(facekit.sha256, *(model.sha256 for model in models.values()), draws, *modules)
-    records = Records(folder, "templates", key)
+    key = key_of(facekit.sha256, model.sha256, subjects, *modules)
+    records = bench.records("templates", key)
     cases = [("facekit", facekit, False, False), ("facekit_drawn", facekit, True, False)]
-    for label, model in models.items():
-        cases += [(label, model, False, False), (f"{label}_marked", model, False, True)]
+    cases += [("default", model, False, False), ("default_marked", model, False, True)]
     rows: list[Row] = []
-    for number, (label, model, drawn, marked) in enumerate(cases):
-        report(label, number / len(cases))
-        row = records.row(label, lambda m=model, d=drawn, k=marked: _round_trips(m, facekit, d, k, draws))
+    for number, (label, fitted, drawn, marked) in enumerate(cases):
+        bench.report(label, number / len(cases))
+        row = records.row(label, lambda m=fitted, d=drawn, k=marked: _round_trips(m, facekit, d, k, subjects))
         rows.append({"model": label} | row)
     figures = {f"{row['model']}_{name}": value for row in rows for name, value in row.items() if name != "model"}
     return {"figures": figures, "rows": rows, "markdown": _table(rows)}

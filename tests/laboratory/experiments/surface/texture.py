@@ -31,7 +31,6 @@ from pipeline.stages.context import ReconstructionContext
 from pipeline.texturing.head_texture import paint_head
 from pipeline.texturing.layout.model_layout import model_layout
 from pipeline.texturing.layout.uv_unwrap import Layout
-from pipeline.texturing.paper_blend import paper_texture
 from pipeline.texturing.vertex_colours import texture as colour
 from rig.camera import Camera
 from rig.capture import Capture
@@ -39,13 +38,12 @@ from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.errors import EigenheadError
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.surface.paper_blend import paper_texture
 
 SUBJECTS = 10
 KEPT_BACK = 4  # nearest cameras to the front one that take turns
@@ -57,13 +55,7 @@ Image = UInt8[np.ndarray, "h w 3"]
 
 
 def texture(
-    model: HeadModel,
-    captures: Mapping[str, Path],
-    *,
-    renderer: Renderer,
-    report: Progress,
-    subjects: int = SUBJECTS,
-    folder: Path | None = None,
+    model: HeadModel, captures: Mapping[str, Path], *, renderer: Renderer, bench: Bench, subjects: int = SUBJECTS
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``,
     the mean over the group: ``studio``, or a capture by its name.
@@ -72,12 +64,10 @@ def texture(
         model: fitted; heads are drawn from it, too.
         captures: folders with a truth beside them, by name.
         renderer: for the studio.
-        report: called with the subject and the share done.
         subjects: heads in the studio.
-        folder: keeps rows, so that a stopped run can continue, and a picture of every subject at 200 %.
     """
     settings = replace(Settings(), outputs=OutputSettings(surface="head"))
-    records = Records(folder, "texture", key_of(model.sha256, settings))
+    records = bench.records("texture", key_of(model.sha256, settings))
     jobs: list[tuple[str, str, int, Callable[[], Known]]] = []
     for number in range(subjects):
         draw = partial(photographed, model, IN_SPAN_MODES, IN_SPAN_SPREAD, 300 + number, renderer=renderer)
@@ -85,11 +75,10 @@ def texture(
     jobs += [(name, name, 1, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, number, read) in enumerate(jobs):
-        report(name, done / len(jobs))
-        picture = None if folder is None else folder / f"texture-{name}.png"
+        bench.report(name, done / len(jobs))
+        picture = None if bench.folder is None else bench.folder / f"texture-{name}.png"
         compute = partial(row_of, read, model, renderer, settings, number, picture)
         rows.append({"name": name, "group": group, **records.row(name, compute)})
-    report("done", 1.0)
     return {"figures": _figures(rows), "rows": rows}
 
 

@@ -31,12 +31,10 @@ from pipeline.stages.context import ReconstructionContext
 from rig.errors import EigenheadError
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
-from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.visible import PARTS, VisiblePoints
 from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import made_real
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.detail import (
     IN_SPAN_MODES,
     IN_SPAN_SPREAD,
@@ -47,7 +45,7 @@ from tests.laboratory.experiments.paper.detail import (
 )
 from tests.laboratory.experiments.paper.span import weighted_quantile
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.face_skin import (
     crater_map,
     face_places,
@@ -79,10 +77,9 @@ def visible(
     captures: Mapping[str, Path],
     *,
     renderer: Renderer,
-    report: Progress,
+    bench: Bench,
     subjects: int = len(STYLES),
     realism: tuple[str, ...] = (),
-    folder: Path | None = None,
 ) -> Outcome:
     """Runs this module's experiment. Returns ``{"figures": {...}, "rows": [...]}``; a figure is ``<group>_<quantity>``,
     the mean over the group: ``studio``, ``real`` (the same heads with ``realism``), or a capture by its name.
@@ -91,12 +88,10 @@ def visible(
         model: fitted; heads are drawn from it, too.
         captures: folders with a truth beside them, by name.
         renderer: for the studio.
-        report: called with the subject and the share done.
         subjects: heads in the studio, with the hair styles of ``STYLES`` in turn.
         realism: names of ``rig.studio.sensor.realism``, with which each head is photographed once more.
-        folder: keeps rows, so that a stopped run can continue, and a picture of every subject.
     """
-    records = Records(folder, "visible", key_of(model.sha256, Settings()))
+    records = bench.records("visible", key_of(model.sha256, Settings()))
     jobs: list[tuple[str, str, Callable[[], Known]]] = []
     for number in range(subjects):
         style = STYLES[number % len(STYLES)]
@@ -109,11 +104,10 @@ def visible(
     jobs += [(name, name, partial(read_known, path)) for name, path in captures.items()]
     rows = []
     for done, (group, name, read) in enumerate(jobs):
-        report(name, done / len(jobs))
-        picture = None if folder is None else folder / f"visible-{name}.png"
+        bench.report(name, done / len(jobs))
+        picture = None if bench.folder is None else bench.folder / f"visible-{name}.png"
         compute = partial(known_row, read, model, renderer, picture)
         rows.append({"name": name, "group": group, **records.row(name, compute)})
-    report("done", 1.0)
     return {"figures": figures(rows), "rows": rows}
 
 

@@ -1,6 +1,6 @@
 """Scores a surface by how much of the visible truth it has, and how right it is, by part.
 
-Recall: distance of every point of the truth (``rig.studio.visible``) to the surface, where that faces the same way.
+Recall: distance of every point of the truth (``rig.studio.scene.visible``) to the surface where that faces as it does.
 Precision: distance of the surface's own points to the truth, as far as the truth covers them. Distances are to tangent
 planes where a sample is close, so that the density of samples has no effect.
 """

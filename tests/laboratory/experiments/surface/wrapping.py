@@ -20,19 +20,16 @@ from pipeline.applications.wrapping.wrap import wrap
 from pipeline.applications.wrapping.write import wrap_picture
 from pipeline.head_model.model import HeadModel
 from rig.formats.meshes.polygon_obj import PolygonMesh
-from rig.progress import Progress, discard_progress
+from rig.progress import discard_progress
 from tests.laboratory.experiments import markdown
-from tests.laboratory.experiments.outcome import Outcome, Row
 from tests.laboratory.experiments.paper.span import Truth, read_truth
-from tests.laboratory.experiments.records import Records, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 
-def wrapping(
-    facekit: HeadModel, truths: Mapping[str, Path], *, report: Progress, folder: Path | None = None
-) -> Outcome:
+def wrapping(facekit: HeadModel, truths: Mapping[str, Path], *, bench: Bench) -> Outcome:
     """Runs this module's experiment. Returns ``<scan>_median_mm``, ``<scan>_landmarks_mm`` and so on."""
     modules = (fitting, placing, scan, sighting, likeness, registration)
-    records = Records(folder, "wrap", key_of(facekit.sha256, *modules))
+    records = bench.records("wrap", key_of(facekit.sha256, *modules))
     pictures: dict[str, np.ndarray] = {}
     rows: list[Row] = []
     template: Template | None = None
@@ -46,7 +43,7 @@ def wrapping(
         return {**wrapped.figures(), "landmarks_mm": apart, "unit_found": float(wrapped.placed.unit == "mm")}
 
     for number, (name, path) in enumerate(truths.items()):
-        report(name, number / len(truths))
+        bench.report(name, number / len(truths))
         rows.append({"scan": name} | records.row(name, lambda n=name, p=path: one(n, p)))
     figures = {f"{row['scan']}_{name}": value for row in rows for name, value in row.items() if name != "scan"}
     return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}

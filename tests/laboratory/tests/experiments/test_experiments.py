@@ -7,20 +7,17 @@ import numpy as np
 import pytest
 from scipy.optimize import rosen
 
-from rig.errors import EigenheadError
 from rig.mesh import Mesh
-from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown, records
 from tests.laboratory.experiments.paper import views
-from tests.laboratory.experiments.paper.robustness import WRONG_RADII_PX, WRONG_SHARE, spoiled
 from tests.laboratory.experiments.paper.tables import correlation
 from tests.laboratory.experiments.peers import peers, soft_rasteriser
 from tests.laboratory.experiments.pictures import heads
 from tests.laboratory.experiments.records import Records, key_of
-from tests.laboratory.experiments.runner import EXPERIMENTS, Options, UnknownExperiment, run_experiment
+from tests.laboratory.runner import run
+from tests.laboratory.table import EXPERIMENTS
 from tests.support.scenes import ellipsoid
 from tests.support.shared_data import shared
-from tests.support.subjects import off_by, stated
 
 
 def test_a_stopped_run_goes_on_and_another_key_starts_anew(tmp_path: Path) -> None:
@@ -124,34 +121,6 @@ def test_exchanges_repair_a_greedy_choice() -> None:
     assert views.a_optimal([(information, np.eye(2))], 2, 0.1 * np.eye(2)) == [1, 2]
 
 
-def test_a_fifth_of_the_contour_is_wrong() -> None:
-    rows, columns = np.ogrid[:300, :400]
-    mask = (rows - 150) ** 2 + (columns - 200) ** 2 < 100**2
-    wrong = spoiled(mask, np.random.default_rng(1))
-    edge = 2 * np.pi * 100
-    changed = np.argwhere(wrong != mask)
-    angle = np.arctan2(changed[:, 0] - 150, changed[:, 1] - 200)
-    share = len(np.unique((angle / (2 * np.pi) * 400).astype(int))) / 400
-    assert WRONG_SHARE - 0.02 < share < WRONG_SHARE + 2 * WRONG_RADII_PX[1] / edge + 0.02
-    assert (wrong & ~mask).any()
-    assert (mask & ~wrong).any()
-
-
-def test_cameras_are_off_by_what_was_asked() -> None:
-    """Mean square motion of points on a sphere of 100 mm radius, in squares of what was asked: along each image axis 1
-    of tilt and slide, and 1/3 each of roll and range."""
-    rig, rng = default_layout(), np.random.default_rng(3)
-    directions = rng.standard_normal((200, 3))
-    points = rig.centre_world() + 100.0 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    squares = []
-    for _ in range(30):
-        off = off_by(rig, 0.5, rng)
-        squares += [((off[c.name].project(points) - c.project(points)) ** 2).sum(axis=1).mean() for c in rig]
-    # 330 cameras with about three numbers each that dominate: a standard error of 4 % in squares.
-    assert np.mean(squares) == pytest.approx(0.5**2 * 2 * (1 + 1 / 3 + 1 / 3), rel=0.16)
-    assert all(camera.covariance is not None for camera in stated(rig, 0.5))
-
-
 def test_correlation_of_too_few_rows_is_none() -> None:
     assert correlation([{"a": 1.0, "b": 2.0}] * 2, "a", "b") is None
     assert correlation([{"a": x, "b": -2.0 * x} for x in (1.0, 2.0, 4.0)], "a", "b") == pytest.approx(-1.0)
@@ -165,19 +134,6 @@ def test_heads_stand_side_by_side() -> None:
     assert (picture[2, 715] == (245, 245, 245)).all()
 
 
-def test_an_unknown_experiment_is_refused_by_name() -> None:
-    with pytest.raises(UnknownExperiment, match="no experiment is called"):
-        run_experiment("table9", model="default", subjects=1, shared=Path(), folder=None, report=lambda s, f: None)
-    assert issubclass(UnknownExperiment, EigenheadError)
-
-
-CONTRACT = ("table1", "table2", "table3", "cost", "levels", "peers", "limit", "robustness", "views", "span", "detail")
-
-
-def test_every_name_of_the_contract_is_there() -> None:
-    assert set(CONTRACT) <= set(EXPERIMENTS)
-
-
 @pytest.mark.slow
 @pytest.mark.gl
 @pytest.mark.parametrize(
@@ -189,10 +145,8 @@ def test_every_name_of_the_contract_is_there() -> None:
     ],
 )
 def test_a_short_run_leaves_rows_a_table_and_figures(tmp_path: Path, name: str, figure: str, most: float) -> None:
-    found = run_experiment(
-        name, model="default", subjects=2, shared=tmp_path, folder=tmp_path, report=lambda s, f: None,
-        options=Options(simplex=0),
-    )  # fmt: skip
+    options = ["--simplex", "0"] if name == "table1" else []
+    found, _ = run(name, EXPERIMENTS[name], ["--subjects", "2", "--out", str(tmp_path), *options])
     assert 0.0 < found["figures"][figure] < most
     assert all(np.isfinite(value) for value in found["figures"].values())
     assert (tmp_path / f"{name}.md").read_text().startswith("| ")
@@ -208,9 +162,8 @@ def test_a_short_run_leaves_rows_a_table_and_figures(tmp_path: Path, name: str, 
 @pytest.mark.gl
 def test_intervals_are_counted_at_every_level_for_both_populations(tmp_path: Path) -> None:
     data = shared("data/ict-facekit").parent
-    found = run_experiment(
-        "hidden", model="default", subjects=1, shared=data, folder=tmp_path, report=lambda s, f: None
-    )["figures"]
+    options = ["--subjects", "1", "--shared", str(data), "--out", str(tmp_path)]
+    found = run("hidden", EXPERIMENTS["hidden"], options)[0]["figures"]
     for level in ("span", "kernel", "photo", "fine"):
         assert 0.5 < found[f"all_{level}_seen_all_within_95"] <= 1.0
     assert found["studio_fine_seen_face_median_mm"] < 0.2

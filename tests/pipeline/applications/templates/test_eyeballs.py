@@ -9,8 +9,8 @@ from trimesh.util import wrap_as_stream
 
 from pipeline.applications.templates.animated import AnimatedMesh
 from pipeline.applications.templates.eyeballs import Eyeball, lifted, placed_eyeballs, turn_to
+from pipeline.applications.templates.write.shapes import animated_glb, animated_parts
 from pipeline.fusion.crossings import crossing_faces
-from pipeline.results.write_template_shapes import animated_glb, animated_parts
 from rig.formats.meshes.glb_document import opened_glb
 from rig.formats.meshes.parts_files import PlacedPart, parts_obj_bytes, parts_usdz_bytes
 from rig.geometry import RigidTransform, rotation_from_vector

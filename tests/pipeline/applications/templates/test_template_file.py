@@ -12,9 +12,9 @@ from pipeline.applications.templates.header import BadTemplate, OtherModel
 from pipeline.applications.templates.load import load_template
 from pipeline.applications.templates.names import UnknownTemplate, WrongName, list_templates, new_path, remove_template
 from pipeline.applications.templates.template_file import Template, read_template, save_template
+from pipeline.applications.templates.write.mesh import write_template
 from pipeline.head_model.data_folder import DATA
 from pipeline.head_model.model import HeadModel, load_model
-from pipeline.results.write_template import write_template
 from pipeline.settings import Settings, settings_from_document
 from pipeline.texturing.layout.model_layout import model_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.applications.model_building.correspondence.scans import write_landmarks
 from pipeline.applications.verification.reference import Reference, read_reference
 from rig.errors import InputError
 from rig.formats.meshes.obj import obj_bytes
 from rig.formats.meshes.ply import ply_bytes
 from rig.mesh import Mesh
+from tests.support.landmark_files import write_landmarks
 from tests.support.measured_heads import mannequin, marks
 
 

@@ -3,8 +3,14 @@
 import numpy as np
 
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
-from pipeline.texturing.pores.sharp_texture import sharpened_atlas
-from pipeline.texturing.pores.skin_maps import MID_CODE, MM_PER_CODE, codes_of, heights_of, normal_codes
+from pipeline.texturing.pores.skin_maps import (
+    MID_CODE,
+    MM_PER_CODE,
+    codes_of,
+    heights_of,
+    normal_codes,
+    sharpened_atlas,
+)
 from pipeline.texturing.pores.texel_frames import COARSE, TexelFrames
 from rig.colour_space import linear_from_srgb
 

@@ -9,9 +9,10 @@ import pytest
 
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import read_cameras
-from rig.formats.cameras.foreign_keys import FOREIGN_KEYS, ForeignKey, markdown_table, says_nothing
+from rig.formats.cameras.foreign_keys import FOREIGN_KEYS, ForeignKey, Table, Treatment, says_nothing
 from rig.formats.cameras.reading import CamerasRead
 from rig.formats.cameras.unread_programs import OPENCV_KEYS, PATTERNS
+from rig.messages.message import Message
 from tests.support.fan_rig import POINTS
 from tests.support.planted_keys import PLANTS, VALUES, base
 
@@ -75,6 +76,20 @@ def test_a_key_that_the_table_does_not_have_is_told_once(kind: str, key: str, tm
     (remark,) = read_cameras(path).remarks
     assert remark.code == "unknown-key"
     assert key in remark.text
+
+
+def markdown_table(table: Table) -> str:
+    """The table as docs/foreign-cameras.md has it, with one row for all keys that share a description."""
+    rows: dict[tuple[Treatment, str | Message], list[str]] = {}
+    for key, rule in table.items():
+        rows.setdefault((rule.treatment, rule.why), []).append(f"`{key}`")
+    order: tuple[Treatment, ...] = ("read", "refused", "told", "nothing")
+    lines = ["| key | | |", "|---|---|---|"]
+    for treatment in order:
+        for (kind, why), keys in rows.items():
+            if kind == treatment:
+                lines.append(f"| {' '.join(keys)} | {treatment} | {why} |")
+    return "\n".join(lines)
 
 
 def test_the_page_shows_the_table() -> None:

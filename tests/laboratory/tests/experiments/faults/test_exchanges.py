@@ -6,12 +6,13 @@ import pytest
 from pipeline.head_model.model import load_model
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments.faults.exchanges import KINDS, _planted, exchanges, false_alarms
+from tests.laboratory.experiments.records import Bench
 
 
 @pytest.mark.gl
 @pytest.mark.slow
 def test_pairs_triples_and_duplicates_are_named_and_repaired(renderer):
-    found = exchanges(load_model(), renderer=renderer, report=lambda stage, share: None, subjects=2)["figures"]
+    found = exchanges(load_model(), renderer=renderer, bench=Bench(), subjects=2)["figures"]
     assert [found[f"{kind}_named_share"] for kind in KINDS] == [1.0, 1.0, 1.0]
     assert (found["pair_repaired_share"], found["triple_repaired_share"]) == (1.0, 1.0)
     assert found["good_called_exchanged"] == 0
@@ -20,7 +21,7 @@ def test_pairs_triples_and_duplicates_are_named_and_repaired(renderer):
 @pytest.mark.gl
 @pytest.mark.slow
 def test_nothing_is_told_of_good_captures(renderer):
-    found = false_alarms(load_model(), renderer=renderer, report=lambda stage, share: None, subjects=2)["figures"]
+    found = false_alarms(load_model(), renderer=renderer, bench=Bench(), subjects=2)["figures"]
     assert found == {"captures": 2, "cameras-exchanged": 0, "camera-moved": 0, "mask-loose": 0, "wrong-rig": 0}
 
 

@@ -18,7 +18,7 @@ from rig.studio.scene.layout import rig_from_directions
 from rig.studio.scene.simulate import simulate
 from rig.studio.sensor.preset import CLEAN
 from server.tasks.subjects import drawn_subject
-from tests.laboratory.experiments.faults.real import RealCapture, choose, outline_px, psnr_db, real, views_in_front
+from tests.laboratory.experiments.faults.real import RealCapture, choose, judge, outline_px, psnr_db, views_in_front
 from tests.support.scenes import ellipsoid
 
 AWAY = RigidTransform(np.eye(3), np.array([0.0, 0.0, 600.0]))
@@ -73,15 +73,12 @@ def test_a_studio_subject_is_judged_by_the_views_that_were_held_out(renderer: Re
     taken = simulate(drawn_subject(model, rng), rig_from_directions(AROUND).scaled(0.4), CLEAN, rng, renderer=renderer)
     masks = taken.masks
     real_capture = RealCapture("anna", Capture(taken.capture.images, masks=masks), taken.rig, masks, "cam04")
-    found = real(model, [real_capture], renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
-    (row,) = found["rows"]
-    assert isinstance(row, dict)
+    row = judge(model, real_capture, renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
     assert (row["views"], row["held_out"], row["surface"]) == (15, 2, "head")
     assert len(row["used"]) == 11
-    figures = found["figures"]
-    assert figures["anna_outline_px"] < 3.0
-    assert figures["anna_psnr_db"] > 20.0
-    assert figures["anna_points_mm"] < 3.0
+    assert row["outline_px"] < 3.0
+    assert row["psnr_db"] > 20.0
+    assert row["points_mm"] < 3.0
     few = replace(real_capture, rig=taken.rig.subset(taken.rig.names[:11]))
     with pytest.raises(InputError, match="11 views of use on the front side; more than 11 are needed"):
-        real(model, [few], renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)
+        judge(model, few, renderer=renderer, settings=HEAD_OF_SPAN, report=quiet)

@@ -36,6 +36,7 @@ from tests.laboratory.experiments.people.people_subjects import (
     seen_vertices,
     studio_cases,
 )
+from tests.laboratory.experiments.records import Bench
 from tests.support.scenes import ellipsoid, fan
 from tests.support.shared_data import shared
 
@@ -218,8 +219,8 @@ def test_refusals_and_crashes_are_rows(
 @pytest.mark.timeout(1200)  # two whole jobs, beside another test
 def test_two_rows_are_computed_and_kept(renderer: "Renderer", tmp_path: Path) -> None:
     run = partial(
-        people, load_model(), None, [], renderer=renderer, report=lambda stage, share: None,
-        only=("front-11", "studio-plain-0", "plates", "masks"), detail="span", folder=tmp_path,
+        people, load_model(), None, [], renderer=renderer, bench=Bench(folder=tmp_path),
+        only=("front-11", "studio-plain-0", "plates", "masks"), detail="span",
     )  # fmt: skip
     found = run()
     rows = found["rows"]

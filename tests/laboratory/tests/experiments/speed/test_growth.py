@@ -9,6 +9,7 @@ import pytest
 from pipeline.compute.trace import FORMAT
 from pipeline.head_model.model import load_model
 from rig.render.renderer import Renderer
+from tests.laboratory.experiments.records import Bench
 from tests.laboratory.experiments.speed.growth import VIEWS, Size, exponent, growth, sizes
 from tests.laboratory.experiments.speed.scaling import JobCommand
 
@@ -52,9 +53,7 @@ def test_jobs_run_in_children_and_their_rows_are_kept(tmp_path: Path, renderer: 
     command = JobCommand([sys.executable, str(tmp_path / "job.py")], {"PATH": ""})
     chosen = [Size("views", count, 0.03) for count in (3, 6, 12)]
     found, _ = (
-        growth(
-            load_model(), chosen, command=command, renderer=renderer, report=lambda *_: None, folder=tmp_path / "out"
-        )
+        growth(load_model(), chosen, command=command, renderer=renderer, bench=Bench(folder=tmp_path / "out"))
         for _ in range(2)
     )
     assert (tmp_path / "runs").read_text() == "3 6 12 "

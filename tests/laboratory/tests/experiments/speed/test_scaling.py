@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from pipeline.compute.trace import FORMAT
+from tests.laboratory.experiments.records import Bench
 from tests.laboratory.experiments.speed.critical_path import schedule, work_of
 from tests.laboratory.experiments.speed.scaling import JobCommand, JobFailed, scaling
 
@@ -142,9 +143,7 @@ def test_jobs_run_in_children_and_their_rows_are_kept(tmp_path: Path) -> None:
         f"open(sys.argv[sys.argv.index('--trace') + 1], 'w').write({json.dumps(trace)!r})\n"
     )
     command, out = job_of(tmp_path, program), tmp_path / "out"
-    found, again = (
-        scaling([Path("scan")], command=command, report=lambda *_: None, folder=out, threads=3) for _ in range(2)
-    )
+    found, again = (scaling([Path("scan")], command=command, bench=Bench(folder=out), threads=3) for _ in range(2))
     assert found["figures"] == again["figures"]
     assert (tmp_path / "runs").read_text() == "1 scan\n3 scan\n"
     figures = found["figures"]
@@ -159,4 +158,4 @@ def test_jobs_run_in_children_and_their_rows_are_kept(tmp_path: Path) -> None:
 def test_a_job_that_fails_is_named_with_what_it_said(tmp_path: Path) -> None:
     command = job_of(tmp_path, "import sys\nsys.exit('eigenhead: no camera sees it')\n")
     with pytest.raises(JobFailed, match="scan could not be reconstructed: eigenhead: no camera sees it"):
-        scaling([Path("scan")], command=command, report=lambda *_: None, threads=1)
+        scaling([Path("scan")], command=command, bench=Bench(), threads=1)

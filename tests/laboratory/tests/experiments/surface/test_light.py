@@ -8,6 +8,7 @@ import pytest
 from pipeline.head_model.model import load_model
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.render.renderer import Renderer
+from tests.laboratory.experiments.records import Bench
 from tests.laboratory.experiments.surface.light import levelled, light
 
 
@@ -27,7 +28,7 @@ def test_levelled_images_differ_by_no_overall_colour() -> None:
 @pytest.mark.timeout(1200)  # eight whole jobs, beside another test
 def test_albedos_of_three_lights_differ_by_at_most_half(tmp_path: Path) -> None:
     with Renderer.create() as renderer:
-        found = light(load_model(), renderer=renderer, report=lambda stage, share: None, folder=tmp_path)
+        found = light(load_model(), renderer=renderer, bench=Bench(folder=tmp_path))
     assert found["figures"]["ratio"] < 0.5
     assert found["figures"]["ratio_level"] < 0.5
     assert found["figures"]["chart_ratio"] < 0.4

@@ -9,7 +9,7 @@ from pipeline.head_model.model import load_model
 from rig.errors import InputError
 from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
-from rig.progress import discard_progress
+from tests.laboratory.experiments.records import Bench
 from tests.laboratory.experiments.surface.meshes import meshes
 from tests.support.subdivided_spheres import subdivided_sphere
 
@@ -28,7 +28,7 @@ def test_a_planted_fault_of_a_result_is_counted(tmp_path: Path) -> None:
         quality=np.ones(count, np.float32),
         views=np.ones(count, np.uint8),
     )
-    found = meshes({}, [tmp_path / "planted"], report=discard_progress)
+    found = meshes({}, [tmp_path / "planted"], bench=Bench())
     degree = int((faces == 0).any(axis=1).sum())
     assert degree < found["figures"]["planted_crossing_after"] < 10 * degree
     assert found.get("markdown", "").splitlines()[2].startswith("| planted | 1 | - | - | - |")
@@ -36,7 +36,7 @@ def test_a_planted_fault_of_a_result_is_counted(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_random_heads_come_out_clean(tmp_path: Path) -> None:
-    found = meshes({"default": load_model()}, [], report=discard_progress, subjects=1, folder=tmp_path)
+    found = meshes({"default": load_model()}, [], bench=Bench(folder=tmp_path), subjects=1)
     for kind in ("fitted", "displaced"):
         of = f"default, {kind}_"
         figures = {name.removeprefix(of): value for name, value in found["figures"].items() if name.startswith(of)}
@@ -48,4 +48,4 @@ def test_random_heads_come_out_clean(tmp_path: Path) -> None:
 
 def test_a_folder_without_a_head_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no head\.ply"):
-        meshes({}, [tmp_path], report=discard_progress)
+        meshes({}, [tmp_path], bench=Bench())

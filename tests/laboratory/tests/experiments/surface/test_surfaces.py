@@ -12,8 +12,9 @@ from rig.rig import Rig
 from rig.studio.scene.visible import VisiblePoints
 from tests.laboratory.experiments.paper.detail import Known
 from tests.laboratory.experiments.peers.openmvs import PeerFailed
-from tests.laboratory.experiments.runner import Options, run_experiment
 from tests.laboratory.experiments.surface.surfaces import as_markdown, figures, peer_row
+from tests.laboratory.runner import run
+from tests.laboratory.table import EXPERIMENTS
 from tests.support.scenes import ellipsoid
 
 
@@ -60,7 +61,4 @@ def test_what_is_left_out_stands_below_the_table_and_has_no_figure() -> None:
 def test_a_folder_without_the_programs_is_refused_before_anything_is_computed(tmp_path: Path) -> None:
     (tmp_path / "captures" / "one.truth").mkdir(parents=True)
     with pytest.raises(InputError, match="DensifyPointCloud"):
-        run_experiment(
-            "surfaces", model="default", subjects=None, shared=tmp_path, folder=None, report=lambda s, f: None,
-            options=Options(openmvs=tmp_path),
-        )  # fmt: skip
+        run("surfaces", EXPERIMENTS["surfaces"], ["--shared", str(tmp_path), "--openmvs", str(tmp_path)])

@@ -13,7 +13,6 @@ from pipeline.applications.model_building.correspondence.scans import (
     find_scans,
     plain_name,
     read_landmarks,
-    write_landmarks,
 )
 from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.geometry.surface_index import SurfaceIndex
@@ -21,6 +20,7 @@ from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.landmarks import NAMES
 from pipeline.head_model.model import load_model
 from rig.errors import InputError
+from tests.support.landmark_files import write_landmarks
 
 
 def sphere(radius: float) -> tuple[np.ndarray, np.ndarray]:

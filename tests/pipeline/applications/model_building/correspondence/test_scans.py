@@ -137,6 +137,7 @@ def test_the_mixture_keeps_each_vertex_variance(monkeypatch: pytest.MonkeyPatch)
     assert pytest.approx(1) == prior.GLOBAL**2 + prior.LOCAL**2
 
 
+@pytest.mark.slow
 def test_the_prior_takes_a_head_for_as_likely_as_its_mirror_image(
     model: HeadModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial import KDTree
 
 from pipeline.applications.model_building.correspondence.scan_checks import BadScan, check, outward_share
-from pipeline.applications.model_building.correspondence.scans import Scan, read_scan, write_landmarks
+from pipeline.applications.model_building.correspondence.scans import Scan, read_scan
 from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.applications.model_building.training.build import build_model
 from pipeline.geometry.surface_index import SurfaceIndex
@@ -20,6 +20,7 @@ from rig.errors import InputError
 from rig.formats.meshes.obj import obj_bytes
 from rig.geometry import rigid_fit
 from rig.mesh import Mesh
+from tests.support.landmark_files import write_landmarks
 
 SUBJECTS = (4, 40, 100, 120)
 

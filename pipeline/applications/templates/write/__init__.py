@@ -1,0 +1,1 @@
+"""Writes a result in the vertex order of a template."""

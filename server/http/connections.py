@@ -1,0 +1,139 @@
+"""Bounds what a connection may cost before anybody has shown a key: bytes and seconds to the end of a header, the pace
+of a body, and the number of connections.
+
+uvicorn's parser, httptools, joins a header that arrives in pieces quadratically and bounds neither it nor the time that
+it takes. h11 bounds the header, at 139 us of CPU a request against 60 us, and leaves the time open. So bytes are
+counted here, in front of the parser. A limit that passes closes the connection; a header that is too long is answered.
+"""
+
+import resource
+from asyncio import BaseTransport, TimerHandle, Transport
+from collections.abc import Sequence
+from typing import Any, cast
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from rig.messages.message import compose
+from server.wire.problems import Problem
+
+HEADER_BYTES = 32 << 10  # of a request line and its fields, or of a body's trailer; nginx's default (4 x 8 KiB)
+HEADER_S = 30.0  # from the first byte to the end of a header
+PACE_S, PACE_BYTES = 60.0, 30_000  # a body that brings less in that time is dropped: 500 B/s, as Apache's MinRate
+CONNECTIONS_MOST = 2048  # of 50 kB each, with what the kernel holds of them
+DESCRIPTORS_SPARED = 256  # of the process's limit: for the database, files, and children
+PIPELINED_MOST = 16  # requests that wait behind the one that is answered
+
+
+class BoundedConnection(HttpToolsProtocol):
+    """Serves a connection, as uvicorn does, within the limits of this module.
+
+    Of too many connections, or too many of one address (half of all), the one that has waited longest for a header is
+    closed for a new one. If all of them are in the midst of a request, the new one is closed.
+    """
+
+    _timer: TimerHandle | None = None
+    _in_header = True
+    _unparsed = _received = 0
+
+    def connection_made(self, transport: BaseTransport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Takes a new connection, or closes it or an idle one if there are too many."""
+        super().connection_made(cast(Transport, transport))
+        self.since = self.loop.time()
+        self._await_header()
+        most = connections_most()
+        if len(self.connections) > most // 2:
+            self._make_room(self._neighbours(), most // 2)
+            self._make_room(list(self.connections), most)
+
+    @property
+    def waits(self) -> bool:
+        """Returns whether the connection is waiting for a header, with no request to be answered."""
+        return self._in_header and (self.cycle is None or self.cycle.response_complete)
+
+    def drop(self) -> None:
+        """Closes the connection at once and forgets it."""
+        self.connections.discard(self)
+        self.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Ends the time that ran."""
+        self._set_timer(None)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Passes bytes to the parser as long as it makes a header or a body of them."""
+        self._unparsed += len(data)
+        self._received += len(data)
+        if self._in_header and self._timer is None:
+            self._await_header()
+        super().data_received(data)
+        if self._unparsed > HEADER_BYTES and not self.transport.is_closing():
+            self._refuse(Problem(431, "header-too-large", compose("header-too-large", bytes=HEADER_BYTES)))
+
+    def on_headers_complete(self) -> None:
+        """Begins a request, and the time in which its body has to bring something."""
+        self._in_header, self._unparsed = False, 0
+        self._keep_pace()
+        if len(self.pipeline) >= PIPELINED_MOST:
+            raise ValueError("too many pipelined requests")  # the parser's error: answered with 400, and closed
+        super().on_headers_complete()
+
+    def on_body(self, body: bytes) -> None:
+        """Takes a piece of a body."""
+        self._unparsed = 0
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        """Ends a request. The next one's time begins with its first byte; until then uvicorn's keep-alive counts."""
+        self._in_header, self._unparsed, self.since = True, 0, self.loop.time()
+        self._set_timer(None)
+        super().on_message_complete()
+
+    def handle_websocket_upgrade(self) -> None:
+        """Hands the connection over: a WebSocket has pings of its own."""
+        self._set_timer(None)
+        super().handle_websocket_upgrade()
+
+    def _make_room(self, crowd: Sequence[object], most: int) -> None:
+        if len(crowd) > most:
+            idle = [one for one in crowd if isinstance(one, BoundedConnection) and one.waits and one is not self]
+            min(idle, key=lambda one: one.since, default=self).drop()
+
+    def _neighbours(self) -> list[Any]:
+        """Returns the connections from the same address; none if there is no address."""
+        host = self.client and self.client[0]
+        return [one for one in self.connections if host and (getattr(one, "client", None) or " ")[0] == host]
+
+    def _await_header(self) -> None:
+        self._set_timer(self.loop.call_later(HEADER_S, self.drop))
+
+    def _keep_pace(self) -> None:
+        """Checks after ``PACE_S`` seconds that the body went on, unless this side did not read meanwhile."""
+        before = self._received
+
+        def check() -> None:
+            if self.flow.read_paused or self._received - before >= PACE_BYTES:
+                self._keep_pace()
+            else:
+                self.drop()
+
+        self._set_timer(self.loop.call_later(PACE_S, check))
+
+    def _set_timer(self, timer: TimerHandle | None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = timer
+
+    def _refuse(self, problem: Problem) -> None:
+        answer = problem.response()
+        fields = [*answer.raw_headers, (b"connection", b"close")]
+        head = b"".join(name + b": " + value + b"\r\n" for name, value in fields)
+        self.transport.write(b"HTTP/1.1 %d \r\n%b\r\n%b" % (problem.status, head, answer.body))
+        self.transport.close()
+
+
+def connections_most() -> int:
+    """Returns how many connections may be open: as many as the limit of open files allows, at most
+    ``CONNECTIONS_MOST``."""
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return min(CONNECTIONS_MOST, max(files - DESCRIPTORS_SPARED, files // 2))

@@ -1,0 +1,206 @@
+"""Attacks on a real service of this machine, over loopback, each bounded: attack, what is expected, what was seen.
+
+The service is the tests' one without a worker, at 1,024 open files, systemd's default. A witness at another address
+asks for /healthz and, with another key, for a list, twenty times a second (``tests.support.attacks``).
+"""
+
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+
+from tests.support.attacks import (
+    CHUNKED,
+    REQUEST,
+    Witness,
+    add_keys,
+    flood_header,
+    half_body,
+    jpeg_with_metadata,
+    limit_files,
+    png_of_chunks,
+    seconds_to_end,
+    silent_connections,
+    spoiled_capture,
+)
+from tests.support.services import RunningService, packed, running_service, small_capture, upload
+
+FILES, CONNECTIONS, MEGABYTES = 1024, 1100, 98
+HEALTHZ_S, SLOWER, MEMORY_MB = 1.0, 3.0, 300.0  # the worst answer, the median beside a calm one, and what comes on top
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Holds an attack, what is expected of the service under it, what was seen, and whether that is as expected."""
+
+    attack: str
+    expected: str
+    seen: str
+    held: bool
+
+
+@dataclass(frozen=True)
+class Field:
+    """Holds the service under attack, an attacker's and a witness's key, what a calm time looks like, and a folder."""
+
+    service: RunningService
+    attacker: str
+    other: str
+    calm: Witness
+    folder: Path
+
+
+def run() -> dict[str, Any]:
+    """Runs all attacks. Returns the figures and a line for each attack."""
+    with tempfile.TemporaryDirectory(prefix="eigenhead-attacks-") as name:
+        folder = Path(name)
+        with running_service(folder / "data", worker=False) as service:
+            open_to_all = http_status(service, "POST", "/v1/keys", {"name": "mine", "scopes": ["admin"]})
+            rows = [Seen("first key over HTTP", "403", str(open_to_all), open_to_all == 403)]
+            attacker, other = add_keys(service, "read,capture", "read,capture")
+            limit_files(service, FILES)
+            calm = Witness(service, other)
+            with calm.watching():
+                time.sleep(3.0)
+            field = Field(service, attacker, other, calm, folder)
+            rows += [attack(field) for attack in ATTACKS]
+    lines = [
+        f"{'held' if row.held else 'FAILS'}  {row.attack}: expected {row.expected}; seen {row.seen}" for row in rows
+    ]
+    return {"figures": {"attacks": len(rows), "held": sum(row.held for row in rows)}, "lines": lines}
+
+
+def http_status(service: RunningService, method: str, path: str, body: Any = None, key: str | None = None) -> int:
+    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+    return httpx.request(method, service.url + path, json=body, headers=headers, timeout=60).status_code
+
+
+def others_under(field: Field, name: str, attack: Callable[[], object]) -> Seen:
+    """Runs an attack beside the witness, and compares what the witness felt with a calm time."""
+    witness = Witness(field.service, field.other)
+    with witness.watching():
+        attack()
+        time.sleep(0.5)
+    figures = witness.figures()
+    ratio = witness.others_median_s / field.calm.others_median_s
+    more = max(witness.memory_mb) - max(field.calm.memory_mb)
+    held = not witness.failures and max(witness.healthz_s) < HEALTHZ_S and ratio < SLOWER and more < MEMORY_MB
+    seen = f"healthz {figures['healthz_worst_s']} s at worst, others {ratio:.1f} times, {more:.0f} MB more, "
+    seen += f"{figures['failures']} failures"
+    expected = f"healthz {HEALTHZ_S:.0f} s, others {SLOWER:.0f} times, {MEMORY_MB:.0f} MB more, no failure"
+    return Seen(name, expected, seen, held)
+
+
+def flood(field: Field) -> Seen:
+    name = f"{MEGABYTES} MB of one header, twice"
+    return others_under(field, name, lambda: [flood_header(field.service, MEGABYTES, REQUEST) for _ in range(2)])
+
+
+def flood_trailer(field: Field) -> Seen:
+    return others_under(
+        field, f"{MEGABYTES} MB of one trailer", lambda: flood_header(field.service, MEGABYTES, CHUNKED)
+    )
+
+
+def stay_silent(field: Field) -> Seen:
+    def attack() -> None:
+        with silent_connections(field.service, CONNECTIONS):
+            time.sleep(3.0)
+
+    return others_under(field, f"{CONNECTIONS} silent connections at {FILES} open files", attack)
+
+
+def send_halves(field: Field) -> Seen:
+    def attack() -> None:
+        with silent_connections(field.service, CONNECTIONS, half_body("/v1/sessions", field.attacker)):
+            time.sleep(3.0)
+
+    return others_under(field, f"{CONNECTIONS} half bodies with a key", attack)
+
+
+def wait_for_ends(field: Field) -> Seen:
+    with silent_connections(field.service, 1, b"GET /healthz HT") as (header,):
+        of_header = seconds_to_end(header, 60.0)
+    with silent_connections(field.service, 1, half_body("/v1/sessions", field.attacker)) as (body,):
+        of_body = seconds_to_end(body, 60.0)
+    seen = f"header {of_header:.0f} s, body {of_body:.0f} s"
+    return Seen("half a header, half a body, and silence", "closed within 35 s", seen, max(of_header, of_body) < 35.0)
+
+
+def send_metadata(field: Field) -> Seen:
+    done, jpeg = cv2.imencode(".jpg", np.zeros((24, 24, 3), np.uint8))
+    assert done
+
+    def change(folder: Path) -> None:
+        (folder / "images" / "cam00.png").unlink()
+        (folder / "images" / "cam00.jpg").write_bytes(jpeg_with_metadata(jpeg.tobytes(), 60))
+
+    archive = spoiled_capture(field.folder / "metadata", change)
+    with client(field.service, field.attacker) as http:
+        began = time.monotonic()
+        status = upload(http, archive).status_code
+    seconds = time.monotonic() - began
+    return Seen(
+        "60 MB of EXIF in a JPEG", "422 within 10 s", f"{status} after {seconds:.1f} s", status == 422 and seconds < 10
+    )
+
+
+def give_up_uploads(field: Field) -> Seen:
+    def change(folder: Path) -> None:
+        picture = folder / "images" / "cam00.png"
+        picture.write_bytes(png_of_chunks(picture.read_bytes(), 4_000_000))
+
+    slow, fine = spoiled_capture(field.folder / "slow", change), packed(small_capture(field.folder / "fine"))
+    calm_s = seconds_of_upload(field, fine)
+    for _ in range(2):
+        with client(field.service, field.attacker, 2.0) as http, suppress(httpx.TimeoutException):
+            upload(http, slow)
+    under_s = seconds_of_upload(field, fine)
+    seen = f"{under_s:.1f} s beside {calm_s:.1f} s"
+    expected = "another key's upload takes 1.5 times as long at most, or 2 s more"
+    return Seen("two uploads that are given up", expected, seen, under_s < max(1.5 * calm_s, calm_s + 2.0))
+
+
+def erase_with_capture_scope(field: Field) -> Seen:
+    status = http_status(field.service, "DELETE", "/v1/captures/" + "0" * 28 + "?erase=true", key=field.attacker)
+    return Seen("erasing with the scope capture", "403", str(status), status == 403)
+
+
+def frame_the_console(field: Field) -> Seen:
+    headers = httpx.get(field.service.url + "/docs", timeout=60).headers
+    policy, sniff = headers.get("content-security-policy", ""), headers.get("x-content-type-options", "")
+    held = "frame-ancestors 'none'" in policy and sniff == "nosniff"
+    return Seen(
+        "a page of another site frames ours", "frame-ancestors 'none', nosniff", f"{policy[-23:]}, {sniff}", held
+    )
+
+
+def client(service: RunningService, key: str, timeout_s: float = 60.0) -> httpx.Client:
+    return httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {key}"}, timeout=timeout_s)
+
+
+def seconds_of_upload(field: Field, archive: bytes) -> float:
+    with client(field.service, field.other) as http:
+        began = time.monotonic()
+        upload(http, archive).raise_for_status()
+        return time.monotonic() - began
+
+
+ATTACKS = (
+    flood,
+    flood_trailer,
+    stay_silent,
+    send_halves,
+    wait_for_ends,
+    send_metadata,
+    give_up_uploads,
+    erase_with_capture_scope,
+    frame_the_console,
+)

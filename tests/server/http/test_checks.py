@@ -1,0 +1,86 @@
+"""What an upload may cost others: metadata, time, memory and places, at one real service with two keys."""
+
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from tests.support.attacks import add_keys, jpeg_with_metadata, png_of_chunks, spoiled_capture
+from tests.support.services import RunningService, packed, running_service, small_capture, upload
+
+CHUNKS = 4_000_000  # of a PNG: half a minute and more of one process
+CHECK_S = 12.0
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
+    with running_service(tmp_path_factory.mktemp("checks") / "data", worker=False, check_s=str(CHECK_S)) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def keys(service: RunningService) -> list[str]:
+    return add_keys(service, "capture", "capture")
+
+
+@pytest.fixture(scope="module")
+def fine(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return packed(small_capture(tmp_path_factory.mktemp("fine") / "capture"))
+
+
+@pytest.fixture(scope="module")
+def slow(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    def change(folder: Path) -> None:
+        picture = folder / "images" / "cam00.png"
+        picture.write_bytes(png_of_chunks(picture.read_bytes(), CHUNKS))
+
+    return spoiled_capture(tmp_path_factory.mktemp("slow") / "capture", change)
+
+
+def client(service: RunningService, key: str, timeout_s: float = 60.0) -> httpx.Client:
+    return httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {key}"}, timeout=timeout_s)
+
+
+@pytest.mark.parametrize("segment", [65_533, 20])
+def test_metadata_is_refused_before_it_is_read(
+    service: RunningService, keys: list[str], tmp_path: Path, segment: int
+) -> None:
+    def change(folder: Path) -> None:
+        picture = folder / "images" / "cam00.png"
+        done, data = cv2.imencode(".jpg", np.zeros((24, 24, 3), np.uint8))
+        assert done
+        picture.with_suffix(".jpg").write_bytes(jpeg_with_metadata(data.tobytes(), 60, segment))
+        picture.unlink()
+
+    archive = spoiled_capture(tmp_path / "capture", change)
+    with client(service, keys[0]) as http:
+        upload(http, archive[:1000])  # a child process has begun
+        began = time.monotonic()
+        answer = upload(http, archive)
+    assert answer.status_code == 422
+    assert any("metadata" in error for error in answer.json()["errors"])
+    assert time.monotonic() - began < 8.0
+
+
+@pytest.mark.slow
+def test_a_slow_check_keeps_no_other_key_waiting_and_ends(
+    service: RunningService, keys: list[str], slow: bytes, fine: bytes
+) -> None:
+    with client(service, keys[1]) as other:
+        assert upload(other, fine).status_code == 201
+        for _ in range(2):  # given up by their sender
+            with client(service, keys[0], timeout_s=1.5) as attacker, suppress(httpx.TimeoutException):
+                upload(attacker, slow)
+        began = time.monotonic()
+        assert upload(other, fine).status_code == 201
+        assert time.monotonic() - began < CHECK_S / 2
+    with client(service, keys[0]) as attacker:
+        assert upload(attacker, fine).status_code == 201  # what was given up has ended
+        assert time.monotonic() - began < CHECK_S
+        answer = upload(attacker, slow)
+    assert (answer.status_code, answer.json()["detail_message"]["code"]) == (422, "check-too-long")

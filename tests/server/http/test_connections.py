@@ -1,0 +1,88 @@
+"""What a stranger without a key may cost: one real service with few open files."""
+
+import json
+import socket
+import time
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from server.http import connections
+from tests.support.attacks import (
+    CHUNKED,
+    REQUEST,
+    Witness,
+    flood_header,
+    half_body,
+    limit_files,
+    seconds_to_end,
+    silent_connections,
+)
+from tests.support.services import RunningService, running_service
+
+FILES = 512  # the service then takes 256 connections, 128 of one address; `attacks` has 1,024 and 1,100
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
+    with running_service(tmp_path_factory.mktemp("strangers") / "data", worker=False) as running:
+        limit_files(running, FILES)
+        yield running
+
+
+@pytest.fixture(scope="module")
+def calm(service: RunningService) -> Witness:
+    witness = Witness(service)
+    with witness.watching():
+        time.sleep(1.5)
+    return witness
+
+
+def check(witness: Witness, calm: Witness) -> None:
+    assert witness.failures == []
+    assert max(witness.healthz_s) < 1.0
+    assert witness.others_median_s < 3.0 * calm.others_median_s
+    assert max(witness.memory_mb) < max(calm.memory_mb) + 300.0
+
+
+@pytest.mark.parametrize("begin", [REQUEST, CHUNKED], ids=["header", "trailer"])
+def test_a_header_without_end_is_refused_at_its_bound(service: RunningService, calm: Witness, begin: bytes) -> None:
+    with Witness(service).watching() as witness:
+        ends = [flood_header(service, 98, begin) for _ in range(5)]
+        time.sleep(0.3)
+    check(witness, calm)
+    for sent, answer in ends:
+        assert sent < 20_000_000  # what both sockets hold
+        assert not answer or answer.startswith((b"HTTP/1.1 431 ", b"HTTP/1.1 404 "))  # a reset may take it away
+
+
+def test_a_header_of_the_permitted_length_passes_and_a_longer_one_is_told(service: RunningService) -> None:
+    fits = {f"X-{i}": "a" * 1000 for i in range(30)}
+    assert httpx.get(service.url + "/healthz", headers=fits).status_code == 200
+    with socket.create_connection(("127.0.0.1", service.port), timeout=30) as sock:
+        sock.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Long: " + b"a" * connections.HEADER_BYTES)
+        head, _, body = b"".join(iter(lambda: sock.recv(1 << 16), b"")).partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 431 ")
+    assert json.loads(body)["detail_message"]["parameters"] == {"bytes": connections.HEADER_BYTES}
+
+
+def test_silent_connections_leave_room_for_others(service: RunningService, calm: Witness) -> None:
+    with Witness(service).watching() as witness, silent_connections(service, 300) as opened:
+        time.sleep(1.0)
+        assert len(opened) == 300
+    check(witness, calm)
+
+
+def test_half_bodies_leave_room_for_others(service: RunningService, calm: Witness) -> None:
+    with Witness(service).watching() as witness, silent_connections(service, 300, half_body("/v1/jobs")):
+        time.sleep(1.0)
+    check(witness, calm)
+
+
+@pytest.mark.slow
+def test_half_headers_and_half_bodies_end_after_half_a_minute(service: RunningService) -> None:
+    begun = (b"GET /healthz HT", half_body("/v1/jobs"))
+    for begin in begun:
+        with silent_connections(service, 1, begin) as (sock,):
+            assert 25.0 < seconds_to_end(sock, 60.0) < 35.0

@@ -1,0 +1,182 @@
+"""Attacks on a running service, each bounded and on loopback, and a witness who measures what others feel of them."""
+
+import resource
+import socket
+import statistics
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+
+from server.services.keys import Keys
+from server.settings import ServiceSettings
+from server.storage.database import open_database
+from tests.support.services import RunningService, packed, small_capture
+
+ATTACKER, WITNESS = "127.0.0.3", "127.0.0.2"  # addresses of loopback: the bounds are by address
+EVERY_S = 0.05
+
+
+def limit_files(service: RunningService, count: int) -> None:
+    """Sets ``ulimit -n`` of a running service."""
+    assert service.process is not None
+    resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (count, count))
+
+
+def connect(service: RunningService) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", service.port), timeout=30, source_address=(ATTACKER, 0))
+
+
+REQUEST = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n"
+CHUNKED = b"POST /v1/nowhere HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n1\r\na\r\n0\r\n"
+
+
+def flood_header(service: RunningService, megabytes: int, begin: bytes = REQUEST) -> tuple[int, bytes]:
+    """One header field in pieces of 64 KiB after ``begin``. Returns how many bytes were sent, and the answer."""
+    sent, piece = 0, b"a" * (1 << 16)
+    with connect(service) as sock:
+        with suppress(ConnectionError):
+            sock.sendall(begin + b"X-Long: ")
+            while sent < megabytes * 1_000_000:
+                sent += sock.send(piece)
+        return sent, _answer(sock)
+
+
+@contextmanager
+def silent_connections(service: RunningService, count: int, begin: bytes = b"") -> Iterator[list[socket.socket]]:
+    """Connections that send ``begin`` and then nothing."""
+    with ExitStack() as stack:
+        opened = []
+        for _ in range(count):
+            sock = stack.enter_context(connect(service))
+            with suppress(ConnectionError):
+                sock.sendall(begin)
+            opened.append(sock)
+        yield opened
+
+
+def half_body(path: str, key: str | None = None) -> bytes:
+    """The header of a JSON request and the first bytes of its body."""
+    access = "" if key is None else f"Authorization: Bearer {key}\r\n"
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\n{access}Content-Type: application/json\r\n"
+    return (head + 'Content-Length: 400\r\n\r\n{"capture_id": ').encode()
+
+
+def seconds_to_end(sock: socket.socket, timeout_s: float) -> float:
+    """How long the service leaves a connection open."""
+    began = time.monotonic()
+    sock.settimeout(timeout_s)
+    _answer(sock)
+    return time.monotonic() - began
+
+
+def _answer(sock: socket.socket) -> bytes:
+    answer = b""
+    with suppress(ConnectionError):
+        while piece := sock.recv(1 << 16):
+            answer += piece
+    return answer
+
+
+@dataclass
+class Witness:
+    """Asks for /healthz and, with another key, for a list, again and again; holds seconds, failures and memory."""
+
+    service: RunningService
+    key: str | None = None
+    healthz_s: list[float] = field(default_factory=list)
+    others_s: list[float] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    memory_mb: list[float] = field(default_factory=list)
+
+    @contextmanager
+    def watching(self) -> Iterator["Witness"]:
+        ended = threading.Event()
+        thread = threading.Thread(target=self._watch, args=(ended,))
+        thread.start()
+        try:
+            yield self
+        finally:
+            ended.set()
+            thread.join()
+
+    def _watch(self, ended: threading.Event) -> None:
+        headers = {} if self.key is None else {"Authorization": f"Bearer {self.key}"}
+        transport = httpx.HTTPTransport(local_address=WITNESS)
+        with httpx.Client(base_url=self.service.url, headers=headers, transport=transport, timeout=60) as client:
+            while not ended.wait(EVERY_S):
+                for path, seconds in (("/healthz", self.healthz_s), ("/v1/captures", self.others_s)):
+                    began = time.monotonic()
+                    try:
+                        client.get(path).raise_for_status()
+                    except httpx.HTTPError as error:
+                        self.failures.append(f"{path}: {error!r}")
+                    seconds.append(time.monotonic() - began)
+                self.memory_mb.append(memory_mb(self.service))
+
+    @property
+    def others_median_s(self) -> float:
+        return statistics.median(self.others_s)
+
+    def figures(self) -> dict[str, float]:
+        return {
+            "healthz_worst_s": round(max(self.healthz_s), 3),
+            "others_median_ms": round(1000 * self.others_median_s, 1),
+            "failures": len(self.failures),
+            "memory_mb": round(max(self.memory_mb)),
+        }
+
+
+def memory_mb(service: RunningService) -> float:
+    """Resident memory of the service's process and all below it (MB)."""
+    assert service.process is not None
+    return sum(_resident_mb(pid) for pid in _tree(service.process.pid))
+
+
+def _tree(pid: int) -> list[int]:
+    below: list[int] = []
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            below += [int(child) for child in (task / "children").read_text().split()]
+    return [pid, *(each for child in below for each in _tree(child))]
+
+
+def _resident_mb(pid: int) -> float:
+    with suppress(OSError, StopIteration):
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        return int(next(line for line in lines if line.startswith("VmRSS:")).split()[1]) / 1000
+    return 0.0
+
+
+def jpeg_with_metadata(jpeg: bytes, megabytes: int, segment: int = 65_533) -> bytes:
+    """A JPEG with so much EXIF before its pixels, in segments of ``segment`` bytes."""
+    payload = b"Exif\0\0" + bytes(segment - 8)
+    part = b"\xff\xe1" + segment.to_bytes(2, "big") + payload
+    return jpeg[:2] + part * (megabytes * 1_000_000 // len(part)) + jpeg[2:]
+
+
+def png_of_chunks(png: bytes, count: int) -> bytes:
+    """A PNG with ``count`` empty chunks before its pixels: each takes its reader some microseconds."""
+    at = 8 + 25  # after signature and header
+    chunk = bytes(4) + b"teSt" + zlib.crc32(b"teSt").to_bytes(4, "big")
+    return png[:at] + chunk * count + png[at:]
+
+
+def spoiled_capture(folder: Path, change: Callable[[Path], None]) -> bytes:
+    """An archive of a small capture after ``change``, which gets the capture's folder."""
+    change(small_capture(folder))
+    return packed(folder)
+
+
+def add_keys(service: RunningService, *scopes: str) -> list[str]:
+    """New keys of a running service, each with the named scopes (with commas between)."""
+    engine = open_database(ServiceSettings(data=service.data))
+    try:
+        return [Keys(engine).add(f"key {number}", tuple(each.split(","))) for number, each in enumerate(scopes)]
+    finally:
+        engine.dispose()
