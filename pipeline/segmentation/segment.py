@@ -23,7 +23,7 @@ from pipeline.segmentation.cross_view import count_rejecting_cameras
 from pipeline.segmentation.foreground import Decision, decide, doubtful, reconsider
 from pipeline.segmentation.matting import Matte, solve_matte
 from pipeline.segmentation.view_consistency import judge_agreement
-from pipeline.segmentation.without_plates.head_seed import HeadSeed, find_head_seed
+from pipeline.segmentation.without_plates.head_seed import HeadSeed, above_chin, find_head_seed
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.errors import InputError
@@ -113,8 +113,13 @@ def _searched(
         capture.images, rig, settings, head=head, report=lambda share: report("segmentation", 0.8 * share)
     )
     with task_pool() as pool:
-        jobs = {n: pool.submit(_refined, capture.images[n], one, settings) for n, one in found.decisions.items()}
-        jobs |= {n: pool.submit(_as_cut, share, settings) for n, share in found.shares.items()}
+        counted = {
+            n: None if head is None else above_chin(head, rig[n], capture.images[n].shape[:2]) for n in rig.names
+        }  # what is guessed on clothes does not count against the head
+        jobs = {
+            n: pool.submit(_refined, capture.images[n], one, settings, counted[n]) for n, one in found.decisions.items()
+        }
+        jobs |= {n: pool.submit(_as_cut, share, settings, counted[n]) for n, share in found.shares.items()}
         silhouettes = {name: _doubted(jobs[name].result(), settings) for name in rig.names}
     return judge_agreement(silhouettes, rig, settings)
 
@@ -138,13 +143,16 @@ def _concerns(message: Message, code: str) -> bool:
     return message.code == code or (isinstance(remark, Message) and remark.code == code)
 
 
-def _as_cut(share: Float32[np.ndarray, "h w"], settings: SegmentationSettings) -> Silhouette:
+def _as_cut(
+    share: Float32[np.ndarray, "h w"], settings: SegmentationSettings, counted: Bool[np.ndarray, "h w"] | None = None
+) -> Silhouette:
     """Returns the silhouette of a view that was cut along its edges; its outline is weak where the windows of the cut
-    disagree."""
+    disagree. ``counted`` are the pixels whose outline is judged; None for all."""
     alpha, holes = _without_specks(share, np.zeros_like(share))
     mask = alpha > 0.5
     undecided = dilated(np.abs(share - 0.5) < UNDECIDED, 1)
     rim = mask & ~eroded(mask, 1)
+    rim = rim if counted is None else rim & counted
     broad = cv2.blur(undecided.astype(np.float32), (UNDECIDED_PX, UNDECIDED_PX)) > UNDECIDED_FILLED
     weak = float(broad[rim].mean()) if rim.any() else 1.0
     figures = {"cut": 1.0, "weak_share": round(weak, 4)}
@@ -171,22 +179,35 @@ def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: Segmentati
     return decide(image, plates_for(image, plates), settings)
 
 
-def _refined(image: ImageRgb, decision: Decision, settings: SegmentationSettings) -> Silhouette:
-    """Returns the sub-pixel silhouette of a coarse decision, or an unusable one if the mask is too small."""
+def _refined(
+    image: ImageRgb,
+    decision: Decision,
+    settings: SegmentationSettings,
+    counted: Bool[np.ndarray, "h w"] | None = None,
+) -> Silhouette:
+    """Returns the sub-pixel silhouette of a coarse decision, or an unusable one if the mask is too small. ``counted``
+    are the pixels whose outline is judged; None for all."""
     if decision.mask.mean() < settings.least_area:
         return _nothing(image.shape[:2], decision.background)
     matte = solve_matte(image, decision, settings)
-    return _silhouette(matte, decision, settings)
+    return _silhouette(matte, decision, settings, counted)
 
 
-def _silhouette(matte: Matte, decision: Decision, settings: SegmentationSettings) -> Silhouette:
+def _silhouette(
+    matte: Matte, decision: Decision, settings: SegmentationSettings, counted: Bool[np.ndarray, "h w"] | None
+) -> Silhouette:
     alpha = np.zeros(decision.background.plates.shape[1:3], np.float32)
     coarse = cv2.resize(decision.probability.astype(np.float32), alpha.shape[::-1], interpolation=cv2.INTER_LINEAR)
     alpha[matte.box], holes = _without_specks(matte.alpha, coarse[matte.box])
     distance = distance_to_level(alpha)
-    weak = float((matte.contrast < settings.weak_contrast).mean()) if len(matte.contrast) else 1.0
-    # What lies beside the unsolved is right in four of five places: reason for a warning, not to leave the view out.
-    weak = max(weak, min(matte.unsure, settings.weak_share_unusable))
+    little = matte.contrast < settings.weak_contrast
+    if counted is not None:
+        rim = matte.alpha > 0.5
+        little = little[counted[matte.box][rim & ~eroded(rim, 1)]]
+    weak = float(little.mean()) if len(little) else 1.0
+    if counted is None:
+        # What lies beside the unsolved is right in four of five places: reason to warn, not to leave the view out.
+        weak = max(weak, min(matte.unsure, settings.weak_share_unusable))
     contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
     others = sum(a for a in decision.detached_component_areas if a > STRANGER_SHARE)
     background = decision.background

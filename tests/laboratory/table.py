@@ -56,6 +56,11 @@ EXPERIMENTS = {
         "Counts right, warned and silently wrong captures of living people.",
         {"others": inputs.facekit_or_none, "captures": inputs.folders_or_known},
     ),
+    "guards": Record(
+        "experiments.people.guards:guards",
+        "Counts false alarms and hits of every check that can refuse a capture.",
+        {"folders": inputs.folders_or_known},
+    ),
     "planted": Record("experiments.faults.planted:planted", "Runs whole jobs on pictures with faults of studios."),
     "visible": Record(
         "experiments.surface.visible:visible",

@@ -17,7 +17,7 @@ from pipeline.multiview.scene_points import ScenePoints, find_scene_points
 from pipeline.segmentation.background import coarse_size
 from pipeline.segmentation.foreground import Decision
 from pipeline.segmentation.without_plates.estimated_plate import decision_without_plate, plate_noise
-from pipeline.segmentation.without_plates.head_seed import HeadSeed
+from pipeline.segmentation.without_plates.head_seed import HeadSeed, head_core
 from pipeline.segmentation.without_plates.local_cut import COLUMNS, cut_views
 from pipeline.segmentation.without_plates.mask_search import search_masks
 from pipeline.segmentation.without_plates.standing_plane import NEAR, ball_above, standing_plane
@@ -27,6 +27,7 @@ from rig.rig import Rig
 
 POINTS_SHARE, MASKS_SHARE = 0.3, 0.6  # of the time, when they are there
 POINT_PX = 2  # of the reduced image: what is around a point is the same thing
+MIN_LEVEL = 0.8  # cosine between a table's normal and the face's up: a nod of 35 degrees
 MAX_PLATE_NOISE = 8.0  # levels by which the guess of a plate may be off; 2 to 4 before the studio's backdrops
 ALPHA_BLUR_PX = 1.0  # of the image that was cut
 
@@ -55,6 +56,8 @@ def decide_without_plates(
     points = find_scene_points(images, rig, report=partial(_between, report, 0.0, POINTS_SHARE))
     ball = viewing_ball(rig, None if head is None else head.centre_world)
     plane = standing_plane(points.points, *ball)
+    if plane is not None and head is not None and plane[:3] @ head.up_world < MIN_LEVEL:
+        plane = None  # a patterned shirt is as flat as a table, but upright
     if plane is not None:
         ball = ball_above(plane, points.points, *ball)
     volume = viewing_volume(rig, sizes, ball, plane_world=plane)
@@ -74,6 +77,8 @@ def decide_without_plates(
     report_cuts = partial(_between, report, MASKS_SHARE, 1.0)
     reduced = {name: _reduced(images[name], COLUMNS) for name in rig.names}
     cuts = cut_views(reduced, {name: one.mask for name, one in found.items()}, volume, report=report_cuts)
+    if head is not None:
+        cuts = {name: solid_around(head_core(head, rig[name], cut.shape), cut) for name, cut in cuts.items()}
     shares = {name: _enlarged(cuts[name], images[name].shape[:2]) for name in rig.names if name in cluttered}
     return WithoutPlates({name: one for name, one in decisions.items() if name not in cluttered}, shares)
 
@@ -96,6 +101,14 @@ def background_seen(
     for x, y in (points.pixels[name][behind] + 0.5) * (size[1] / width):
         cv2.circle(mask, (int(x), int(y)), POINT_PX, 1, -1)
     return mask.view(bool)
+
+
+def solid_around(core: Bool[np.ndarray, "h w"], share: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Returns the share of a person's cut, of which the head's ``core`` is part and that has no holes: a cut takes a
+    highlight on a forehead for the wall."""
+    subject = np.pad(((share > 0.5) | core).view(np.uint8), 1)
+    cv2.floodFill(subject, None, (0, 0), 2)
+    return np.where(core | ((subject[1:-1, 1:-1] == 0) & (share <= 0.5)), np.float32(1.0), share)
 
 
 def _reduced(image: UInt8[np.ndarray, "_ _ 3"], columns: int) -> UInt8[np.ndarray, "_ _ 3"]:

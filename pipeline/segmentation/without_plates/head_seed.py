@@ -77,6 +77,17 @@ def beside_head(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[n
     return (above > CHIN_MM) & (aside > HAIR_MM)
 
 
+def above_chin(seed: HeadSeed, camera: Camera, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """Returns the pixels of an image (``size``: height, width) that are not below the chin, where clothes begin."""
+    up_camera = camera.camera_from_world.rotation @ seed.up_world
+    chin = seed.centre_world + CHIN_MM * seed.skull_mm / SKULL_MM * seed.up_world
+    if camera.camera_from_world.apply(chin)[2] <= 0:
+        return np.ones(size, bool)
+    middle, up = camera.project(chin[None])[0], up_camera[:2]
+    row, column = np.ogrid[: size[0], : size[1]]
+    return (column - middle[0]) * up[0] + (row - middle[1]) * up[1] > 0
+
+
 @cache
 def _networks() -> FaceNetworks:
     return load_networks()

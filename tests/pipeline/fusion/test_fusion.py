@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.fusion.fusion import BustSurface, NoSurface, finished, fuse
+from pipeline.fusion.fusion import BustSurface, NoSurface, finished, fuse, mask_warnings
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import BustSettings
 from pipeline.stereo.depth_map import DepthMap
@@ -138,6 +138,17 @@ def test_wrong_mask_of_one_view_cuts_nothing_that_others_see(ball: Scene) -> Non
     assert errors.max() < 6.0  # a few vertices beside what the wrong mask leaves out, at the edge of what is seen
     assert [(warning.code, warning.text[:5]) for warning in surface.warnings] == [("mask-contradicted", "cam03")]
     assert surface.seen.sum() > 0.95 * fused(ball).seen.sum()
+
+
+def test_soft_masks_that_lack_a_little_in_every_view_warn_of_none() -> None:
+    names = [f"cam{k:02}" for k in range(16)]
+    soft = np.linspace(0.003, 0.015, 16)  # what published soft masks of sixteen cameras lack
+    assert [*mask_warnings(names, soft)] == []
+    one_cut = np.where(np.arange(16) == 5, 0.08, soft)
+    assert [warning.text[:5] for warning in mask_warnings(names, one_cut)] == ["cam05"]
+    alone = np.where(np.arange(16) == 5, 0.003, 0.0)
+    assert [warning.text[:5] for warning in mask_warnings(names, alone)] == ["cam05"]
+    assert len([*mask_warnings(names, np.full(16, 0.05))]) == 16
 
 
 @pytest.mark.slow

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.segmentation.segment import segment
-from pipeline.segmentation.without_plates.head_seed import HeadSeed, beside_head, head_core
+from pipeline.segmentation.without_plates.decide import solid_around
+from pipeline.segmentation.without_plates.head_seed import HeadSeed, above_chin, beside_head, head_core
 from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
@@ -47,6 +48,30 @@ def test_what_is_beside_the_head_holds_neither_head_nor_body() -> None:
     assert not (beside & core).any()
     below = camera.project(np.array([[0.0, 0.0, 0.0]]) - 200.0 * seed.up_world)[0] / 2
     assert below[1] >= 240 or not beside[int(below[1])].any()
+
+
+def test_clothes_are_below_the_chin_and_the_head_is_not() -> None:
+    camera = fan(640, 480).cameras[0]
+    seed = seed_at(np.zeros(3), camera)
+    above, core = above_chin(seed, camera, (480, 640)), head_core(seed, camera, (480, 640))
+    assert above[core].all()
+    chest = camera.project(-120.0 * seed.up_world[None])[0]
+    assert not above[int(chest[1]), int(chest[0])]
+
+
+def test_a_cut_keeps_the_head_and_has_no_holes() -> None:
+    core = np.zeros((40, 40), bool)
+    core[10:16, 10:30] = True
+    share = np.zeros((40, 40), np.float32)
+    share[8:36, 8:32] = 0.9
+    share[12, 12:20] = 0.1  # the forehead
+    share[24:28, 14:20] = 0.2  # a hole in the shirt
+    share[30:36, 20:22] = 0.3  # a gap that is open below
+    solid = solid_around(core, share)
+    assert (solid[core] > 0.5).all()
+    assert (solid[24:28, 14:20] > 0.5).all()
+    assert (solid[30:36, 20:22] < 0.5).all()
+    assert solid[:8].max() == 0.0
 
 
 @pytest.mark.slow
