@@ -40,8 +40,7 @@ def require(scope: str) -> Callable[..., Caller]:
         request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(bearer)]
     ) -> Caller:
         caller = _caller(request, credentials)
-        if not caller.may(scope):
-            raise Problem(403, "scope-missing", compose("key-lacks-scope", scope=f"{scope!r}"))
+        caller.check_may(scope)
         return caller
 
     return authenticate

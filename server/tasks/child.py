@@ -124,6 +124,11 @@ class Child:
                 self._kill()
             raise
 
+    @property
+    def runs(self) -> bool:
+        """Whether the child process has started and was not killed, so that the next piece of work begins at once."""
+        return self._process is not None
+
     def close(self) -> None:
         """Kills the child process. The next piece of work starts another."""
         self._kill()
@@ -182,19 +187,19 @@ class ChildProcessPool:
 
     def __init__(self, count: int, niceness: int = 0, memory: int = 0) -> None:
         self._all = [Child(niceness, memory=memory) for _ in range(count)]
-        self._free: queue.LifoQueue[Child] = queue.LifoQueue()
-        for child in self._all:
-            self._free.put(child)
+        self._free: queue.PriorityQueue[tuple[bool, int]] = queue.PriorityQueue()  # whether it is to be started; which
+        for number in range(count):
+            self._free.put((True, number))
 
     @contextmanager
     def one(self, timeout_s: float | None = None) -> Iterator[Child]:
-        """Yields a child that no other thread has during the block, waiting for one if needed. Raises queue.Empty if
+        """Yields a child that no other thread has during the block, a running one first. Raises queue.Empty if
         none is free within ``timeout_s`` seconds."""
-        child = self._free.get(timeout=timeout_s)
+        _, number = self._free.get(timeout=timeout_s)
         try:
-            yield child
+            yield self._all[number]
         finally:
-            self._free.put(child)
+            self._free.put((not self._all[number].runs, number))
 
     def close(self) -> None:
         """Kills all child processes."""

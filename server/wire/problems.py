@@ -13,6 +13,7 @@ from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from sqlalchemy.exc import DataError, DBAPIError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from rig.errors import EigenheadError, InputError
 from rig.messages.message import Message, MessageDocument, compose, documents_of, message_of
@@ -138,6 +139,8 @@ def problem_from(error: Exception) -> Problem:
     """Converts an error to a problem. An unexpected error is logged and becomes a 500 problem without details."""
     if isinstance(error, Problem):
         return error
+    if isinstance(error, ClientDisconnect):
+        error = Conflict("client-gone", compose("client-gone"))
     if isinstance(error, InputError):
         error = unusable_input(error)
     if isinstance(error, Refused):
@@ -185,7 +188,15 @@ def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:
             )
         return problem.response()
 
-    for kind in (Exception, EigenheadError, HTTPException, RequestValidationError, OSError, DBAPIError):
+    for kind in (
+        Exception,
+        EigenheadError,
+        ClientDisconnect,
+        HTTPException,
+        RequestValidationError,
+        OSError,
+        DBAPIError,
+    ):
         app.add_exception_handler(kind, answer)
 
 

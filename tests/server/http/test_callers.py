@@ -8,13 +8,14 @@ import pytest
 from fastapi import Request
 from fastapi.security import HTTPAuthorizationCredentials
 
+from server.errors import Forbidden
 from server.http.auth import require
-from server.services.keys import Caller, Keys
+from server.services.keys import SCOPES, Caller, Keys
 from server.settings import ServiceSettings
 from server.storage.database import open_database
 from server.wire.problems import Problem
 
-ALL = frozenset({"read", "capture", "submit", "admin"})
+ALL = frozenset(SCOPES)
 
 
 class Door:
@@ -113,9 +114,9 @@ def test_a_wrong_key_is_told_from_none(door: Door) -> None:
 
 def test_a_key_does_what_its_scopes_say(door: Door) -> None:
     reader, chief = door.keys.add("lab", ("read",)), door.keys.add("chief", ("admin",))
-    status, kind, detail, _ = door.refusal("submit", reader)
-    assert (status, kind) == (403, "scope-missing")
-    assert detail == "This key may not do that: it lacks the scope 'submit'."
+    with pytest.raises(Forbidden, match="it lacks the scope 'submit'") as refused:
+        door.ask("submit", reader)
+    assert refused.value.kind == "scope-missing"
     assert door.ask("submit", chief).scopes == frozenset({"admin"})
 
 

@@ -1,5 +1,6 @@
 """What an upload may cost others: metadata, time, memory and places, at one real service with two keys."""
 
+import socket
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -84,3 +85,24 @@ def test_a_slow_check_keeps_no_other_key_waiting_and_ends(
         assert time.monotonic() - began < CHECK_S
         answer = upload(attacker, slow)
     assert (answer.status_code, answer.json()["detail_message"]["code"]) == (422, "check-too-long")
+
+
+def test_a_client_who_goes_in_the_midst_of_a_body_is_no_fault_of_the_service(
+    service: RunningService, keys: list[str]
+) -> None:
+    with client(service, keys[0]) as http:
+        made = http.post("/v1/uploads", headers={"Tus-Resumable": "1.0.0", "Upload-Length": "1000"})
+    head = (
+        f"PATCH {made.headers['Location']} HTTP/1.1\r\nHost: localhost\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n"
+    )
+    head += f"Authorization: Bearer {keys[0]}\r\nContent-Type: application/offset+octet-stream\r\n"
+    with socket.create_connection(("127.0.0.1", service.port)) as sock:
+        sock.sendall(head.encode() + b"Content-Length: 1000\r\n\r\n" + bytes(100))
+        time.sleep(0.3)
+    deadline = time.monotonic() + 10
+    while "method=PATCH" not in service.log.read_text():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    (line,) = (line for line in service.log.read_text().splitlines() if "method=PATCH" in line)
+    assert "status=409" in line
+    assert "unforeseen" not in service.log.read_text()
