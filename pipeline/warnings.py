@@ -7,6 +7,7 @@ from typing import Literal
 from rig.messages.message import Message
 
 WARNING_CODES = (
+    "bust-guessed",
     "camera-gain",
     "camera-moved",
     "cameras-exchanged",

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 
-from pipeline.detail.untangling import Topology, topology_of, untangled
+from pipeline.fusion.untangling import Topology, topology_of, untangled
 from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.part_labels.codes import Part

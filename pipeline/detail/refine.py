@@ -35,7 +35,7 @@ from pipeline.detail.solve import (
     solve_field,
 )
 from pipeline.detail.surface_points import SurfacePoints, thinned
-from pipeline.detail.untangling import untangled_head
+from pipeline.fusion.untangling import untangled_head
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions

@@ -1,6 +1,4 @@
-"""Removes self-intersections of a mesh. Where it crosses itself, vertices move to the middle of their neighbours, which
-smooths out a crumpled patch where it lies; and if that is no help, back towards positions at which it cannot cross.
-"""
+"""Finds triangles of a mesh that cross each other, and separates vertices that coincide."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,13 +10,8 @@ from pipeline.fusion.grid_kernels import grown
 from pipeline.geometry.cells import sorted_into_cells
 from rig.mesh import Mesh
 
-MAX_ROUNDS = 46
 APART_SHARE = 0.05  # of the way to the middle of a vertex's neighbours: some 0.03 mm
 SIZES = 4  # classes of triangles, each half as wide as the last
-SMOOTHINGS = 6  # rounds in which vertices go to the middle of their neighbours: after five an oily head crossed no more
-HALVINGS = (
-    6  # rounds after them in which vertices go half their way; later ones go all of it, and take their neighbours along
-)
 
 
 def crossing_faces(
@@ -76,44 +69,6 @@ def _near(boxes: Float[np.ndarray, "f 6"], active: Bool[np.ndarray, " f"]) -> Bo
     taken = np.zeros(cell.max(axis=0, initial=0) + 2, bool)
     taken[tuple(cell[active].T)] = True
     return grown(taken)[tuple(cell.T)]
-
-
-@traced
-def without_crossings(mesh: Mesh, safe: Float[np.ndarray, "v 3"]) -> tuple[Mesh, int]:
-    """Moves vertices of crossing triangles to the middle of their neighbours, then towards their ``safe`` positions,
-    until no triangles cross. Returns the mesh and the number of vertices moved. With all vertices at ``safe`` the mesh
-    must not cross itself."""
-    vertices, faces = mesh.vertices.copy(), mesh.faces
-    moved = np.zeros(len(vertices), bool)
-    active: Bool[np.ndarray, " f"] | None = None
-    for done in range(MAX_ROUNDS):
-        crossing = crossing_faces(vertices, faces, active)
-        if not crossing.any():
-            break
-        back = np.zeros(len(vertices), bool)
-        back[faces[crossing]] = True
-        later = done - SMOOTHINGS
-        for _ in range(max(0, later - HALVINGS + 1)):
-            back[faces[back[faces].any(axis=1)]] = True
-        if later < 0:
-            vertices[back] = _middles(vertices, faces, back)
-        else:
-            share = 0.5 if later < HALVINGS else 0.0
-            vertices[back] = safe[back] + share * (vertices[back] - safe[back])
-        moved |= back
-        active = np.asarray(back[faces].any(axis=1))
-    return Mesh(vertices, faces), int(moved.sum())
-
-
-def _middles(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], chosen: Bool[np.ndarray, " v"]
-) -> Float[np.ndarray, "n 3"]:
-    """Returns the mean of the neighbours of each chosen vertex of a closed mesh."""
-    corners = faces[chosen[faces].any(axis=1)]
-    first, second = corners.ravel(), np.roll(corners, -1, axis=1).ravel()  # a closed mesh has each edge both ways
-    count = np.bincount(first, minlength=len(vertices))[chosen]
-    total = [np.bincount(first, vertices[second, axis], len(vertices))[chosen] for axis in range(3)]
-    return np.stack(total, axis=1) / count[:, None]
 
 
 @traced

@@ -2,8 +2,8 @@
 
 Enters: depth maps, silhouettes and the fitted head. Leaves: a two-manifold mesh with a standard deviation and a part
 for each vertex. A signed distance is computed on a grid (``signed_distance``); its zero becomes a mesh
-(``pipeline.geometry.surface_nets``); the vertices are moved to the depth maps (``refinement``), and back where the mesh
-would cross itself (``crossings``).
+(``pipeline.geometry.surface_nets``); the vertices are moved to the depth maps (``refinement``) and to the fitted head
+(``skin``); what is then turned, folded or crossing is mended (``untangling``).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,14 +14,15 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
-from pipeline.fusion.crossings import without_coincidences, without_crossings
+from pipeline.fusion.crossings import without_coincidences
 from pipeline.fusion.hair_outline import STRAND_SHARE, grown_to_outlines
 from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
 from pipeline.fusion.refinement import Measured, refine_vertices
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
 from pipeline.fusion.silent_hair import SilentHair, shell_deviation_mm
-from pipeline.fusion.skin import HeadSkin, drawn_to_skin
+from pipeline.fusion.skin import HeadSkin, combine_with_head
+from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, topology_of, untangled
 from pipeline.fusion.view_stack import stack_views
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.normals import normals_of
@@ -48,13 +49,15 @@ CONTRADICTED_WARNED = 0.002  # of a view's crop: what its outline leaves out and
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BustSurface:
-    """Holds the whole visible surface: one closed two-manifold piece, facing outwards, without self-intersections."""
+    """Holds the whole visible surface: one closed two-manifold piece that faces outwards. ``faults`` counts what is
+    wrong with its triangles after their repair, in single precision."""
 
     mesh_world: Mesh
     deviation_mm: Float[np.ndarray, " v"]  # standard deviation along the normal
     part: UInt8[np.ndarray, " v"]  # codes of ``Part``
     views: UInt8[np.ndarray, " v"]  # whose depth agrees with the place
     warnings: tuple[ReportWarning, ...] = ()
+    faults: MeshFaults = CLEAN
 
     @property
     def seen(self) -> Bool[np.ndarray, " v"]:
@@ -68,7 +71,6 @@ class DepthSurface:
     itself."""
 
     mesh_world: Mesh
-    safe_world: Float[np.ndarray, "v 3"]  # places (mm) with which the mesh cannot cross itself
     measured: Measured
     warnings: tuple[ReportWarning, ...]
     shell_deviation_mm: float | None = None  # of hair that is a guess inside its outlines; None without such hair
@@ -107,7 +109,7 @@ def fuse(
     report("bust", 0.1)
     level = solve(maps, views, head_world, settings.spacing_mm, hair)
     report("bust", 0.6)
-    net, safe = closed_net(level, head_world)
+    net = closed_net(level, head_world)
     report("bust", 0.8)
     mesh, measured = refine_vertices(net, views, settings.spacing_mm)
     measured = without_islands(mesh, measured)
@@ -115,7 +117,7 @@ def fuse(
     warnings = tuple(mask_warnings(names, contradicted))
     straight = without_bias(mesh, measured.views > 0, bias)
     shell_mm = None if hair is None else shell_deviation_mm(hair, views)
-    return DepthSurface(straight, safe, measured, warnings, shell_mm)
+    return DepthSurface(straight, measured, warnings, shell_mm)
 
 
 @traced
@@ -132,7 +134,7 @@ def finished(
     Args:
         surface: from the depth maps.
         votes: which part each point shows; None counts all that is seen as skin.
-        head: the part of the fitted head that photographs measured; None if there is none.
+        head: the delivered head with its deviation; None if there is none.
         silhouettes: by camera.
         rig: the cameras as calibrated, world frame.
     """
@@ -142,18 +144,21 @@ def finished(
     shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
     if head is not None:
         skin = 1.0 if shares is None else shares[:, Part.SKIN.channel]
-        mesh = drawn_to_skin(mesh, seen * skin, head, seen_deviation_mm(measured))
+        mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured))
     moved_mm = np.zeros(len(seen))
     if shares is not None and surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, shares[:, Part.HAIR.channel], silhouettes, rig)
-    mesh, _ = without_crossings(mesh, surface.safe_world)
-    mesh = without_coincidences(mesh)
+    topology = topology_of(mesh.faces, len(seen))
+    clean = without_coincidences(Mesh(untangled(mesh.vertices, topology), mesh.faces))
+    mended_mm = np.linalg.norm(clean.vertices - mesh.vertices, axis=1)
+    mesh = clean
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
-    deviation = np.hypot(deviation_mm(mesh, measured), STRAND_SHARE * moved_mm)
+    deviation = np.hypot(np.hypot(deviation_mm(mesh, measured), STRAND_SHARE * moved_mm), mended_mm)
     if surface.shell_deviation_mm is not None:
         guessed = ~seen & facing_a_camera(mesh, rig)
         deviation[guessed] = np.minimum(deviation[guessed], surface.shell_deviation_mm)
-    return BustSurface(mesh, deviation, part, measured.views, surface.warnings)
+    faults = mesh_faults(mesh.vertices.astype(np.float32).astype(float), topology)
+    return BustSurface(mesh, deviation, part, measured.views, surface.warnings, faults)
 
 
 def facing_a_camera(mesh_world: Mesh, rig: Rig) -> Bool[np.ndarray, " v"]:
@@ -175,21 +180,18 @@ def mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -
 
 
 @traced
-def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
-    """Returns the mesh of the zero level, only the piece that is the subject, and safe positions of its vertices (mm,
-    world frame): with every vertex in the middle of its cell the mesh cannot cross itself."""
+def closed_net(level: Level, head_world: Mesh | None) -> Mesh:
+    """Returns the mesh of the zero level (mm, world frame), only the piece that is the subject."""
     grid, field = level.grid, level.field.copy()
     compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
     net = surface_net(field, grid.index, grid.neighbours)
-    vertices, faces, cells = net.vertices, net.faces, np.flatnonzero(net.of_cell >= 0)
+    vertices, faces = net.vertices, net.faces
     head = None if head_world is None else (head_world.vertices - grid.corner) / grid.step_mm
     kept = _subject(vertices, faces, head)
     taken = np.zeros(len(vertices), bool)
     taken[faces[kept]] = True
-    used, row = np.flatnonzero(taken), np.cumsum(taken, dtype=np.int32) - 1
-    placed = grid.corner + grid.step_mm * vertices[used]
-    safe = grid.corner + grid.step_mm * (grid.index[cells[used]] + 0.5)
-    return Mesh(placed, row[faces[kept]]), safe
+    row = np.cumsum(taken, dtype=np.int32) - 1
+    return Mesh(grid.corner + grid.step_mm * vertices[taken], row[faces[kept]])
 
 
 def _subject(

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.fusion.net_kernels import component_of
 from pipeline.fusion.refinement import Measured
@@ -34,13 +34,16 @@ def deviation_mm(mesh: Mesh, measured: Measured) -> Float[np.ndarray, " v"]:
     """Returns the standard deviation (mm) of each vertex along its normal. Seen vertices have that of
     ``seen_deviation_mm``; the others a guess that grows with the distance to the nearest seen vertex."""
     seen = measured.views > 0
-    out = np.full(len(seen), MAX_MM)
-    if not seen.any():
-        return out
-    out[seen] = seen_deviation_mm(measured)[seen]
-    known = mesh.vertices[seen][::EVERY]
-    far, _ = nearest(PointTree.of(known), mesh.vertices[~seen])
-    out[~seen] = np.minimum(EDGE_MM + SLOPE * far, MAX_MM)
+    return np.where(seen, seen_deviation_mm(measured), guessed_deviation_mm(mesh.vertices, seen))
+
+
+def guessed_deviation_mm(vertices: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    """Returns the standard deviation (mm) of the guess at every vertex that no view sees, from its distance to those
+    that one sees; 0 for these."""
+    out = np.where(seen, 0.0, MAX_MM)
+    if seen.any():
+        far, _ = nearest(PointTree.of(vertices[seen][::EVERY]), vertices[~seen])
+        out[~seen] = np.minimum(EDGE_MM + SLOPE * far, MAX_MM)
     return out
 
 

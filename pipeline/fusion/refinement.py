@@ -36,11 +36,11 @@ def refine_vertices(mesh_world: Mesh, views: ViewStack, step_mm: float) -> tuple
     """Moves the vertices along their normals to where the depth maps see the surface. Returns the moved mesh, and the
     views' measurements at its vertices."""
     starts, indices = neighbours(mesh_world.faces, len(mesh_world.vertices))
-    mesh = mesh_world
+    mesh, root = mesh_world, np.full(len(mesh_world.vertices), np.sqrt(STIFFNESS))
     for _ in range(ROUNDS):
         normals = vertex_normals(mesh.vertices, mesh.faces)
         found = measure_vertices(mesh, normals, views, GATE_STEPS * step_mm)
-        moved = smooth_offsets(found.offset_mm, found.information, starts, indices, STIFFNESS, SWEEPS)
+        moved = smooth_offsets(found.offset_mm, found.offset_mm, found.information, starts, indices, root, SWEEPS, 1.0)
         mesh = Mesh(mesh.vertices + np.clip(moved, -step_mm, step_mm)[:, None] * normals, mesh.faces)
     normals = vertex_normals(mesh.vertices, mesh.faces)
     return mesh, measure_vertices(mesh, normals, views, AGREEMENT_MM)

@@ -104,25 +104,30 @@ def depth_between(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def smooth_offsets(
+    start: np.ndarray,
     offset: np.ndarray,
     information: np.ndarray,
     starts: np.ndarray,
     indices: np.ndarray,
-    stiffness: float,
+    root_stiffness: np.ndarray,
     sweeps: int,
+    factor: float,
 ) -> np.ndarray:
-    """Returns offsets (n) smoothed over the mesh: by ``sweeps`` of Gauss-Seidel it minimises ``sum information (d -
-    offset)^2 + stiffness sum over edges (d - d')^2``. The neighbours of vertex v are ``indices[starts[v]:starts[v +
-    1]]``."""
-    out = offset.copy()
+    """Returns offsets d (n) smoothed over the mesh: by ``sweeps`` of Gauss-Seidel from ``start``, over-relaxed by
+    ``factor``, it minimises ``sum information (d - offset)^2 + sum over edges r r' (d - d')^2``, with the
+    ``root_stiffness`` r of the edge's ends. The neighbours of vertex v are ``indices[starts[v]:starts[v + 1]]``."""
+    out = start.copy()
     for _ in range(sweeps):
         for v in range(len(out)):
+            if root_stiffness[v] == 0.0:
+                continue
             total, weight = information[v] * offset[v], information[v]
             for k in range(starts[v], starts[v + 1]):
-                total += stiffness * out[indices[k]]
-                weight += stiffness
-            if weight > 0:
-                out[v] = total / weight
+                edge = root_stiffness[v] * root_stiffness[indices[k]]
+                total += edge * out[indices[k]]
+                weight += edge
+            if weight > 0.0:
+                out[v] += factor * (total / weight - out[v])
     return out
 
 

@@ -1,17 +1,19 @@
-"""Combines the fused surface with the fitted head where both show the same skin. The head is a second measurement of
-it, from its own shape and from patches that have no window bias.
+"""Combines the fused surface with the fitted head: the head is the prior of skin, depth is data.
 
-Where the two lie as far apart as their errors, the vertex moves to their weighted mean, in which noisy places of the
-surface count less. Where they lie farther apart, the surroundings decide. If most of them agree with the head, the
-vertex is in a crater or on a speck (a chance match, the rest of a highlight), and moves to the head. If not, one of the
-two shows something else (hair, a fold that the head lacks, a wrong head), and the vertex stays. Where silhouettes hold
-the head, the two count as agreed, however far apart they lie: on an oily tip of the nose all windows err alike, and
-outlines show it in profile. What no view sees is skin, too, where seen skin encloses it: gaps of a few vertices would
-stand as pits.
+Each vertex of the surface has a height over the closest point of the head. The estimated heights u minimise
 
-What the two differ by over whole neighbourhoods is no noise of the surface: the head has the wrong shape there. Where
-that is much of the skin, by what the head states about itself, the model cannot make this subject (a statue, say), its
-details are wrong as well, and the surface stays as it is.
+    sum_i w_i (d_i - u_i)^2 / (n_i s_i^2)  +  sum_i p_i k_i (u_i / l)^2  +  sum_(i, j) sqrt(k_i k_j) (u_i - u_j)^2,
+
+with the measured heights d and their standard deviation s, of which n neighbours err alike; the probability p that a
+place is skin; and the stiffness k of the head's own error, the inverse of its variance. So a noisy place takes the
+head's shape, a place without depth follows the head at the height of its rim, and a head that states a large error
+leaves the surface as depth shows it. Hair (p = 0) stays where it is, and fades into skin by p.
+
+Which of the two is wrong where they contradict each other is decided by both deviations: w falls where a measured
+height differs from the estimate by several times the deviation of both (Geman and McClure's weights, from wide to
+narrow). A crater or a speck is rejected so, being alone; a whole neighbourhood that lies elsewhere (hair over skin, an
+open mouth) moves the estimate and stays. What depth and head differ by over a neighbourhood enlarges the head's
+deviation there: it states less than that where the model cannot make the subject (a statue, say).
 """
 
 from dataclasses import dataclass
@@ -20,120 +22,129 @@ import numpy as np
 from jaxtyping import Bool, Float, Int32, Int64
 
 from pipeline.compute.trace import traced
+from pipeline.fusion.prior import near_rim
+from pipeline.fusion.quality import guessed_deviation_mm
 from pipeline.fusion.refinement import neighbours
-from pipeline.fusion.refinement_kernels import blurred_over_mesh
+from pipeline.fusion.refinement_kernels import blurred_over_mesh, smooth_offsets
+from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_index import SurfaceIndex
-from rig.mesh import Mesh
+from rig.mesh import Mesh, face_normals
 
-# The head's share of the mean, where skin has texture: against the truth of two captures and two studio heads, better
-# than 0.5 and 1. The surface's share falls by its variance (inverse-variance weights) from this deviation on, in mm.
-HEAD_SHARE, TEXTURED_MM = 0.7, 0.12
-SAME_MM = 1.0  # distance at which agreement has fallen to 1 / e, at least ...
-# ... and so many of the deviations that the surface states about a place: 0.15 mm where skin has texture, where 1 mm
-# prevails, 0.39 at 512 x 384 with noise of 6 levels. Normals' p95 there: 32 degrees without it, 25 at 4, 23 at 6.
-SAME_DEVIATIONS = 6.0
+Adjacency = tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]]
+
+REACH_MM = 15.0  # height over the head above which the surface is something else (hair, a collar, a hand)
 SURROUNDINGS = 24  # steps of a mean over neighbours: 5 mm (standard deviation) where vertices are 1.5 mm apart
-CONSENT = (0.5, 0.75)  # mean agreement of the surroundings from which on the head counts, and counts whole
-ENCLOSED = (0.5, 0.75)  # mean probability of seen skin around what no view sees, from which on that is skin, and surely
-# The upper quartile of the distances of the two over neighbourhoods, by the head's median deviation, up to which the
-# head counts whole and from which on it counts for nothing: 0.25 to 0.33 of scan-a, draw-b and scan-a's oily version,
-# 0.40 under a beard, 0.54 of a studio head of oily skin, 0.84 of the photographs of a Buddha, whose head
-# the model cannot make.
-WRONG_SHAPE = (0.6, 0.8)
-QUARTILE, SURELY = 0.75, 0.5  # probability from which on a vertex counts as skin there
-FARTHEST = 4.0  # times as far nothing of that share is left
-CANDIDATES = 3  # triangles looked at for each vertex: twice as fast as six, off by more than 0.01 mm in one of 100
+# Radius within which depths err alike (highlights, shading, repeated patterns), and guesses of what no view sees.
+CORRELATED_MM, GUESSES_CORRELATED_MM = 16.0, 5.0
+MIN_DEVIATION_MM = 0.12  # of depth and of the head: what neither states (cameras, shading)
+STIFFNESS = 0.4  # of the head's error by its inverse variance
+LENGTH_MM = 7.5  # over which the head's error falls to zero on skin
+SURE_MM = 1.0  # deviation of a head from which on its error is no longer smooth: ears lie beside their place
+OUTLIER_DEVIATIONS = 3.0  # of depth and head together: the scale of Geman and McClure's weights ...
+NARROWING = (8.0, 4.0, 2.0, 1.0)  # ... and by what it is multiplied, round after round
+SWEEPS, OVER_RELAXATION = 16, 1.6  # in each round
+CANDIDATES = 3  # triangles compared for each vertex: twice as fast as six, off by more than 0.01 mm in one of 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadSkin:
-    """Holds the part of the fitted head's skin that photographs measured."""
+    """Holds the delivered head as the prior of skin."""
 
     mesh_world: Mesh  # mm
-    deviation_mm: Float[np.ndarray, " v"]  # standard deviation of each vertex
-    outlined: Float[np.ndarray, " v"]  # how far silhouettes hold each vertex, 0 to 1
+    deviation_mm: Float[np.ndarray, " v"]  # standard deviation of each vertex along its normal
 
 
-def measured_skin(
-    head_world: Mesh,
-    deviation_mm: Float[np.ndarray, " v"],
-    measured: Bool[np.ndarray, " v"],
-    outlined: Float[np.ndarray, " v"] | None = None,
-) -> HeadSkin:
-    """Returns the head's triangles whose corners are all ``measured``. If ``outlined`` is None, no outline speaks for
-    the head."""
-    faces = head_world.faces[measured[head_world.faces].all(axis=1)]
-    held = np.zeros(len(deviation_mm)) if outlined is None else outlined
-    return HeadSkin(Mesh(head_world.vertices, faces), deviation_mm, held)
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightField:
+    """Holds what n vertices of a surface measure over a head."""
+
+    row: Int64[np.ndarray, " n"]  # vertices that have a height
+    height_mm: Float[np.ndarray, " n"]
+    normal: Float[np.ndarray, "n 3"]  # of the head, along which heights are measured
+    deviation_mm: Float[np.ndarray, " n"]  # that the head states
 
 
 @traced
-def drawn_to_skin(
+def combine_with_head(
     mesh_world: Mesh, skin: Float[np.ndarray, " v"], head: HeadSkin, deviation_mm: Float[np.ndarray, " v"]
 ) -> Mesh:
-    """Moves the vertices of skin towards the closest point of the fitted head, to the weighted mean or all the way.
+    """Moves the vertices of skin along the head's normals to the estimate from depth and head.
 
     Args:
-        mesh_world: the fused surface, mm.
+        mesh_world: the fused surface, closed, mm.
         skin: probability that a vertex shows skin; 0 where no view sees it.
-        head: its skin, as far as photographs measured it.
-        deviation_mm: standard deviation along the normal; 0 where no view sees the vertex.
+        head: the delivered head.
+        deviation_mm: standard deviation of depth along the normal; 0 where no view sees the vertex.
     """
-    vertices = mesh_world.vertices.copy()
-    beside = neighbours(mesh_world.faces, len(vertices))
-    noise_mm = mean_around(beside, deviation_mm, skin)
-    same_mm = np.maximum(SAME_MM, SAME_DEVIATIONS * noise_mm)
-    reach = FARTHEST * float(same_mm.max(initial=SAME_MM))
-    low, high = head.mesh_world.vertices.min(axis=0) - reach, head.mesh_world.vertices.max(axis=0) + reach
-    enclosed = _ramp(mean_around(beside, skin, np.ones(len(vertices))), ENCLOSED)
-    drawn = np.where(deviation_mm > 0.0, skin, enclosed)
-    candidates = np.flatnonzero((drawn > 0.0) & ((vertices > low) & (vertices < high)).all(axis=1))
-    if not len(candidates) or not len(head.mesh_world.faces):
+    seen = deviation_mm > 0.0
+    field = heights_over(head, mesh_world)
+    if not len(field.row) or not seen.any():
         return mesh_world
-    normals = normals_of(mesh_world)[candidates]
-    hit = SurfaceIndex(head.mesh_world.vertices, head.mesh_world.faces).closest(vertices[candidates], CANDIDATES)
-    same = (hit.distances <= FARTHEST * same_mm[candidates]) & ((hit.normals * normals).sum(axis=1) >= 0.0)
-    agreement, shown = np.zeros(len(vertices)), np.zeros(len(vertices))
-    agreement[candidates] = same * np.exp(-((hit.distances / same_mm[candidates]) ** 2))
-    shown[candidates] = skin[candidates]
-    held = same * (head.outlined[head.mesh_world.faces[hit.triangles]] * hit.weights).sum(axis=1)
-    near, agreement[candidates] = agreement[candidates], np.maximum(agreement[candidates], held)
-    around = mean_around(beside, agreement, shown)[candidates]
-    consent = np.maximum(_ramp(around, CONSENT), held)
-    head_share = 1.0 - (1.0 - HEAD_SHARE) * (TEXTURED_MM / np.maximum(noise_mm[candidates], TEXTURED_MM)) ** 2
-    share = drawn[candidates] * same * np.maximum(head_share * near, consent * (1.0 - (1.0 - head_share) * near))
-    apart_mm, compared = np.zeros(len(vertices)), np.zeros(len(vertices))
-    apart_mm[candidates] = ((hit.points - vertices[candidates]) * hit.normals).sum(axis=1)
-    compared[candidates] = skin[candidates] * same
-    stated_mm = (head.deviation_mm[head.mesh_world.faces[hit.triangles]] * hit.weights).sum(axis=1)
-    offset_mm = mean_around(beside, np.clip(apart_mm, -same_mm, same_mm), compared)[candidates]
-    share *= trust_of(offset_mm, stated_mm, compared[candidates])
-    vertices[candidates] += share[:, None] * (hit.points - vertices[candidates])
+    count, row = len(seen), field.row
+    beside = neighbours(mesh_world.faces, count)
+    share = skin_share(beside, mesh_world.vertices, skin, seen)
+    around_mm = mean_around(beside, deviation_mm, seen.astype(float))
+    noise_mm = np.where(seen, np.maximum(deviation_mm, around_mm), guessed_deviation_mm(mesh_world.vertices, seen))
+    noise_mm = np.hypot(noise_mm, MIN_DEVIATION_MM)
+    height, stated_mm, within = np.zeros(count), np.zeros(count), np.zeros(count)
+    height[row], stated_mm[row], within[row] = field.height_mm, np.hypot(field.deviation_mm, MIN_DEVIATION_MM), 1.0
+    most = 4.0 * np.hypot(noise_mm, stated_mm)
+    shown = within * seen * skin
+    offset = within * mean_around(beside, np.clip(height, -most, most), shown)
+    head_mm = np.sqrt(stated_mm**2 + mean_around(beside, offset**2, shown))
+    unsure = np.maximum(head_mm / SURE_MM, 1.0)
+    stiffness = within * STIFFNESS / (np.maximum(head_mm, MIN_DEVIATION_MM) * unsure) ** 2
+    area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / count
+    pull = share * stiffness * area_mm2 / LENGTH_MM**2
+    alike = np.pi * np.where(seen, CORRELATED_MM, GUESSES_CORRELATED_MM) ** 2 / area_mm2
+    information = within / (noise_mm**2 * np.maximum(alike, 1.0))
+    both_mm, root = np.hypot(noise_mm, head_mm), np.sqrt(stiffness)
+    estimate = offset
+    for narrowing in NARROWING:
+        off = (height - estimate) / (OUTLIER_DEVIATIONS * narrowing * both_mm)
+        data = information / (1.0 + off**2) ** 2
+        total = data + pull
+        target = data * height / np.maximum(total, 1e-12)
+        estimate = smooth_offsets(estimate, target, total, *beside, root, SWEEPS, OVER_RELAXATION)
+    vertices = mesh_world.vertices.copy()
+    vertices[row] += (share * (estimate - height))[row, None] * field.normal
     return Mesh(vertices, mesh_world.faces)
 
 
-def _ramp(values: Float[np.ndarray, " n"], ends: tuple[float, float]) -> Float[np.ndarray, " n"]:
-    """Returns 0 up to the first end, 1 from the second on, and a straight line between them."""
-    return np.clip((values - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
+def heights_over(head: HeadSkin, mesh_world: Mesh) -> HeightField:
+    """Returns the heights of the surface's vertices over the head, of those that lie within ``REACH_MM`` of it, face
+    its way, and are not beside the open rim of its neck."""
+    vertices, normals, skin = mesh_world.vertices, normals_of(mesh_world), head.mesh_world
+    low, high = skin.vertices.min(axis=0) - REACH_MM, skin.vertices.max(axis=0) + REACH_MM
+    row = np.flatnonzero(((vertices > low) & (vertices < high)).all(axis=1))
+    hit = SurfaceIndex(skin.vertices, skin.faces).closest(vertices[row], CANDIDATES, facing=normals[row])
+    corner = skin.faces[hit.triangles]
+    normal = np.einsum("nk,nkx->nx", hit.weights, normals_of(skin)[corner])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    near = (hit.distances < REACH_MM) & ((hit.normals * normals[row]).sum(axis=1) > 0.0)
+    near &= ~near_rim(skin, hit.points)
+    height = ((vertices[row] - hit.points) * normal).sum(axis=1)
+    deviation_mm = (head.deviation_mm[corner] * hit.weights).sum(axis=1)
+    return HeightField(row[near], height[near], normal[near], deviation_mm[near])
 
 
-def trust_of(
-    offset_mm: Float[np.ndarray, " n"], stated_mm: Float[np.ndarray, " n"], skin: Float[np.ndarray, " n"]
-) -> float:
-    """Returns how far the head may be believed, 0 to 1, from its distance to the surface over each place's
-    surroundings, its own standard deviation there, and the probability that both show the same skin."""
-    sure = skin > SURELY
-    if not sure.any():
-        return 1.0
-    wrong = float(np.quantile(np.abs(offset_mm[sure]), QUARTILE)) / max(float(np.median(stated_mm[sure])), 1e-6)
-    return float(np.clip((WRONG_SHAPE[1] - wrong) / (WRONG_SHAPE[1] - WRONG_SHAPE[0]), 0.0, 1.0))
+def skin_share(
+    beside: Adjacency,
+    vertices: Float[np.ndarray, "v 3"],
+    skin: Float[np.ndarray, " v"],
+    seen: Bool[np.ndarray, " v"],
+) -> Float[np.ndarray, " v"]:
+    """Returns the probability that each vertex shows skin; where no view sees it, that of what is seen nearest."""
+    rim = np.flatnonzero(seen)
+    nearest_seen = nearest(PointTree.of(vertices[rim]), vertices[~seen])[1]
+    share = skin.copy()
+    share[~seen] = mean_around(beside, skin, seen.astype(float))[rim[nearest_seen]]
+    return np.where(seen, share, mean_around(beside, share, np.ones(len(seen))))
 
 
 def mean_around(
-    beside: tuple[Int64[np.ndarray, " s"], Int32[np.ndarray, " e"]],
-    values: Float[np.ndarray, " v"],
-    weight: Float[np.ndarray, " v"],
+    beside: Adjacency, values: Float[np.ndarray, " v"], weight: Float[np.ndarray, " v"]
 ) -> Float[np.ndarray, " v"]:
     """Returns, for each vertex of a closed mesh, the weighted mean of the values over its surroundings
     (``SURROUNDINGS`` steps); about 0 where no weight is near. ``beside`` are its ``neighbours``."""

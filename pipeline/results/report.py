@@ -266,6 +266,11 @@ def _bust(bust: Bust) -> BustReport:
         "parts": {name: float(np.mean(surface.part == code)) for code, name in enumerate(PART_NAMES)},
         "quality": {"median_seen": _finite(median), "max": _finite(surface.deviation_mm.max())},
         "filled": int(np.count_nonzero(bust.views == 0)),
+        "flipped": surface.faults.turned,
+        "folded": surface.faults.folded,
+        "crossing": surface.faults.crossing,
+        "face_silent_share": bust.shaped.face_silent_share,
+        "guessed_share": bust.shaped.guessed_share,
     }
 
 

@@ -152,7 +152,9 @@ class HairReport(TypedDict):
 
 
 class BustReport(TypedDict):
-    """Describes the bust, the whole visible surface. ``closed`` says whether every edge has two faces."""
+    """Describes the bust, the whole visible surface. ``closed`` says whether every edge has two faces. ``flipped`` and
+    ``crossing`` count triangles, ``folded`` counts edges. Of its vertices on the face, ``face_silent_share`` is the
+    share that no view's depth agrees with, and ``guessed_share`` the share that the head did not measure either."""
 
     spacing_mm: float
     vertices: int
@@ -162,6 +164,11 @@ class BustReport(TypedDict):
     parts: dict[str, float]
     quality: dict[str, float | None]
     filled: int
+    flipped: int
+    folded: int
+    crossing: int
+    face_silent_share: float
+    guessed_share: float
 
 
 class SkinReport(TypedDict):

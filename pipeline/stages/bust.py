@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.silent_hair import find_silent_hair
-from pipeline.fusion.skin import measured_skin
+from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.raster import depth_maps
 from pipeline.stages.context import ReconstructionContext
@@ -23,6 +23,20 @@ from rig.capture import Capture
 from rig.mesh import Mesh, vertex_normals
 from rig.messages.message import compose
 
+# Of the face: the message is for an operator who takes the bust for a measurement.
+MAX_GUESSED_SHARE = 0.1
+FACE_REACH_MM = 10.0  # from the head's face: what lies farther in front of it is hair, a hand or a garment
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShapedBust:
+    """Holds the surface of the bust. Of its vertices on the face, ``face_silent_share`` (0 to 1) is the share that no
+    view's depth agrees with, and ``guessed_share`` the share that the refined head did not measure either."""
+
+    surface: BustSurface
+    face_silent_share: float
+    guessed_share: float
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bust:
@@ -30,11 +44,16 @@ class Bust:
     images that coloured each vertex; 0 if its colour was filled from its neighbours. ``spacing_mm`` is the grid's
     spacing."""
 
-    surface: BustSurface
+    shaped: ShapedBust
     normals: Float[np.ndarray, "v 3"]
     colours: UInt8[np.ndarray, "v 3"]
     views: UInt8[np.ndarray, " v"]
     spacing_mm: float
+
+    @property
+    def surface(self) -> BustSurface:
+        """Returns the surface without its colours."""
+        return self.shaped.surface
 
     @property
     def mesh_world(self) -> Mesh:
@@ -73,28 +92,39 @@ def fuse_depth(
 
 def shape_bust(
     context: ReconstructionContext, views: Views, depth: Depth, refined: RefinedHead, fused: DepthSurface | None
-) -> Staged[BustSurface | None]:
-    """Moves the fused surface to the delivered head where both show the same skin, and hair to its outlines, and
-    removes self-intersections. Returns None for None."""
+) -> Staged[ShapedBust | None]:
+    """Combines the fused surface with the delivered head, extends hair to its outlines, and mends the triangles.
+    Returns None for None. Warns ``bust-guessed`` where much of the face was measured by nothing."""
     if fused is None:
         return Staged(None)
-    displaced = refined.displaced
-    skin = None
-    if displaced is not None:
-        skin = measured_skin(refined.mesh_world, refined.deviation_mm, displaced.observed, displaced.outlined)
-    return Staged(finished(fused, depth.votes, skin, views.silhouettes, context.rig))
+    head = HeadSkin(refined.mesh_world, refined.deviation_mm)
+    surface = finished(fused, depth.votes, head, views.silhouettes, context.rig)
+    mesh, face = surface.mesh_world, context.model.levels["full"].face_region
+    far, near = nearest(PointTree.of(head.mesh_world.vertices), mesh.vertices, within=FACE_REACH_MM)
+    on_face = np.isfinite(far)
+    on_face[on_face] = face[near[on_face]]
+    silent = ~surface.seen[on_face]
+    measured = np.zeros(len(face), bool) if refined.displaced is None else refined.displaced.observed
+    guessed = silent & ~measured[near[on_face]]
+    shaped = ShapedBust(surface, _share(silent), _share(guessed))
+    doubtful = shaped.guessed_share > MAX_GUESSED_SHARE
+    return Staged(shaped, [compose("bust-guessed", share=shaped.guessed_share)] if doubtful else [])
+
+
+def _share(chosen: Bool[np.ndarray, " n"]) -> float:
+    return float(chosen.mean()) if len(chosen) else 0.0
 
 
 def colour_bust(
-    context: ReconstructionContext, views: Views, surface: BustSurface | None, coloured: Capture
+    context: ReconstructionContext, views: Views, shaped: ShapedBust | None, coloured: Capture
 ) -> Staged[Bust | None]:
     """Colours the bust from the photographs of ``coloured``. Returns None without a surface."""
-    if surface is None:
+    if shaped is None:
         return Staged(None)
-    settings, rig, mesh = context.settings, context.rig, surface.mesh_world
+    settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
     colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
-    return Staged(Bust(surface, normals, colours.colours, colours.views, settings.bust.spacing_mm))
+    return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

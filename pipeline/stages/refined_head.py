@@ -12,7 +12,7 @@ from pipeline.detail.outline_points import outline_search
 from pipeline.detail.patch_points import patch_search
 from pipeline.detail.refine import DeformedSurface, refine_to_surface
 from pipeline.detail.surface_points import with_scaled_deviation
-from pipeline.detail.untangling import untangled_head
+from pipeline.fusion.untangling import untangled_head
 from pipeline.photometric_fit.depth_search import head_depth_factor
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import Depth, is_refined

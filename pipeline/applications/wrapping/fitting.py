@@ -15,7 +15,7 @@ from pipeline.applications.templates.likeness import Likeness, MetSurface, Stage
 from pipeline.applications.templates.placement import Surface
 from pipeline.applications.templates.registration import components, weld
 from pipeline.applications.templates.template_file import Template
-from pipeline.detail.untangling import topology_of, untangled
+from pipeline.fusion.untangling import topology_of, untangled
 from pipeline.head_model.model import HeadModel, with_expressions
 from rig.mesh import vertex_normals
 from rig.progress import Progress

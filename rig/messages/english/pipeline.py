@@ -2,6 +2,7 @@
 
 TEMPLATES = {
     "no-bust": "{reason}",
+    "bust-guessed": "{share:.0%} of the face in bust.ply were measured neither by depth nor by the head's fine level, and follow the fitted head: add cameras that see the face, or light with more texture",
     "hair-beyond-head": "the head's vertices reach {share:.0%} of the hair to 2 mm; the rest hangs or stands beyond them: bust.ply shows it whole",
     "cap-not-found": "the photographs show no cap of the colour {colour}: {share:.0%} of the head well above the brows could be one, and the job went on as without; give its colour as a photograph shows it, #rrggbb, of none that hair or skin has too",
     "features": "{remark}",

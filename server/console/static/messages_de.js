@@ -367,6 +367,7 @@ export default {
   "setting-refused": "{setting} {value} wurde nicht übernommen",
   "front-of-other-capture": "die Frontkamera {front} gehört nicht zur Aufnahme ({cameras})",
   "no-bust": "{reason}",
+  "bust-guessed": "{share:.0%} des Gesichts in bust.ply hat weder die Tiefe noch die feine Stufe des Kopfes gemessen; sie folgen dem angepassten Kopf: weitere Kameras auf das Gesicht richten oder Licht mit mehr Textur setzen",
   "hair-beyond-head": "die Punkte des Kopfes erreichen {share:.0%} des Haars auf 2 mm; der Rest hängt oder steht darüber hinaus: bust.ply zeigt es ganz",
   "cap-not-found": "die Fotos zeigen keine Kappe der Farbe {colour}: {share:.0%} des Kopfes weit über den Brauen könnten eine sein, und der Auftrag lief weiter wie ohne; ihre Farbe so angeben, wie ein Foto sie zeigt, #rrggbb, und keine, die auch Haar oder Haut hat",
   "features": "{remark}",

@@ -9,7 +9,7 @@ from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids
 from pipeline.detail.folds import folded
 from pipeline.detail.refine import DeformedSurface, deform_to_points, refine_to_surface
 from pipeline.detail.surface_points import SurfacePoints, thinned, with_scaled_deviation
-from pipeline.detail.untangling import head_topology, spoilt_faces
+from pipeline.fusion.untangling import head_topology, spoilt_faces
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part

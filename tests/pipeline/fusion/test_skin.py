@@ -3,148 +3,128 @@
 import numpy as np
 import pytest
 
-from pipeline.fusion.skin import FARTHEST, HEAD_SHARE, SAME_MM, TEXTURED_MM, HeadSkin, drawn_to_skin, measured_skin
+from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.skin import REACH_MM, HeadSkin, combine_with_head, skin_share
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
 
-
-def sure(mesh: Mesh) -> np.ndarray:
-    """Deviations of good photographs."""
-    return np.full(len(mesh.vertices), 0.1)
+DEPTH_MM, STATED_MM = 0.15, 0.3  # what depth of good photographs states, and a head
 
 
-def stating(head: Mesh, deviation_mm: float = 0.4) -> HeadSkin:
-    """The head, measured everywhere, with what it states about itself."""
+def stating(head: Mesh, deviation_mm: float = STATED_MM) -> HeadSkin:
+    return HeadSkin(head, np.full(len(head.vertices), deviation_mm))
+
+
+def lifted(head: Mesh, height_mm: float | np.ndarray) -> Mesh:
+    return Mesh(head.vertices + np.reshape(height_mm, (-1, 1)) * head.normals(), head.faces)
+
+
+def combined(
+    head: Mesh,
+    height_mm: float | np.ndarray,
+    *,
+    skin: np.ndarray | float = 1.0,
+    depth_mm: np.ndarray | float = DEPTH_MM,
+    stated_mm: float = STATED_MM,
+) -> np.ndarray:
+    """Returns the heights (mm) over the head of a surface at the given heights, after both are combined."""
     count = len(head.vertices)
-    return measured_skin(head, np.full(count, deviation_mm), np.ones(count, bool))
+    surface = lifted(head, height_mm)
+    mesh = combine_with_head(surface, skin * np.ones(count), stating(head, stated_mm), depth_mm * np.ones(count))
+    return ((mesh.vertices - head.vertices) * head.normals()).sum(axis=1)
 
 
-def off_by(head: Mesh, height_mm: float) -> Mesh:
-    return Mesh(head.vertices + height_mm * head.normals(), head.faces)
+def noise(head: Mesh, deviation_mm: float) -> np.ndarray:
+    return np.random.default_rng(4).normal(0.0, deviation_mm, len(head.vertices))
 
 
 @pytest.mark.parametrize("height_mm", [0.1, -0.1])
-def test_skin_that_both_show_goes_to_their_weighted_mean(height_mm: float) -> None:
-    """The share is within 1 % of the full one at 0.1 mm, exp(-0.01)."""
+def test_skin_that_both_show_goes_between_them(height_mm: float) -> None:
+    left = np.median(combined(ellipsoid(5), height_mm)) / height_mm
+    assert 0.0 < left < 0.8
+
+
+def test_the_noisier_the_surface_the_more_the_head_counts() -> None:
     head = ellipsoid(5)
-    surface = off_by(head, height_mm)
-    drawn = drawn_to_skin(surface, np.ones(len(surface.vertices)), stating(head), sure(head))
-    left = ((drawn.vertices - head.vertices) * head.normals()).sum(axis=1)
-    assert np.median(left) == pytest.approx((1.0 - HEAD_SHARE) * height_mm, rel=0.15)
+    left = [np.median(combined(head, 0.1, depth_mm=deviation_mm)) for deviation_mm in (0.1, 0.3, 1.0)]
+    assert left[0] > left[1] > left[2] > 0.0
 
 
-def test_a_noisy_surface_counts_by_its_variance() -> None:
-    """Twice the deviation of skin with texture: a fourth of the surface's share."""
+def test_the_larger_the_deviation_that_the_head_states_the_less_it_counts() -> None:
     head = ellipsoid(5)
-    surface = off_by(head, 0.1)
-    noisy = np.full(len(surface.vertices), 2.0 * TEXTURED_MM)
-    drawn = drawn_to_skin(surface, np.ones(len(surface.vertices)), stating(head), noisy)
-    left = ((drawn.vertices - head.vertices) * head.normals()).sum(axis=1)
-    assert np.median(left) == pytest.approx((1.0 - HEAD_SHARE) / 4.0 * 0.1, rel=0.2)
+    left = [np.std(combined(head, noise(head, 0.2), stated_mm=stated_mm)) for stated_mm in (0.2, 1.0, 8.0)]
+    assert left[0] < left[1] < left[2]
+    assert left[0] < 0.3 * 0.2
+    assert left[2] > 0.8 * 0.2
 
 
-@pytest.mark.parametrize(("stated_mm", "share"), [(0.5, 0.0), (4.0, 0.37)])
-def test_a_head_counts_by_how_far_off_it_states_that_it_may_be(stated_mm: float, share: float) -> None:
-    """At 0.8 mm the full share of 0.7 has fallen to 0.37, by exp(-0.64)."""
+@pytest.mark.parametrize("height_mm", [-2.5, 2.5])
+def test_a_crater_and_a_speck_go_to_the_head(height_mm: float) -> None:
+    """A vertex and its neighbours, however sure they are of themselves."""
     head = ellipsoid(5)
-    surface = off_by(head, 0.8)
-    drawn = drawn_to_skin(surface, np.ones(len(surface.vertices)), stating(head, stated_mm), sure(head))
-    moved = np.linalg.norm(drawn.vertices - surface.vertices, axis=1)
-    assert np.median(moved) / 0.8 == pytest.approx(share, abs=0.05)
+    spot = np.linalg.norm(head.vertices - head.vertices[0], axis=1) < 4.0
+    assert 4 < spot.sum() < 10
+    assert np.abs(combined(head, 0.1 + height_mm * spot)).max() < 0.5
+
+
+@pytest.mark.parametrize("height_mm", [3.0, 8.0])
+def test_a_neighbourhood_that_depth_shows_elsewhere_stays(height_mm: float) -> None:
+    """Hair that was labelled as skin, or a mouth that the head lacks: 6 cm wide."""
+    head = ellipsoid(5)
+    far = np.linalg.norm(head.vertices - head.vertices[0], axis=1)
+    left = combined(head, height_mm * (far < 30.0))
+    assert np.median(left[far < 15.0]) == pytest.approx(height_mm, rel=0.07)
+    assert np.abs(left[far > 45.0]).max() < 0.3
 
 
 def test_a_head_of_the_wrong_shape_leaves_what_the_surface_shows() -> None:
-    """Dents and bumps of 4 cm that the head lacks, and the roughness of its own details."""
+    """Dents and bumps of 4 cm that the head lacks, ten times what it states of itself."""
     head = ellipsoid(5)
-    surface = off_by(head, 0.0)
-    rough = np.random.default_rng(5).normal(0.0, 0.2, len(head.vertices))
-    wrong = Mesh(head.vertices + (np.sin(head.vertices[:, 1] / 13.0) + rough)[:, None] * head.normals(), head.faces)
-    drawn = drawn_to_skin(surface, np.ones(len(rough)), stating(wrong), sure(head))
-    assert np.abs(drawn.vertices - surface.vertices).max() < 0.01
+    waves = 3.0 * np.sin(head.vertices[:, 1] / 13.0)
+    left = combined(head, waves)
+    assert np.corrcoef(left, waves)[0, 1] > 0.98
+    assert np.std(left - waves) < 0.25 * np.std(waves)
 
 
-def test_what_lies_farther_apart_stays() -> None:
-    """Hair over the skin, or a head that is wrong there."""
+def test_what_lies_beyond_reach_stays() -> None:
     head = ellipsoid(5)
-    for height_mm in (3.0, FARTHEST * SAME_MM + 1.0):
-        surface = off_by(head, height_mm)
-        drawn = drawn_to_skin(surface, np.ones(len(surface.vertices)), stating(head), sure(head))
-        assert np.abs(drawn.vertices - surface.vertices).max() < 0.01
+    height = REACH_MM + 1.0
+    assert np.abs(combined(head, height) - height).max() < 1e-9
 
 
-def test_a_crater_and_a_speck_go_to_the_head_that_their_surroundings_agree_with() -> None:
+def test_hair_stays_and_fades_into_skin() -> None:
     head = ellipsoid(5)
-    surface = off_by(head, 0.1)
-    spots = surface.vertices.copy()
-    for middle, height_mm in ((head.vertices[0], -2.5), (head.vertices[40], 2.5)):
-        near = np.linalg.norm(head.vertices - middle, axis=1) < 4.0  # a vertex and its neighbours
-        assert 4 < near.sum() < 10
-        spots[near] += height_mm * head.normals()[near]
-    drawn = drawn_to_skin(Mesh(spots, head.faces), np.ones(len(spots)), stating(head), sure(head))
-    left = np.abs(((drawn.vertices - head.vertices) * head.normals()).sum(axis=1))
-    assert left.max() < 0.6
+    skin = np.clip(head.vertices[:, 0] / 20.0, 0.0, 1.0)
+    height = 0.3 + noise(head, 0.2)
+    moved = np.abs(combined(head, height, skin=skin) - height)
+    assert moved[skin == 0.0].max() < 1e-9
+    assert moved[(skin > 0.3) & (skin < 0.7)].mean() < moved[skin == 1.0].mean()
 
 
-def test_a_crater_as_wide_as_its_surroundings_goes_to_a_head_that_silhouettes_hold() -> None:
-    """An oily tip of the nose: windows err alike all over it, so that no surroundings agree with the head."""
+def test_a_place_that_no_view_sees_follows_the_head_from_its_rim() -> None:
+    """A pit 3 cm wide within seen skin that stands 0.3 mm over the head."""
     head = ellipsoid(5)
-    wide = np.linalg.norm(head.vertices - head.vertices[0], axis=1) < 25.0
-    surface = Mesh(head.vertices - 2.5 * wide[:, None] * head.normals(), head.faces)
-    count = len(head.vertices)
-    middle = np.linalg.norm(head.vertices - head.vertices[0], axis=1) < 8.0
-    for outlined, deepest in ((None, 2.6), (middle.astype(float), 0.3)):
-        stated = measured_skin(head, np.full(count, 4.0), np.ones(count, bool), outlined)
-        drawn = drawn_to_skin(surface, np.ones(count), stated, sure(head))
-        left = ((head.vertices - drawn.vertices) * head.normals()).sum(axis=1)
-        assert deepest - 0.3 < left[0] < deepest
+    far = np.linalg.norm(head.vertices - head.vertices[0], axis=1)
+    silent = far < 15.0
+    height = np.where(silent, -1.5, 0.3)
+    left = combined(head, height, skin=1.0 - silent, depth_mm=np.where(silent, 0.0, DEPTH_MM))
+    assert np.abs(left[silent]).max() < 0.35
+    rim = (far > 11.0) & silent
+    assert np.abs(np.median(left[rim]) - np.median(left[(far > 15.0) & (far < 19.0)])) < 0.15
 
 
-def test_a_gap_that_no_view_sees_goes_to_the_head_where_seen_skin_encloses_it() -> None:
-    """A pit of a few vertices; the unseen back of the head is no gap, and stays but at its rim."""
+def test_a_place_that_no_view_sees_is_what_is_seen_next_to_it() -> None:
     head = ellipsoid(5)
-    surface, front = off_by(head, 0.1), head.vertices[:, 2] > 0.0
-    middle = head.vertices[head.vertices[:, 2].argmax()]
-    pit = np.linalg.norm(head.vertices - middle, axis=1) < 4.0
-    assert 4 < pit.sum() < 20
-    dented = Mesh(surface.vertices - 1.5 * pit[:, None] * head.normals(), head.faces)
-    seen = front & ~pit
-    drawn = drawn_to_skin(dented, seen.astype(float), stating(head), np.where(seen, 0.15, 0.0))
-    left = ((drawn.vertices - head.vertices) * head.normals()).sum(axis=1)
-    assert np.abs(left[pit]).max() < 0.3
-    behind = head.vertices[:, 2] < -10.0
-    assert np.abs(drawn.vertices - dented.vertices)[behind].max() == 0.0
+    seen, right = head.vertices[:, 2] > 0.0, head.vertices[:, 0] > 0.0
+    beside = neighbours(head.faces, len(seen))
+    share = skin_share(beside, head.vertices, (seen & right).astype(float), seen)
+    middle = np.abs(head.vertices[:, 0]) < 20.0
+    assert share[~seen & right & ~middle].min() > 0.9
+    assert share[~seen & ~right & ~middle].max() < 0.1
 
 
-def test_a_crust_gives_way_to_the_head_where_the_surface_itself_is_unsure() -> None:
-    """Noise of 1.4 mm (RMS) about the head: a surface that states 0.5 mm takes the head's shape; one that is sure of it
-    (hair, say) is believed."""
-    head = ellipsoid(5)
-    rough = np.random.default_rng(4).normal(0.0, 1.4, len(head.vertices))
-    surface = Mesh(head.vertices + rough[:, None] * head.normals(), head.faces)
-    left = {}
-    for deviation_mm in (0.5, 0.15):
-        drawn = drawn_to_skin(surface, np.ones(len(rough)), stating(head), np.full(len(rough), deviation_mm))
-        off = ((drawn.vertices - head.vertices) * head.normals()).sum(axis=1)
-        left[deviation_mm] = float(np.sqrt(np.mean(off**2)))
-    assert left[0.5] < 0.5
-    assert left[0.15] > 1.0
-
-
-def test_only_seen_skin_moves_and_only_to_what_was_measured_of_the_head() -> None:
-    head = ellipsoid(5)
-    surface, front = off_by(head, 0.3), head.vertices[:, 2] > 0.0
-    left = head.vertices[:, 0] > 0.0
-    measured = measured_skin(head, np.full(len(front), 1.0), front)
-    assert front[np.unique(measured.mesh_world.faces)].all()
-    drawn = drawn_to_skin(surface, left.astype(float), measured, sure(head))
-    moved = np.linalg.norm(drawn.vertices - surface.vertices, axis=1)
-    assert (moved[~left] == 0.0).all()
-    assert moved[left & (head.vertices[:, 2] > 5.0)].min() > 0.1
-    assert moved[head.vertices[:, 2] < -10.0].max() < 0.01
-
-
-def test_a_head_that_was_not_measured_moves_nothing() -> None:
+def test_without_depth_nothing_moves() -> None:
     head = ellipsoid(3)
-    surface = off_by(head, 0.3)
-    nothing = measured_skin(head, np.full(len(head.vertices), 0.4), np.zeros(len(head.vertices), bool))
-    assert drawn_to_skin(surface, np.ones(len(head.vertices)), nothing, sure(head)) is surface
+    surface = lifted(head, 0.3)
+    count = len(head.vertices)
+    assert combine_with_head(surface, np.zeros(count), stating(head), np.zeros(count)) is surface

@@ -1,4 +1,4 @@
-"""Counts turned, folded and crossing triangles of heads, before and after ``pipeline.detail.untangling``.
+"""Counts turned, folded and crossing triangles of heads, before and after ``pipeline.fusion.untangling``.
 
 Heads are random: all modes of a fit (eigenheads and kernel, within 2.5 standard deviations) with five expressions at
 random weights, ``fitted``; and ``displaced``, the same under a random displacement along their normals, twice what the
@@ -15,11 +15,10 @@ import scipy.sparse as sparse
 from jaxtyping import Float
 from scipy.sparse.linalg import SuperLU, splu
 
-from pipeline.detail import untangling
 from pipeline.detail.nodes import solving_nodes
 from pipeline.detail.smooth_field import SmoothField, smooth_field
-from pipeline.detail.untangling import MeshFaults, Topology, clean_mean_head, head_topology, mesh_faults, topology_of
-from pipeline.fusion import crossing_kernels, crossings
+from pipeline.fusion import crossing_kernels, crossings, untangling
+from pipeline.fusion.untangling import MeshFaults, Topology, clean_mean_head, head_topology, mesh_faults, topology_of
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings

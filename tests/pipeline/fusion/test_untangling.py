@@ -10,7 +10,8 @@ from scipy.sparse.linalg import splu
 
 from pipeline.detail.nodes import solving_nodes
 from pipeline.detail.smooth_field import smooth_field
-from pipeline.detail.untangling import (
+from pipeline.fusion.crossings import crossing_faces
+from pipeline.fusion.untangling import (
     MeshFaults,
     clean_mean_head,
     head_topology,
@@ -21,7 +22,6 @@ from pipeline.detail.untangling import (
     untangled,
     untangled_head,
 )
-from pipeline.fusion.crossings import crossing_faces
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings

@@ -17,7 +17,7 @@ import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.array_cache import cached_arrays
-from pipeline.detail.sparse_factor import factorised
+from pipeline.estimation.sparse_factor import factorised
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.net_kernels import component_of
 from pipeline.geometry.procrustes import procrustes
@@ -58,13 +58,18 @@ class MeshFaults:
     crossing: int
 
 
+CLEAN = MeshFaults(turned=0, folded=0, crossing=0)
+
+
 def topology_of(faces: Int[np.ndarray, "f 3"], count: int) -> Topology:
     """Returns the topology of a mesh with ``count`` vertices."""
     ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
     key, owner = ends[:, 0] * count + ends[:, 1], np.repeat(np.arange(len(faces)), 3)
     order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(key[order][1:] == key[order][:-1])
-    low, high = np.divmod(np.unique(key), count)
+    key = key[order]
+    repeated = key[1:] == key[:-1]
+    same = np.flatnonzero(repeated)
+    low, high = np.divmod(key[np.append(True, ~repeated)], count)
     columns = (np.concatenate([low, high]), np.concatenate([high, low]))
     beside = sparse.csr_array((np.ones(2 * len(low)), columns), shape=(count, count))
     return Topology(faces, np.stack([owner[order][same], owner[order][same + 1]], axis=1), beside)
