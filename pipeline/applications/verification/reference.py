@@ -58,7 +58,9 @@ class Reference:
         for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
             numbers = _edge_numbers(corners[:, [i, j]], len(self.mesh.vertices))
             found |= off[:, k] & np.isin(numbers, self.rim)
-        return found
+        # A corner of the rim is also a corner of triangles without an edge on it.
+        rim_corners = np.unique(np.divmod(self.rim, len(self.mesh.vertices)))
+        return found | ((hits.weights > 1 - ON_EDGE) & np.isin(corners, rim_corners)).any(axis=1)
 
 
 def read_reference(path: Path, landmarks: Path | None = None) -> Reference:
