@@ -29,6 +29,8 @@ RINGS = (1, 1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 33, 41, 50)  # about a spot that w
 # shapes and expressions need 5 to 8 of them
 REST_RINGS = (1, 2, 3, 5)  # the same while spots get the mean head's shape. Larger ones move more vertices, and those
 # that are not clean by then seldom are later (tests/laboratory/notes/meshes.md)
+SMALL_RINGS = (1, 1, 2, 2, 3, 3)  # about spots of a fused surface: a larger membrane would cut off an ear
+HALVINGS = 6  # rounds in which vertices go half their way to safe places; in later ones they go all of it
 PLACED_BY = 32  # every so-many-th vertex places the mean head; of so few, BLAS sums alike with any number of threads
 ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles cut off is a part of their loop or lens
 
@@ -128,6 +130,24 @@ def untangled(
         touched |= spot
     out, spoilt, spot = _mended(out, spoilt, topology, np.zeros_like(out), RINGS)
     return np.where((touched | spot)[:, None], out, vertices)
+
+
+def smooth_spots(
+    vertices: Float[np.ndarray, "v 3"], topology: Topology, safe: Float[np.ndarray, "v 3"]
+) -> Float[np.ndarray, "v 3"]:
+    """Returns the vertices (mm) of a fused surface without degenerate spots, tested in single precision. Small spots
+    become membranes; where thin sheets would collapse so, vertices go to the places ``safe``, at which the whole mesh
+    is clean."""
+    out = vertices.astype(np.float32, order="C").astype(float)
+    out, spoilt, touched = _mended(out, spoilt_faces(out, topology), topology, np.zeros_like(out), SMALL_RINGS)
+    halvings, safe = HALVINGS, safe.astype(np.float32)
+    while spoilt.any():  # with all triangles about it at the safe places, a triangle is clean: each round adds some
+        near = np.zeros(len(out), bool)
+        near[topology.faces[_around(spoilt, topology.faces, len(out))]] = True
+        share = 0.5 if halvings > 0 else 0.0
+        out[near] = (safe[near] + share * (out[near] - safe[near])).astype(np.float32)
+        spoilt, halvings, touched = spoilt_faces(out, topology, near), halvings - 1, touched | near
+    return np.where(touched[:, None], out, vertices)
 
 
 def _mended(
