@@ -22,7 +22,7 @@ from pipeline.fusion.refinement import Measured, refine_vertices
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
 from pipeline.fusion.silent_hair import SilentHair, shell_deviation_mm
 from pipeline.fusion.skin import HeadSkin, combine_with_head
-from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, topology_of, untangled
+from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, smooth_spots, topology_of
 from pipeline.fusion.view_stack import stack_views
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.normals import normals_of
@@ -71,6 +71,7 @@ class DepthSurface:
     itself."""
 
     mesh_world: Mesh
+    safe_world: Float[np.ndarray, "v 3"]  # places (mm) with which the mesh cannot cross itself
     measured: Measured
     warnings: tuple[ReportWarning, ...]
     shell_deviation_mm: float | None = None  # of hair that is a guess inside its outlines; None without such hair
@@ -109,7 +110,7 @@ def fuse(
     report("bust", 0.1)
     level = solve(maps, views, head_world, settings.spacing_mm, hair)
     report("bust", 0.6)
-    net = closed_net(level, head_world)
+    net, safe = closed_net(level, head_world)
     report("bust", 0.8)
     mesh, measured = refine_vertices(net, views, settings.spacing_mm)
     measured = without_islands(mesh, measured)
@@ -117,7 +118,7 @@ def fuse(
     warnings = tuple(mask_warnings(names, contradicted))
     straight = without_bias(mesh, measured.views > 0, bias)
     shell_mm = None if hair is None else shell_deviation_mm(hair, views)
-    return DepthSurface(straight, measured, warnings, shell_mm)
+    return DepthSurface(straight, safe, measured, warnings, shell_mm)
 
 
 @traced
@@ -149,7 +150,7 @@ def finished(
     if shares is not None and surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, shares[:, Part.HAIR.channel], silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))
-    clean = without_coincidences(Mesh(untangled(mesh.vertices, topology), mesh.faces))
+    clean = without_coincidences(Mesh(smooth_spots(mesh.vertices, topology, surface.safe_world), mesh.faces))
     mended_mm = np.linalg.norm(clean.vertices - mesh.vertices, axis=1)
     mesh = clean
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
@@ -180,18 +181,21 @@ def mask_warnings(names: Sequence[str], contradicted: Float[np.ndarray, " k"]) -
 
 
 @traced
-def closed_net(level: Level, head_world: Mesh | None) -> Mesh:
-    """Returns the mesh of the zero level (mm, world frame), only the piece that is the subject."""
+def closed_net(level: Level, head_world: Mesh | None) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
+    """Returns the mesh of the zero level, only the piece that is the subject, and safe positions of its vertices (mm,
+    world frame): with every vertex in the middle of its cell the mesh cannot cross itself."""
     grid, field = level.grid, level.field.copy()
     compose_well(field, grid.neighbours, grid.outer, TURNED_TO * grid.step_mm)
     net = surface_net(field, grid.index, grid.neighbours)
-    vertices, faces = net.vertices, net.faces
+    vertices, faces, cells = net.vertices, net.faces, np.flatnonzero(net.of_cell >= 0)
     head = None if head_world is None else (head_world.vertices - grid.corner) / grid.step_mm
     kept = _subject(vertices, faces, head)
     taken = np.zeros(len(vertices), bool)
     taken[faces[kept]] = True
-    row = np.cumsum(taken, dtype=np.int32) - 1
-    return Mesh(grid.corner + grid.step_mm * vertices[taken], row[faces[kept]])
+    used, row = np.flatnonzero(taken), np.cumsum(taken, dtype=np.int32) - 1
+    placed = grid.corner + grid.step_mm * vertices[used]
+    safe = grid.corner + grid.step_mm * (grid.index[cells[used]] + 0.5)
+    return Mesh(placed, row[faces[kept]]), safe
 
 
 def _subject(

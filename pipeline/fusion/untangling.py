@@ -29,6 +29,8 @@ RINGS = (1, 1, 2, 3, 4, 6, 8, 11, 15, 20, 26, 33, 41, 50)  # about a spot that w
 # shapes and expressions need 5 to 8 of them
 REST_RINGS = (1, 2, 3, 5)  # the same while spots get the mean head's shape. Larger ones move more vertices, and those
 # that are not clean by then seldom are later (tests/laboratory/notes/meshes.md)
+SMALL_RINGS = (1, 2, 3)  # about spots of a fused surface: a larger membrane would cut off an ear
+HALVINGS = 2  # rounds in which vertices go half their way to safe places; in later ones they go all of it
 PLACED_BY = 32  # every so-many-th vertex places the mean head; of so few, BLAS sums alike with any number of threads
 ENCLOSED_SHARE = 0.04  # of the vertices: a smaller piece that spoilt triangles cut off is a part of their loop or lens
 
@@ -130,20 +132,43 @@ def untangled(
     return np.where((touched | spot)[:, None], out, vertices)
 
 
+def smooth_spots(
+    vertices: Float[np.ndarray, "v 3"], topology: Topology, safe: Float[np.ndarray, "v 3"]
+) -> Float[np.ndarray, "v 3"]:
+    """Returns the vertices (mm) of a fused surface without degenerate spots, tested in single precision. Small spots
+    become membranes; where thin sheets would collapse so, vertices go to the places ``safe``, at which the whole mesh
+    is clean."""
+    out = vertices.astype(np.float32, order="C").astype(float)
+    spoilt, flat = spoilt_faces(out, topology), np.zeros_like(out)
+    out, spoilt, touched = _mended(out, spoilt, topology, flat, SMALL_RINGS, enclosing=False)
+    halvings, safe = HALVINGS, safe.astype(np.float32)
+    while spoilt.any():  # with all triangles about it at the safe places, a triangle is clean: each round adds some
+        near = np.zeros(len(out), bool)
+        near[topology.faces[_around(spoilt, topology.faces, len(out))]] = True
+        share = 0.5 if halvings > 0 else 0.0
+        out[near] = (safe[near] + share * (out[near] - safe[near])).astype(np.float32)
+        spoilt, halvings, touched = spoilt_faces(out, topology, near), halvings - 1, touched | near
+    return np.where(touched[:, None], out, vertices)
+
+
 def _mended(
     vertices: Float[np.ndarray, "v 3"],
     spoilt: Bool[np.ndarray, " f"],
     topology: Topology,
     shape: Float[np.ndarray, "v 3"],
     rings: tuple[int, ...],
+    *,
+    enclosing: bool = True,
 ) -> tuple[Float[np.ndarray, "v 3"], Bool[np.ndarray, " f"], Bool[np.ndarray, " v"]]:
     """Gives spots the shape ``shape``, displaced as their surroundings are, each at most as often as ``rings`` has
     entries: how far it reaches at each time. Returns the vertices in single precision, the triangles that are still
-    spoilt, and the vertices that were moved."""
+    spoilt, and the vertices that were moved. ``enclosing`` adds the small pieces that spots cut off."""
     out, times, touched = vertices.copy(), np.zeros(len(vertices), int), np.zeros(len(vertices), bool)
     while spoilt.any() and times.max() < len(rings):
         times[np.unique(topology.faces[spoilt])] += 1
-        spot = _with_enclosed(_with_rings(times, spoilt, topology.faces, rings), topology.faces)
+        spot = _with_rings(times, spoilt, topology.faces, rings)
+        if enclosing:
+            spot = _with_enclosed(spot, topology.faces)
         if spot.all():
             break
         rows = np.flatnonzero(spot)

@@ -9,7 +9,7 @@ from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.grid import Grid, refined, whole_box
 from pipeline.fusion.grid_kernels import crossed_at_rim, interpolated
 from pipeline.fusion.net_kernels import component_of, compose_well
-from pipeline.fusion.untangling import CLEAN, mesh_faults, topology_of, untangled
+from pipeline.fusion.untangling import CLEAN, mesh_faults, smooth_spots, topology_of
 from pipeline.geometry.surface_nets import surface_net
 from tests.support.closed_meshes import one_fan_a_vertex
 
@@ -59,12 +59,13 @@ def test_volume_of_the_net_is_that_of_the_inner_nodes() -> None:
     assert volume == pytest.approx((field < 0).sum())
 
 
-def test_a_net_that_was_shaken_is_mended() -> None:
-    vertices, faces, *_ = noise_net(2)
-    shaken = vertices + np.random.default_rng(0).normal(0, 0.3, vertices.shape)
-    assert crossing_faces(shaken, faces).any()
-    topology = topology_of(faces, len(vertices))
-    assert mesh_faults(untangled(shaken, topology), topology) == CLEAN
+def test_safe_places_are_clean_and_mend_a_net_that_was_shaken() -> None:
+    vertices, faces, grid, _, of_cell = noise_net(2)
+    safe, topology = grid.index[of_cell >= 0] + 0.5, topology_of(faces, len(vertices))
+    assert mesh_faults(safe, topology) == CLEAN
+    shaken = vertices + np.random.default_rng(0).normal(0, 0.7, vertices.shape)
+    assert mesh_faults(shaken, topology).crossing > 0.1 * len(faces)
+    assert mesh_faults(smooth_spots(shaken, topology, safe), topology) == CLEAN
 
 
 def test_crossings_are_those_of_every_pair_tried() -> None:

@@ -137,7 +137,7 @@ def test_a_head_is_written_pushed_out_to_the_hair(
     """The head is a ball of 57 mm, the bust one of 60 mm whose upper half is hair."""
     bust, capture, _ = photographed
     part = np.where(bust.mesh_world.vertices[:, 1] > 0.0, Part.HAIR, Part.SKIN).astype(np.uint8)
-    bust = replace(bust, surface=replace(bust.surface, part=part))
+    bust = replace(bust, shaped=replace(bust.shaped, surface=replace(bust.surface, part=part)))
     sphere = trimesh.creation.icosphere(4, 57.0)
     head = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32))
     refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", verbatim("planted")))
