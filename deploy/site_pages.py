@@ -1,5 +1,5 @@
 """MkDocs hook: the pages at the top of the checkout stand on the site beside those of docs/, README.md as the first,
-and links between the two lead there."""
+and links between the two lead there. The laboratory's notes are no part of the site: a link to them is its text."""
 
 import re
 from pathlib import Path
@@ -15,6 +15,7 @@ PAGES = {
     "SECURITY.md": "SECURITY.md",
 }
 _FROM_TOP = re.compile(r"""(?:(?<=\]\()|(?<=src="))docs/""")
+_TO_NOTES = re.compile(r"\[([^\]]*)\]\(tests/laboratory/[^)]*\)")
 _TO_TOP = re.compile(r"(?<=\]\()((?:\.\./)+)(\w+\.md)")
 
 
@@ -22,7 +23,7 @@ def on_files(files: Files, config: Any, **_: Any) -> Files:
     """Adds the pages at the top of the repository to the site, with their links into docs/ adapted."""
     for name, place in PAGES.items():
         text = (ROOT / name).read_text(encoding="utf-8")
-        files.append(File.generated(config, place, content=_FROM_TOP.sub("", text)))
+        files.append(File.generated(config, place, content=_TO_NOTES.sub(r"\1", _FROM_TOP.sub("", text))))
     return files
 
 

@@ -124,14 +124,8 @@ def assign_images(
     if assignment.pictures and (exchanged == "refuse" or not assignment.overwhelming):
         found = ring_messages(assignment.pictures, what)
         overruled.append(guards.refuse(ExchangedPictures(found, doubtful=not assignment.overwhelming)))
-    wrong = None if assignment.pictures else wrong_rig(distinct, rig)
-    if wrong:
-        face = guards.find_face(capture.images, rig)
-        if face is None or not face.holds_the_rig:
-            wrong = turned_masks(capture.images, silhouettes, capture.masks) or wrong
-            overruled.append(guards.refuse(WrongRig(wrong)))
-        elif wrong.code == "other-lenses":
-            overruled.append(compose("lens-doubtful", finding=wrong))
+    if not assignment.pictures:
+        overruled += _check_rig(capture, rig, silhouettes, distinct, guards)
     pictures = {} if masks else assignment.pictures
     if masks:
         capture = reassign_images(capture, masks=masks)
@@ -144,6 +138,24 @@ def assign_images(
     if not assignment.pictures and loose_outlines(distinct, rig):
         warnings = (*warnings, compose("outlines-loose"))
     return ImageAssignment(capture, _left_out(silhouettes, duplicates), pictures, plates, warnings)
+
+
+def _check_rig(
+    capture: Capture,
+    rig: Rig,
+    silhouettes: Mapping[str, Silhouette],
+    distinct: Mapping[str, Silhouette],
+    guards: Guards,
+) -> list[ReportWarning]:
+    """Refuses another rig's cameras, unless the face holds the rig. Returns the warnings that stand in their place."""
+    wrong = wrong_rig(distinct, rig)
+    if not wrong:
+        return []
+    face = guards.find_face(capture.images, rig)
+    if face is None or not face.holds_the_rig:
+        wrong = turned_masks(capture.images, silhouettes, capture.masks) or wrong
+        return [guards.refuse(WrongRig(wrong))]
+    return [compose("lens-doubtful", finding=wrong)] if wrong.code == "other-lenses" else []
 
 
 def _masks_alone(capture: Capture, silhouettes: Mapping[str, Silhouette], assignment: Assignment) -> bool:

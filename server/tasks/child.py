@@ -126,7 +126,7 @@ class Child:
 
     @property
     def runs(self) -> bool:
-        """Whether the child process has started and was not killed, so that the next piece of work begins at once."""
+        """Returns whether the child has started and was not killed, so that the next piece of work begins at once."""
         return self._process is not None
 
     def close(self) -> None:

@@ -248,23 +248,23 @@ def _await_request(server: socket.socket) -> "tuple[dict[str, Any], list[int]]":
         if len(threads) != 1:
             server.send(f"the fork server has more than one thread: {', '.join(threads)}".encode())
             os._exit(1)
-        told, tell = os.pipe()
+        pid_reader, pid_writer = os.pipe()
         between = os.fork()
         if between == 0:
             between = os.getpid()
             pid = os.fork()
             if pid:
-                os.write(tell, b"%d" % pid)
+                os.write(pid_writer, b"%d" % pid)
                 os._exit(0)
             while os.getppid() == between:
                 time.sleep(0.0005)
             return request, files
         os.waitpid(between, 0)  # from now on the process belongs to whoever asked for it
-        pid = os.read(told, 32)
-        os.close(tell)
-        os.read(told, 1)  # until the process has closed its end, as the last of what it takes on
+        pid = os.read(pid_reader, 32)
+        os.close(pid_writer)
+        os.read(pid_reader, 1)  # until the process has closed its end, as the last of what it takes on
         server.send(pid)
-        for file in (told, *files):
+        for file in (pid_reader, *files):
             os.close(file)
 
 
