@@ -145,6 +145,7 @@ def head_middle(silhouettes, rig):
     rays, centres = [], []
     for camera in rig:
         disc = crown_disc(silhouettes[camera.name].mask, 0)
+        assert disc is not None
         rays.append(camera.rays_world(disc[0][None])[0])
         centres.append(camera.centre_world)
     across = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
