@@ -25,7 +25,7 @@ def recorded() -> Iterator[set[Kernel]]:
         nonlocal compiling
         if not compiling:
             function = kept._dispatcher.py_func
-            place = f"{function.__module__.partition('.')[2]}:{function.__name__}"
+            place = f"{function.__module__.removeprefix('pipeline.')}:{function.__name__}"
             found.add(Kernel(place, tuple(text_from_type(kind) for kind in signature)))
         loaded = load(kept, signature, target_context)
         compiling += loaded is None
