@@ -12,11 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
+from typing import Literal
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
+from pipeline.faces.detection import FaceDetection
 from pipeline.faces.matching import MatchedFaces, match_faces
 from pipeline.faces.points import direction_from_face, point_table
 from pipeline.faces.subject import SubjectFaces
@@ -31,19 +33,21 @@ BLUR_MM = 8.0  # standard deviation of what is subtracted: light differs between
 MIN_COSINE = 0.3  # between the skin's normal and the direction to the camera
 MIN_SHARE = 0.35  # of a part's cells that two drawings share
 MIN_LIKENESS = 0.35  # correlation of a shift that counts
+MIN_PARTS = 2  # of a view that is judged
 DEPTH_PRIOR = 0.02  # keeps the depth 0 where all cameras have one slope
-MAX_OFFSET_MM = 2.5  # 2.0 is the largest of views of one moment
-MIN_MOUTH_LIKENESS = 0.66  # open for shut has 0.55 to 0.62, one moment 0.69 and more ...
-MAX_MOUTH_ELEVATION = 0.42  # ... in cameras that look at the face from less than 25 degrees above it (sine)
-CLEARLY = 2.0  # offset of a view that is named, by the next one's
+MAX_OFFSET_MM = 2.75  # 2.6 is the largest of views of one moment, of five cameras far apart
+MAX_MOUTH_LIKENESS = 0.75  # of a mouth that is open for shut (0.50 to 0.74 with the best other view) ...
+MIN_MOUTH_OFFSET_MM = 1.5  # ... and that lies elsewhere than the eyes say (1.6 to 14; one moment at most 1.4) ...
+MAX_ELEVATION = 0.42  # ... in cameras that look at the face from less than 25 degrees above it (sine)
 
 
 @dataclass(frozen=True, slots=True)
 class OddView:
-    """Holds a view that shows another moment or person: by how far its face lies elsewhere (mm, across its rays, 0 for
-    another mouth at the same place)."""
+    """Holds a view that shows another moment or person, and how far its face, or its mouth alone, lies from where the
+    others see it (mm, along the face)."""
 
     camera: str
+    part: Literal["face", "mouth"]
     offset_mm: float
 
 
@@ -74,37 +78,64 @@ def check_one_moment(subject: SubjectFaces, images: Mapping[str, ImageRgb], rig:
         images: sRGB, by camera.
         rig: the cameras.
     """
-    face = subject.matched
-    if face is None or len(face.detections) < 2:
-        return MomentCheck()
+    odd: list[OddView] = []
+    count = len(_views_with_face(subject))
+    while count > 1:
+        sizes, mouths = _compare(subject, images, rig)
+        suspects = [name for name, size in sizes.items() if size > MAX_OFFSET_MM]
+        left = _views_with_face(subject)
+        if not suspects:
+            # Views that disagree about the head make the drawings of its mouth differ, too.
+            odd = odd or mouths
+            break
+        worst = max(suspects, key=lambda name: sizes[name])
+        if len(left) == 3:  # each may be the wrong one that the two others agree without
+            sure = [name for name in left if _agree(without_views(subject, [name], rig), images, rig)]
+            worst = sure[0] if len(sure) == 1 else None
+        if worst is None or len(left) < 3 or 2 * (len(odd) + 1) >= count:
+            unclear = [OddView(name, "face", sizes[name]) for name in suspects]
+            return MomentCheck((*odd, *unclear), certain=False)
+        odd.append(OddView(worst, "face", sizes.get(worst, 0.0)))
+        subject = without_views(subject, [worst], rig)
+    return MomentCheck(tuple(odd), certain=2 * len(odd) < max(count, 1))
+
+
+def _views_with_face(subject: SubjectFaces) -> list[str]:
+    """Returns the views that show the subject's face, or another one where it must be."""
+    if subject.matched is None:
+        return []
     shown = [name for name in subject.expected if subject.found.get(name)]
-    names = list(dict.fromkeys([*face.detections, *face.outliers, *shown]))
+    return list(dict.fromkeys([*subject.matched.detections, *subject.matched.outliers, *shown]))
+
+
+def _agree(subject: SubjectFaces, images: Mapping[str, ImageRgb], rig: Rig) -> bool:
+    return subject.matched is not None and max(_compare(subject, images, rig)[0].values(), default=0.0) <= MAX_OFFSET_MM
+
+
+def _compare(subject: SubjectFaces, images: Mapping[str, ImageRgb], rig: Rig) -> tuple[dict[str, float], list[OddView]]:
+    """Returns by how much each view's face is off that of the others (mm), and the views of another mouth."""
+    names, face = _views_with_face(subject), subject.matched
+    if face is None:
+        return {}, []
     drawings = {name: _draw(face, images[name], rig[name]) for name in names}
     slopes = {name: _slope(face, rig[name]) for name in names}
-    from_above = {
-        name for name in names if direction_from_face(face.world_from_face, rig[name])[1] > MAX_MOUTH_ELEVATION
-    }
     parts = {part: _shifts(drawings, part) for part in PARTS_MM}
-    odd: list[OddView] = []
-    while True:
-        left = [name for name in names if name not in {view.camera for view in odd}]
-        offsets = {name: size for name, size in _offsets(left, parts, slopes).items()}
-        worst = max(offsets, key=lambda name: offsets[name], default=None)
-        if worst is None or offsets[worst] <= MAX_OFFSET_MM:
-            break
-        second = max((size for name, size in offsets.items() if name != worst), default=0.0)
-        if len(left) < 3 or 2 * (len(odd) + 1) >= len(names) or (len(left) == 3 and offsets[worst] < CLEARLY * second):
-            unclear = [OddView(name, size) for name, size in offsets.items() if size > MAX_OFFSET_MM]
-            return MomentCheck((*odd, *unclear), certain=False)
-        odd.append(OddView(worst, offsets[worst]))
-    if len(left) > 2:
-        mouths = _likeness(left, parts["mouth"])
-        odd += [
-            OddView(name, 0.0)
-            for name, likeness in mouths.items()
-            if likeness < MIN_MOUTH_LIKENESS and name not in from_above
-        ]
-    return MomentCheck(tuple(odd), certain=2 * len(odd) < len(names))
+    by_part = {part: _part_offsets(names, shifts, slopes) for part, shifts in parts.items()}
+    sizes = _sizes(names, list(by_part.values()))
+    likeness = {part: _likeness(names, shifts) for part, shifts in parts.items()}
+    for name in names:
+        if name not in sizes and sum(name in alike for alike in likeness.values()) >= MIN_PARTS:  # like no other view
+            detection = face.detections.get(name) or face.outliers.get(name) or subject.found[name][0]
+            sizes[name] = _landmark_offset(face, detection, rig[name])
+    low = [name for name in names if direction_from_face(face.world_from_face, rig[name])[1] < MAX_ELEVATION]
+    return sizes, _odd_mouths(low, by_part, likeness["mouth"])
+
+
+def _landmark_offset(face: MatchedFaces, detection: FaceDetection, camera: Camera) -> float:
+    """Returns the median distance (mm) of a view's landmarks from those of the face."""
+    depth = camera.camera_from_world.apply(face.points_world)[:, 2]
+    off = np.linalg.norm(detection.landmarks_px - camera.project(face.points_world), axis=1)
+    return float(np.median(off * depth / camera.intrinsics.fx))
 
 
 def without_views(subject: SubjectFaces, names: Sequence[str], rig: Rig) -> SubjectFaces:
@@ -223,12 +254,9 @@ def _slope(face: MatchedFaces, camera: Camera) -> Float[np.ndarray, " 2"]:
     return -np.array([x, y]) / max(z, MIN_COSINE / 2)
 
 
-def _offsets(
-    names: Sequence[str], parts: Mapping[str, Sequence[_Shift]], slopes: Mapping[str, Float[np.ndarray, " 2"]]
-) -> dict[str, float]:
+def _sizes(names: Sequence[str], by_part: Sequence[Mapping[str, Float[np.ndarray, " 2"]]]) -> dict[str, float]:
     """Returns by how much (mm) the drawings of each view are off those of the others, for views of which two parts or
     more can be compared."""
-    by_part = [_part_offsets(names, shifts, slopes) for shifts in parts.values()]
     sizes = {}
     for name in names:
         of_view = np.array([offsets[name] for offsets in by_part if name in offsets])
@@ -237,6 +265,23 @@ def _offsets(
         elif len(of_view) == 2:
             sizes[name] = float(np.linalg.norm(of_view, axis=1).min())
     return sizes
+
+
+def _odd_mouths(
+    names: Sequence[str],
+    by_part: Mapping[str, Mapping[str, Float[np.ndarray, " 2"]]],
+    likeness: Mapping[str, float],
+) -> list[OddView]:
+    """Returns the views whose mouth is like that of no other view and lies elsewhere than their eyes say."""
+    eyes, mouth = by_part["eyes"], by_part["mouth"]
+    offsets = {
+        name: float(np.linalg.norm(mouth[name] - eyes[name])) for name in names if name in eyes and name in mouth
+    }
+    return [
+        OddView(name, "mouth", offset)
+        for name, offset in offsets.items()
+        if likeness[name] < MAX_MOUTH_LIKENESS and offset > MIN_MOUTH_OFFSET_MM
+    ]
 
 
 def _part_offsets(
