@@ -41,10 +41,10 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         check_usd()
     run = Recorder(context)
     with run.stage("segmentation") as stage:
-        views = stage.keep(find_views(stage.context))
-    with run.beside("segmentation", lambda quiet: check_lenses(quiet, views)):
+        shown = stage.keep(find_views(stage.context))
+    with run.beside("segmentation", lambda quiet: check_lenses(quiet, shown)):
         with run.stage("faces") as stage:
-            faces = stage.keep(find_faces(stage.context, views.capture))
+            views, faces = stage.keep(find_faces(stage.context, shown))
         with run.stage("alignment") as stage:
             alignment = stage.keep(align_head(stage.context, views, faces))
         labels, head = fit_shape(run, views, alignment)

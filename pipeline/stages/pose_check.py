@@ -1,5 +1,7 @@
 """Checks whether the delivered head lies where the photographs show the face."""
 
+from dataclasses import replace
+
 from pipeline.evidence.pose import PoseEvidence, judge_pose
 from pipeline.faces.landmark_map import landmark_map
 from pipeline.stages.alignment import Alignment
@@ -8,6 +10,7 @@ from pipeline.stages.faces import Faces
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
+from rig.messages.message import compose
 
 
 def check_pose(
@@ -24,4 +27,9 @@ def check_pose(
         method=alignment.method,
         rival=alignment.rival,
     )
+    if faces.contradicting:
+        cameras = [view.camera for view in faces.contradicting]
+        apart_mm = max(view.offset_mm for view in faces.contradicting)
+        finding = compose("pose-of-moments", cameras=cameras, offset_mm=apart_mm)
+        evidence, warnings = replace(evidence, doubtful=True), [*warnings, compose("pose-doubtful", finding=finding)]
     return Staged(evidence, warnings)

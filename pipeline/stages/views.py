@@ -1,7 +1,7 @@
 """Finds the silhouettes (section 5.4), and decides which views take part."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.stages.context import ReconstructionContext
@@ -24,6 +24,10 @@ class Views:
     silhouettes: Mapping[str, Silhouette]
     assignment: Mapping[str, str]
 
+    def count_usable(self) -> int:
+        """Counts the views that take part."""
+        return sum(silhouette.quality.usable for silhouette in self.silhouettes.values())
+
 
 def find_views(context: ReconstructionContext) -> Staged[Views]:
     """Finds the silhouettes of the capture and decides which views take part. Raises TooFewViews, ExchangedPictures,
@@ -35,6 +39,15 @@ def find_views(context: ReconstructionContext) -> Staged[Views]:
 
     found = usable_views(context.capture, rig, segmented, exchanged=settings.exchanged_pictures)
     return Staged(Views(found.capture, found.silhouettes, found.pictures), found.warnings)
+
+
+def without_odd_views(views: Views, names: Collection[str]) -> Views:
+    """Returns the views with some marked as not usable."""
+    silhouettes = {
+        name: replace(s, quality=replace(s.quality, usable=False)) if name in names else s
+        for name, s in views.silhouettes.items()
+    }
+    return replace(views, silhouettes=silhouettes)
 
 
 def check_lenses(context: ReconstructionContext, views: Views) -> Staged[None]:

@@ -56,6 +56,9 @@ EXPERIMENTS = {
         "Counts right, warned and silently wrong captures of living people.",
         {"others": inputs.facekit_or_none, "captures": inputs.folders_or_known},
     ),
+    "planted-moments": Record(
+        "experiments.people.planted_moments:planted_moments", "Counts views of another moment or person that are named."
+    ),
     "planted": Record("experiments.faults.planted:planted", "Runs whole jobs on pictures with faults of studios."),
     "visible": Record(
         "experiments.surface.visible:visible",
