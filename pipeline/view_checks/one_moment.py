@@ -54,7 +54,7 @@ class OddView:
 @dataclass(frozen=True, slots=True)
 class MomentCheck:
     """Holds the views that differ from the others. ``certain`` is False where the views contradict each other and
-    none of them can be told to be the wrong one."""
+    none of them is known to be the wrong one."""
 
     odd: tuple[OddView, ...] = ()
     certain: bool = True
@@ -93,7 +93,8 @@ def check_one_moment(subject: SubjectFaces, images: Mapping[str, ImageRgb], rig:
             sure = [name for name in left if _agree(without_views(subject, [name], rig), images, rig)]
             worst = sure[0] if len(sure) == 1 else None
         if worst is None or len(left) < 3 or 2 * (len(odd) + 1) >= count:
-            unclear = [OddView(name, "face", sizes[name]) for name in suspects]
+            doubtful = suspects if len(left) > 3 else left
+            unclear = [OddView(name, "face", sizes.get(name, 0.0)) for name in doubtful]
             return MomentCheck((*odd, *unclear), certain=False)
         odd.append(OddView(worst, "face", sizes.get(worst, 0.0)))
         subject = without_views(subject, [worst], rig)
@@ -301,9 +302,12 @@ def _part_offsets(
         weights = 1.0 / np.maximum(np.linalg.norm(rest, axis=1), 0.5)[:, None]
     offsets = {}
     for name in names:
-        own = [r if s.first == name else -r for s, r in zip(counted, rest, strict=True) if name in (s.first, s.second)]
-        if own:
-            offsets[name] = np.median(own, axis=0) if len(own) > 2 else min(own, key=lambda r: float(np.linalg.norm(r)))
+        misses = [
+            r if s.first == name else -r for s, r in zip(counted, rest, strict=True) if name in (s.first, s.second)
+        ]
+        nearest = min(misses, key=lambda r: float(np.linalg.norm(r)), default=None)
+        if nearest is not None:
+            offsets[name] = np.median(misses, axis=0) if len(misses) > 2 else nearest
     return offsets
 
 

@@ -183,7 +183,7 @@ TEMPLATES = {
     "no-face": "no face was found in the photographs, though {views} cameras stand before the head as it was fitted: its pose comes from outlines alone. Look at the overlays; give feature points or --front where it is wrong",
     "moments-differ": "{camera} was left out: its picture shows another moment or another person, since its face or its mouth lies {offset_mm:.0f} mm from where the other cameras see it. Trigger all cameras at once, or put the right picture there",
     "pose-doubtful": "{finding}",
-    "pose-of-moments": "the pictures of {cameras} show another moment or another person than the others (the face or the mouth lies up to {offset_mm:.0f} mm elsewhere), and the views are too few to leave these out or to tell which are right: take the shot again with all cameras at once, or take the wrong pictures out",
+    "pose-of-moments": "the pictures of {cameras} do not show one moment and one person with the other views (the face or the mouth lies up to {offset_mm:.0f} mm elsewhere), and the views are too few to leave some out or to tell which are right: take the shot again with all cameras at once, or take the wrong pictures out",
     "pose-rival": "another pose explains the outlines almost as well (its cost is {share:.1%} higher): look at the overlays; give feature points, --front or more views",
     "pose-one-view": "{camera} alone shows the face: how it is turned is known to some ten degrees only: give feature points, or add views from the front",
     "pose-one-sided": "no face was found, and the cameras look from nearly one side: outlines hardly tell how the head nods: give feature points, or views from the side",
