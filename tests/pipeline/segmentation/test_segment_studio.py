@@ -124,13 +124,14 @@ def test_the_preset_without_its_plates(measured: tuple[Measured, Measured, list[
     assert silent == []
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="not reached: some views stay beyond 0.8 px, mostly grey coats before grey walls and small real gaps in "
-    "hair (python -m tests.laboratory studio_masks prints them)",
-)
-def test_the_worst_view_of_the_preset(measured: tuple[Measured, Measured, list[str]]) -> None:
+def test_the_worst_view_of_the_preset(
+    measured: tuple[Measured, Measured, list[str]], request: pytest.FixtureRequest
+) -> None:
+    """Holds for three captures. In five, some views stay beyond 0.8 px: mostly grey coats before grey walls and small
+    real gaps in hair (``python -m tests.laboratory studio_masks`` prints them)."""
     plates, _, _ = measured
+    if len(plates.iou) > CAPTURES[0] * len(default_layout().names):
+        request.applymarker(pytest.mark.xfail(strict=True, reason="not reached before grey walls"))
     assert min(plates.iou) >= 0.995
     assert max(plates.rms_px) <= 0.8
 
