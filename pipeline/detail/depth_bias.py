@@ -15,7 +15,6 @@ from pipeline.compute.trace import traced
 from pipeline.detail.association import associate, interpolated
 from pipeline.detail.surface_points import SurfacePoints
 from pipeline.estimation.robust import Cauchy
-from pipeline.geometry.normals import normals_of
 from pipeline.part_labels.codes import Part
 from pipeline.stereo.window_bias import WindowBias, windowed_height
 from rig.mesh import Mesh
@@ -40,7 +39,7 @@ class OnFace:
 def points_on_face(surface: SurfacePoints, head_world: Mesh, face: Bool[np.ndarray, " v"]) -> OnFace:
     """Returns the points of skin whose closest point on the fitted head (world frame, mm) is in a triangle with all
     corners in ``face``."""
-    vertices, faces, normals = head_world.vertices, head_world.faces, normals_of(head_world)
+    vertices, faces, normals = head_world.vertices, head_world.faces, head_world.normals()
     skin = np.flatnonzero(surface.part == Part.SKIN)
     if not len(skin):
         return OnFace(skin, np.zeros((0, 3)), np.zeros(0), np.zeros(0))

@@ -15,7 +15,6 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 
 from pipeline.fusion.untangling import Topology, topology_of, untangled
-from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.part_labels.codes import Part
 from rig.mesh import Mesh, vertex_normals
@@ -74,7 +73,7 @@ def covered_share(shell: Mesh, bust: Mesh, part: UInt8[np.ndarray, " b"]) -> flo
 
 def smooth_directions(head: Mesh, topology: Topology) -> Float[np.ndarray, "v 3"]:
     """Returns unit directions out of the head, its normals averaged over their neighbours."""
-    directions, beside = normals_of(head), topology.beside
+    directions, beside = head.normals(), topology.beside
     degree = np.maximum(np.asarray(beside.sum(axis=1)).ravel(), 1.0)[:, None]
     for _ in range(DIRECTION_STEPS):
         directions = 0.5 * directions + 0.5 * (beside @ directions) / degree

@@ -25,7 +25,6 @@ from pipeline.fusion.skin import HeadSkin, combine_with_head
 from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, smooth_spots, topology_of
 from pipeline.fusion.view_stack import stack_views
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
@@ -164,7 +163,7 @@ def finished(
 
 def facing_a_camera(mesh_world: Mesh, rig: Rig) -> Bool[np.ndarray, " v"]:
     """Tells which vertices turn their outside to a camera, whether or not something hides them."""
-    normals, facing = normals_of(mesh_world), np.zeros(len(mesh_world.vertices), bool)
+    normals, facing = mesh_world.normals(), np.zeros(len(mesh_world.vertices), bool)
     for camera in rig:
         facing |= ((camera.centre_world - mesh_world.vertices) * normals).sum(axis=1) > 0.0
     return facing

@@ -17,7 +17,6 @@ from pipeline.compute.trace import traced
 from pipeline.fusion.refinement import neighbours
 from pipeline.fusion.skin import mean_around
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import normals_of
 from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import Silhouette
 from rig.camera import Camera
@@ -72,7 +71,7 @@ def grown_to_outlines(
             break
         outwards = np.zeros(len(hair))
         outwards[hair > 0.0] = missing_thickness(mesh.vertices[hair > 0.0], places, missing_mm)
-        way = (SHARE * trust * hair * outwards)[:, None] * normals_of(mesh)
+        way = (SHARE * trust * hair * outwards)[:, None] * mesh.normals()
         smooth = [mean_around(beside, way[:, axis], np.ones(len(way))) for axis in range(3)]
         mesh = Mesh(mesh.vertices + np.stack(smooth, axis=1), mesh.faces)
     return mesh, np.linalg.norm(mesh.vertices - mesh_world.vertices, axis=1)

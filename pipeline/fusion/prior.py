@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import normals_of
 from rig.mesh import Mesh, boundary_edges
 
 THICKEST_MM = 60.0  # of hair: farther out a point belongs to something else
@@ -45,7 +44,7 @@ def distance_to_subject(
         head_world: the fitted head.
         seen: what says how far the surface lies from both.
     """
-    vertices, normals = head_world.vertices[::EVERY], normals_of(head_world)[::EVERY]
+    vertices, normals = head_world.vertices[::EVERY], head_world.normals()[::EVERY]
     tree = PointTree.of(vertices)
     (thickness, gap), (head_square, hull_square) = _offsets(tree, normals, seen)
     far, near = nearest(tree, places)

@@ -27,7 +27,6 @@ from pipeline.fusion.quality import guessed_deviation_mm
 from pipeline.fusion.refinement import neighbours
 from pipeline.fusion.refinement_kernels import blurred_over_mesh, smooth_offsets
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.normals import normals_of
 from pipeline.geometry.surface_index import SurfaceIndex
 from rig.mesh import Mesh, face_normals
 
@@ -115,12 +114,12 @@ def combine_with_head(
 def heights_over(head: HeadSkin, mesh_world: Mesh) -> HeightField:
     """Returns the heights of the surface's vertices over the head, of those that lie within ``REACH_MM`` of it, face
     its way, and are not beside the open rim of its neck."""
-    vertices, normals, skin = mesh_world.vertices, normals_of(mesh_world), head.mesh_world
+    vertices, normals, skin = mesh_world.vertices, mesh_world.normals(), head.mesh_world
     low, high = skin.vertices.min(axis=0) - REACH_MM, skin.vertices.max(axis=0) + REACH_MM
     row = np.flatnonzero(((vertices > low) & (vertices < high)).all(axis=1))
     hit = SurfaceIndex(skin.vertices, skin.faces).closest(vertices[row], CANDIDATES, facing=normals[row])
     corner = skin.faces[hit.triangles]
-    normal = np.einsum("nk,nkx->nx", hit.weights, normals_of(skin)[corner])
+    normal = np.einsum("nk,nkx->nx", hit.weights, skin.normals()[corner])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     near = (hit.distances < REACH_MM) & ((hit.normals * normals[row]).sum(axis=1) > 0.0)
     near &= ~near_rim(skin, hit.points)

@@ -4,12 +4,6 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.normals_kernels import cosines_towards
-from rig.mesh import Mesh
-
-
-def normals_of(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
-    """Computes the unit vertex normals of a mesh."""
-    return mesh.normals()
 
 
 def facing_cosine(
