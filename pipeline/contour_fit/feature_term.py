@@ -13,6 +13,8 @@ from pipeline.contour_fit.problem import PER_CAMERA, POSE, ContourProblem, Obser
 from pipeline.contour_fit.rim import project_with_slopes
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import Residuals
+from pipeline.head_model.landmarks import LANDMARK_NOISE_MM
+from pipeline.multiview.triangulation import CLICK_NOISE_PX
 
 FEATURE_SCALE = 4.0  # Geman-McClure scale of a feature point, in its standard deviations
 
@@ -43,9 +45,8 @@ class FeatureTerm:
     def _deviation_px(self, slopes: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, " n"]:
         """Returns the standard deviation (px) of each feature point: a click's noise together with the landmark's
         variation between heads."""
-        settings = self.problem.settings
         pixels_per_mm = np.linalg.norm(slopes, axis=(1, 2)) / np.sqrt(2.0)
-        return np.hypot(settings.feature_noise_px, settings.landmark_noise_mm * pixels_per_mm)
+        return np.hypot(CLICK_NOISE_PX, LANDMARK_NOISE_MM * pixels_per_mm)
 
     def _rows(
         self, state: State, points: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2 3"]

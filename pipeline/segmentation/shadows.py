@@ -6,8 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from pipeline.imaging.masks import dilated
-from pipeline.segmentation.background import CHANNEL_SUM
-from pipeline.settings import SegmentationSettings
+from pipeline.segmentation.background import ANY_COLOUR_ODDS, CHANNEL_SUM
+
+DARKEST_SHADOW = 0.55  # share of the sRGB code that a soft shadow leaves (a quarter of the light)
+SHADOW_CHROMA = 0.05  # how far a shadow's colour may be from the plate's, by the light it takes
+
 
 SHADOW_CHI2 = 11.3  # three channels, 99 %: what still counts as a darker piece of the plate
 STEEP = 0.03  # change of a shadow's depth a coarse pixel; blurred by 7 of them, as in the tests, a shadow has 0.016
@@ -22,15 +25,14 @@ def find_shadows(
     chi2: Float32[np.ndarray, "h w"],
     variance: Float32[np.ndarray, "h w 3"],
     odds: Float32[np.ndarray, "h w"],
-    settings: SegmentationSettings,
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Returns the chi-squared of each pixel against the plate in its best shade, and which pixels are soft shadows or
     reflected light: they differ from the plate, a darker or brighter shade explains them, and they begin gradually."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
-    strength = np.sqrt(chi2 / (2 * settings.evidence))
+    strength = np.sqrt(chi2 / (2 * ANY_COLOUR_ODDS))
     best, soft = chi2, np.zeros(odds.shape, bool)
     for sign, most, chroma in (
-        (-1.0, 1 - settings.darkest_shadow, settings.shadow_chroma),
+        (-1.0, 1 - DARKEST_SHADOW, SHADOW_CHROMA),
         (1.0, BRIGHTEST, REFLECTED_CHROMA),
     ):
         depth = np.clip(sign * (ratio - 1), 0.0, most).astype(np.float32)

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision
 from pipeline.texturing.visibility import see_weights
 from rig.mesh import Mesh, face_normals
@@ -33,7 +32,6 @@ def fill_unobserved_patches(
     mesh_world: Mesh,
     silhouettes: Mapping[str, Silhouette],
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
-    settings: TextureSettings,
 ) -> Decision:
     """Returns the decision with a view added at the corners of every wide patch that a camera sees although it sees
     none of the corners, such as a strip that closes an eye."""
@@ -45,10 +43,7 @@ def fill_unobserved_patches(
     faces, normals, area = _parts(mesh_world, rows)
     points = np.einsum("pk,fkx->fpx", INNER, mesh_world.vertices[faces]).reshape(-1, 3)
     facing = np.repeat(normals, len(INNER), axis=0)
-    found = [
-        see_weights(view, silhouettes[view.name], depths[view.name], points, facing, settings)
-        for view in decision.views
-    ]
+    found = [see_weights(view, silhouettes[view.name], depths[view.name], points, facing) for view in decision.views]
     seen = np.stack(found).reshape(len(found), len(rows), len(INNER))
     shown = (seen > 0).mean(axis=2).max(axis=0) >= MIN_SHOWN  # the hidden side of a lid is blind as the eye is
     faces, area, seen = faces[shown], area[shown], seen[:, shown]
