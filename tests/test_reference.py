@@ -74,7 +74,7 @@ def test_every_name_of_a_setting_is_read() -> None:
                 document = {key: document}
             settings_from_document(document)
             known += 1
-    assert known > 100
+    assert known > 25
 
 
 def test_every_key_of_the_example_rig_is_described() -> None:

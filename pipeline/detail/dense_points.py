@@ -24,7 +24,7 @@ HAIR_OFF_MM = 0.5  # how far beside the skin a point lies that is hair after all
 MIN_FACING = 0.35  # cosine between a point's normal and its view: flatter windows smear
 INSIDE_MM = 4.0  # farther behind the fitted head a point shows something that neither pulls nor bounds it
 EVERY = 4  # vertices of the head stand for the others
-TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage compares no others (angle_widest_deg)
+TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage compares no others
 
 
 @traced

@@ -79,13 +79,15 @@ def texture(
     settings: TextureSettings,
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
+    outlier: float = OUTLIER,
 ) -> Texture:
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
 
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
-    weight are no brighter.
+    weight are no brighter. A view counts half where it differs from the median of the
+    views by ``outlier`` of its level.
     """
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
@@ -107,7 +109,7 @@ def texture(
         gains, offsets = balance(weights, colours)
     weights *= gain_confidence(gains)[:, None]
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
-    agreed, seen = blend_views(weights, balanced, OUTLIER)
+    agreed, seen = blend_views(weights, balanced, outlier)
     if not seen.any():
         return _untextured(len(seen))
     decision = None

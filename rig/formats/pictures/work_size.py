@@ -1,8 +1,9 @@
 """Computes the reduced size at which large photographs are read, and the cameras for pictures of that size.
 
 A head fills 60 % of a picture's height, so with four megapixels a pixel covers 0.24 mm of it: finer than depth is
-measured (0.4 mm, ``DenseSettings.pixel_mm``) and than any mesh's vertices. Limits in pixels were chosen on pictures of
-0.8 Mpx. At 12 Mpx outlines still pass them; at 24 Mpx they are wrongly reported to contradict their cameras."""
+measured (0.4 mm, ``PIXEL_MM`` of pipeline/stereo/estimate.py) and than any mesh's vertices. Limits in pixels were
+chosen on pictures of 0.8 Mpx. At 12 Mpx outlines still pass them; at 24 Mpx they are wrongly reported to contradict
+their cameras."""
 
 from dataclasses import replace
 

@@ -14,6 +14,7 @@ from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.settings import TextureSettings
 from pipeline.texturing.inpaint import fill_unknown
 from pipeline.texturing.vertex_colours import Texture, texture
+from pipeline.texturing.vertex_colours_kernels import OUTLIER
 from pipeline.texturing.visibility import sharpened
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
@@ -25,7 +26,7 @@ from tests.support.scenes import ellipsoid, fan
 EXPOSURES = np.array([0.8, 1.2, 0.9, 1.1, 1.2, 0.8, 1.0])[:, None] * np.array([1.0, 0.98, 1.03])
 
 
-def colour(shot: Shot, **settings) -> Texture:
+def colour(shot: Shot, outlier: float = OUTLIER, **settings) -> Texture:
     chosen = TextureSettings(**settings)
     return texture(
         shot.mesh,
@@ -35,6 +36,7 @@ def colour(shot: Shot, **settings) -> Texture:
         shot.rig,
         depth_maps(shot.rig, shot.mesh),
         settings=chosen,
+        outlier=outlier,
     )
 
 
