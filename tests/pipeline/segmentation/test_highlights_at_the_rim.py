@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from pipeline.segmentation.foreground import find_shadows
 from pipeline.segmentation.matting import COARSE_ALPHA_SIGMA, LINEAR, SHADE
 from pipeline.segmentation.matting_kernels import solve_alpha
-from pipeline.segmentation.shadows import find_shadows
 from pipeline.settings import SegmentationSettings
 
 WALL, SKIN = (103, 103, 105), (221, 180, 165)
