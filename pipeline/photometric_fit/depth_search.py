@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
-from pipeline.compute.threads import map_in_threads
+from pipeline.compute.threads import in_threads, map_in_threads
 from pipeline.contour_fit.problem import ContourProblem, State, SurfaceObservations, moved_views
 from pipeline.contour_fit.rim import Views
 from pipeline.geometry.normals import facing_cosine
@@ -23,14 +23,15 @@ from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import rasterise
 from pipeline.multiview.parallax import depth_factor, parallax
 from pipeline.photometric_fit.camera_term import camera_sensitivity, gram_matrices
-from pipeline.photometric_fit.correlation import choose_views, correlate, sweep
-from pipeline.photometric_fit.correlation_kernels import Pictures, Samples
+from pipeline.photometric_fit.correlation_kernels import Members, Pictures, Samples, correlate_views, sweep_pictures
 from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred, distance_of
 from pipeline.photometric_fit.patches import Patches
 from rig.camera import Camera
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 from rig.parabola import second_difference, vertex_offset
+
+MIN_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
 
 CENTRE_MM = 3.0  # distance of patches
 MAX_VIEWS = 5  # most frontal views between which a patch is compared
@@ -340,3 +341,51 @@ def find_peaks(score: Float32[np.ndarray, "c d"], steps: Float[np.ndarray, " d"]
         curvature=-curvature / step**2,
         inside=best == middle,
     )
+
+
+def choose_views(
+    patches: Patches, weights: Float[np.ndarray, " e"], facing: Float32[np.ndarray, "k s"], least_seen: float, most: int
+) -> tuple[Int[np.ndarray, "c n"], Float[np.ndarray, "c n"]]:
+    """Chooses the views that compare each patch: at most ``most`` of those that see it most frontally and nearly whole
+    (``least_seen``, a share). Returns them with their weights, the squared cosine between normal and line of sight; -1
+    and 0 where there are fewer."""
+    total = patches.sums(weights, np.ones((facing.shape[1], 1)))
+    seen = patches.sums(weights, (facing > 0).T.astype(float))
+    cosine = patches.sums(weights, facing.T.astype(float)) / np.maximum(seen, 1e-9)
+    value = np.where(seen > least_seen * total, cosine**2, 0.0)
+    view = np.argsort(-value, axis=1, kind="stable")[:, :most]
+    value = np.take_along_axis(value, view, axis=1)
+    speaks = value > MIN_VIEW
+    return np.where(speaks, view, -1), np.where(speaks, value, 0.0)
+
+
+def sweep(samples: Samples, pictures: Pictures, steps: Float[np.ndarray, " d"]) -> Float32[np.ndarray, "s k d"]:
+    """Returns the grey value that each camera shows for every sample after it is moved along its normal by each of
+    ``steps`` (mm)."""
+    cameras, count = samples.seen.shape
+    out = np.zeros((count, cameras, len(steps)), np.float32)
+    in_threads(count, lambda a, b: sweep_pictures(a, b, samples, pictures, steps, out))
+    return out
+
+
+def correlate(
+    patches: Patches,
+    weights: Float[np.ndarray, " e"],
+    view: Int[np.ndarray, "c n"],
+    value: Float[np.ndarray, "c n"],
+    seen: Bool[np.ndarray, "k s"],
+    *,
+    grey: Float32[np.ndarray, "s k d"],
+    noise: Float[np.ndarray, " k"],
+) -> Float32[np.ndarray, "c d"]:
+    """Returns the mean normalised cross-correlation over the pairs of each patch's chosen views, for every step along
+    the normal; 0 if there is no pair.
+
+    Gain and offset of a view have no effect. ``noise``, the standard deviation of each camera's grey values, is part of
+    the norm, so that patches without texture correlate with nothing. ``view`` and ``value`` are the results of
+    ``choose_views``, ``grey`` that of ``sweep``.
+    """
+    score = np.zeros((len(patches.centre), grey.shape[2]), np.float32)
+    members = Members(patches.start, patches.member, weights)
+    in_threads(len(score), lambda a, b: correlate_views(a, b, members, view, value, seen, grey, noise, score))
+    return score

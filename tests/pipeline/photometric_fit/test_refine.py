@@ -12,8 +12,7 @@ from pipeline.contour_fit.surface_term import SurfaceTerm
 from pipeline.estimation.terms import NormalEquations
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.grey import noise_level
-from pipeline.photometric_fit.correlation import choose_views, correlate
-from pipeline.photometric_fit.depth_search import facing_of, pixels_per_mm, sample_visibility
+from pipeline.photometric_fit.depth_search import choose_views, correlate, facing_of, pixels_per_mm, sample_visibility
 from pipeline.photometric_fit.patches import Patches, spread_samples
 from pipeline.photometric_fit.refine import (
     LOST_MM,

@@ -8,12 +8,11 @@ import numpy as np
 from pipeline.geometry.raster import depth_maps
 from pipeline.head_model.subdivision import boundary_loops, close_loop
 from pipeline.settings import TextureSettings
-from pipeline.texturing.blind_patches import fill_unobserved_patches
 from pipeline.texturing.inpaint import neighbours
 from pipeline.texturing.layout.uv_unwrap import unwrap
 from pipeline.texturing.neighbourhood import Neighbourhood
 from pipeline.texturing.paint import paint_texture
-from pipeline.texturing.vertex_colours import texture
+from pipeline.texturing.vertex_colours import fill_unobserved_patches, texture
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
 from tests.support.photographs import shoot
