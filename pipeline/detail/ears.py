@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from pipeline.detail.association import Target, interpolated
 from pipeline.detail.surface_points import SurfacePoints
 from pipeline.geometry.nearest import PointTree, nearest
+from pipeline.geometry.registration.rigid import motion_columns, solve_with_prior
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
@@ -27,6 +28,7 @@ ROBUST_SHARE = 0.4  # of the reach
 MIN_POINTS, MIN_SHOWN = 80, 80  # about the ear, and on it
 TURN_SD, SCALE_SD, SHIFT_SD_MM = 0.2, 0.08, 8.0  # of the motion, against points worth ...
 POINT_SD_MM = 3.0  # ... that each: they are many, and the shape is another's
+PRIOR = np.array([TURN_SD**-2] * 3 + [SHIFT_SD_MM**-2] * 3 + [SCALE_SD**-2])
 AGREEMENT = 0.4
 
 
@@ -128,7 +130,6 @@ def _descend(
     The points are mapped back to the ear as it was, so that the search tree is built only once.
     """
     scale, turn, cost, shown = 1.0, np.eye(3), np.inf, 0
-    prior = np.diag([TURN_SD**-2] * 3 + [SHIFT_SD_MM**-2] * 3 + [SCALE_SD**-2])
     for reach in REACHES_MM:
         back = (points.points - centre - shift) @ turn / scale
         found = target.closest(back, points.normals @ turn, reach_mm=reach / scale, least_agreement=AGREEMENT)
@@ -143,10 +144,8 @@ def _descend(
         missing = len(points.points) - len(found.row)
         square = distance_mm**2 / (distance_mm**2 + robust**2)
         cost = float((square.sum() + missing) / len(points.points))
-        rows = np.concatenate([np.cross(arm, ahead), ahead, (arm * ahead).sum(axis=1, keepdims=True)], axis=1)
-        weighted = rows * weight[:, None] / POINT_SD_MM**2
         state = np.concatenate([np.zeros(3), shift, [np.log(scale)]])
-        step = np.linalg.solve(weighted.T @ rows + prior, weighted.T @ off - prior @ state)
+        step = solve_with_prior(motion_columns(arm, ahead, scale=True), off, weight / POINT_SD_MM**2, PRIOR, state)
         turn = rotation_from_vector(step[:3]) @ turn
         shift, scale = shift + step[3:6], scale * float(np.exp(step[6]))
     return Motion(cost, scale, turn, shift, shown)

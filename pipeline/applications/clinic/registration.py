@@ -20,7 +20,7 @@ from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
 from pipeline.applications.clinic.surface import PatientSurface
 from pipeline.applications.clinic.trimmed_fit import Patch, TrimmedFit, trimmed_fit
 from pipeline.applications.clinic.visit import Visit
-from pipeline.applications.verification.best_fit import ROUNDS, drawn, search_motions, surface_points
+from pipeline.geometry.registration.search import ROUNDS, draw_rows, draw_surface_points, search_motions
 from pipeline.head_model.landmarks import stacked
 from rig.errors import InputError
 from rig.geometry import RigidTransform, rigid_fit
@@ -79,7 +79,7 @@ def register(
     rng = np.random.default_rng(0)
     face = measured.regions["face"] & ~measured.regions["eyes"]
     rows = np.flatnonzero(face & (visit.views > 0) if (face & (visit.views > 0)).any() else face)
-    rows = rows[drawn(measured.areas[rows], POINTS, rng)]
+    rows = rows[draw_rows(measured.areas[rows], POINTS, rng)]
     normals = measured.mesh_world.normals()
     patch = Patch(measured.mesh_world.vertices[rows], normals[rows], measured.areas[rows])
     names = [name for name in landmarks or {} if name in measured.landmarks]
@@ -102,7 +102,7 @@ def _searched(visit: Visit, surface: PatientSurface, patch: Patch, rng: np.rando
     forward = np.array([0.0, -1.0 if surface.axes == "LPS" else 1.0, 0.0])
     angles = [(nod, turn) for nod in TURNS_DEG["x"] for turn in TURNS_DEG["z"]]
     turns = Rotation.from_euler("xz", angles, degrees=True).as_matrix()
-    points, facing = surface_points(surface.reference, rng)
+    points, facing = draw_surface_points(surface.reference.index, rng)
     ahead = points[facing @ forward > FORWARD]
     ahead = points if len(ahead) < 10 * PLACES else ahead
     places = np.asarray(kmeans2(ahead, PLACES, minit="++", rng=rng)[0])

@@ -1,9 +1,8 @@
 """Lays points of a head on a surface by a rigid motion that a part of them may contradict.
 
-Iterations of closest points with steps on distances along the surface's normals (Chen and Medioni 1992). Of the points
-with a counterpart the nearest ``share`` counts (trimmed ICP, Chetverikov et al. 2002), and among these Tukey's biweight
-takes off what stands out of their scatter. A surface that faces the other way, as those of airways and skull below the
-skin do, is no counterpart.
+Of the points with a counterpart the nearest ``share`` counts (trimmed ICP, Chetverikov et al. 2002), and among these
+Tukey's biweight takes off what stands out of their scatter. A surface that faces the other way, as those of airways and
+skull below the skin do, is no counterpart.
 """
 
 from collections.abc import Callable
@@ -13,8 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import ndtri
 
+from pipeline.geometry.registration.rigid import Counterparts, fit_motion, motion_columns
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
-from rig.geometry import RigidTransform, rotation_from_vector
+from rig.geometry import RigidTransform, Similarity
 
 TUKEY = 4.685  # standard deviations at which a point no longer counts: 95 % efficient with normal errors
 MIN_STD_MM = 0.01
@@ -59,7 +59,7 @@ class TrimmedFit:
 
     def std_along(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Returns how far the motion's error moves points on the surface along normals: standard deviations, mm."""
-        jacobian = np.concatenate([np.cross(points - self.centre, normals), normals], axis=1)
+        jacobian = motion_columns(points - self.centre, normals)
         return np.sqrt(np.einsum("np,pq,nq->n", jacobian, self.covariance, jacobian))
 
 
@@ -80,65 +80,67 @@ def trimmed_fit(
         share: of the points with a counterpart, the nearest, that count.
         beside: tells which closest points lie on an open edge of the surface.
     """
-    motion, reach = start, MAX_REACH_MM
-    for _ in range(STEPS):
-        there = motion.apply(patch.points)
-        hits, valid = _counterparts(patch, surface, motion, there, reach, beside)
-        if valid.sum() < MIN_POINTS:
+    reached = MAX_REACH_MM
+
+    def meet(motion: Similarity, there: Float[np.ndarray, "n 3"], reach: float) -> Counterparts | None:
+        nonlocal reached
+        met = _met(patch, surface, motion, there, reach, share=share, beside=beside)
+        if met is None:
             return None
-        residual = _residuals(hits, there)
-        weights, std = _weights(residual, valid, share)
-        step, centre = _step(there, hits.normals, residual, weights * patch.areas)
-        turn = rotation_from_vector(step[:3])
-        moved = RigidTransform(turn, centre + step[3:] - turn @ centre)
-        motion = moved @ motion
-        still = float(np.abs(moved.apply(there) - there).max()) < STILL_MM
-        if still and reach <= max(MIN_REACH_MM, TUKEY * std):
-            break
-        reach = max(0.7 * reach, MIN_REACH_MM, TUKEY * std)
-    return _finished(patch, surface, motion, share, reach, beside)
+        reached = max(0.7 * reach, MIN_REACH_MM, TUKEY * met.std_mm)
+        return Counterparts(met.hits.normals, -met.residual, met.weights * patch.areas, reached)
 
-
-def _finished(
-    patch: Patch,
-    surface: SurfaceIndex,
-    motion: RigidTransform,
-    share: float,
-    reach: float,
-    beside: Callable[[Hits], Bool[np.ndarray, " n"]],
-) -> TrimmedFit | None:
-    there = motion.apply(patch.points)
-    hits, valid = _counterparts(patch, surface, motion, there, reach, beside)
-    if valid.sum() < MIN_POINTS:
+    found = fit_motion(
+        patch.points, meet, Similarity.from_rigid(start), reach_mm=MAX_REACH_MM, steps=STEPS, still_mm=STILL_MM
+    )
+    if found is None:
         return None
-    residual = _residuals(hits, there)
-    weights, std = _weights(residual, valid, share)
-    centre = np.average(there, axis=0, weights=weights * patch.areas)
-    jacobian = np.concatenate([np.cross(there - centre, hits.normals), hits.normals], axis=1)
-    independent = weights * patch.areas / (np.pi * CORRELATED_MM**2)
+    there = found.apply(patch.points)
+    met = _met(patch, surface, found, there, reached, share=share, beside=beside)
+    if met is None:
+        return None
+    centre = np.average(there, axis=0, weights=met.weights * patch.areas)
+    jacobian = motion_columns(there - centre, met.hits.normals)
+    independent = met.weights * patch.areas / (np.pi * CORRELATED_MM**2)
     information = np.einsum("np,n,nq->pq", jacobian, independent, jacobian)
-    covariance = std**2 * np.linalg.pinv(information, hermitian=True)
-    return TrimmedFit(motion, np.where(valid, residual, np.nan), weights, std, centre, covariance)
+    covariance = met.std_mm**2 * np.linalg.pinv(information, hermitian=True)
+    residual = np.where(met.valid, met.residual, np.nan)
+    return TrimmedFit(
+        RigidTransform(found.rotation, found.translation), residual, met.weights, met.std_mm, centre, covariance
+    )
 
 
-def _counterparts(
+@dataclass(frozen=True, slots=True, eq=False)
+class _Met:
+    """Holds the closest points of a surface, which of them are counterparts, the signed distances from them along the
+    surface's normals (positive where the points lie outside), the weights, and the deviation of those that count."""
+
+    hits: Hits
+    valid: Bool[np.ndarray, " n"]
+    residual: Float[np.ndarray, " n"]
+    weights: Float[np.ndarray, " n"]
+    std_mm: float
+
+
+def _met(
     patch: Patch,
     surface: SurfaceIndex,
-    motion: RigidTransform,
+    motion: Similarity,
     there: Float[np.ndarray, "n 3"],
     reach: float,
+    *,
+    share: float,
     beside: Callable[[Hits], Bool[np.ndarray, " n"]],
-) -> tuple[Hits, Bool[np.ndarray, " n"]]:
-    """Returns the closest points of the surface, and which of them are counterparts."""
+) -> _Met | None:
+    """Returns what the points meet where the motion brings them, None if fewer than ``MIN_POINTS`` do."""
     normals = patch.normals @ motion.rotation.T
     hits = surface.closest(there, facing=normals, facing_mm=FACING_MM)
     alike = np.einsum("nx,nx->n", normals, hits.normals) > FACING
-    return hits, (hits.distances < reach) & alike & ~beside(hits)
-
-
-def _residuals(hits: Hits, there: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Returns signed distances along the surface's normals, positive where the points lie outside."""
-    return np.einsum("nx,nx->n", there - hits.points, hits.normals)
+    valid = (hits.distances < reach) & alike & ~beside(hits)
+    if valid.sum() < MIN_POINTS:
+        return None
+    residual = np.einsum("nx,nx->n", there - hits.points, hits.normals)
+    return _Met(hits, valid, residual, *_weights(residual, valid, share))
 
 
 def _weights(
@@ -151,16 +153,3 @@ def _weights(
     std = max(float(np.median(away[kept])) / normal, MIN_STD_MM)
     weights = np.where(kept, np.maximum(1.0 - (away / (TUKEY * std)) ** 2, 0.0) ** 2, 0.0)
     return weights, std
-
-
-def _step(
-    there: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    residual: Float[np.ndarray, " n"],
-    weights: Float[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, " 6"], Float[np.ndarray, " 3"]]:
-    """Returns the turn (rad) about the weighted middle and the shift (mm) that undo the residuals, and that middle."""
-    centre = np.average(there, axis=0, weights=weights)
-    jacobian = np.concatenate([np.cross(there - centre, normals), normals], axis=1)
-    root = np.sqrt(weights / weights.sum())
-    return np.linalg.lstsq(jacobian * root[:, None], -residual * root, rcond=None)[0], centre

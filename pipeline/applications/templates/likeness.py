@@ -14,11 +14,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from pipeline.applications.templates.placement import Surface, samples
+from pipeline.geometry.registration.rigid import motion_about, motion_columns, solve_with_prior
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.gaussian_process import with_kernel
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
-from rig.geometry import Similarity, rotation_from_vector
+from rig.geometry import Similarity
 from rig.mesh import vertex_normals
 
 
@@ -110,7 +111,7 @@ def fit_model_to_mesh(
             points = np.concatenate([head[rows], np.repeat(marks.on(head), 3, axis=0)])
             met = np.concatenate([met, np.repeat(marks.points, 3, axis=0)])
             planes = np.concatenate([planes, np.tile(np.eye(3), (len(marks.points), 1))])  # a mark is three planes
-            z, place = _gauss_newton_step(modes[:, :, :active], points, met, planes, information, z=z, place=place)
+            z, place = _step(modes[:, :, :active], points, met, planes, information, z=z, place=place)
     head = place.apply(wide.vertices(z))
     normals = vertex_normals(head, full.faces)[rows]
     _, _, off, weight = target.meet(head[rows], normals, replace(STAGES[-1], reach_mm=MET_MM))
@@ -174,7 +175,7 @@ class MetSurface:
         return hits.points - BULGE * bulge, planes
 
 
-def _gauss_newton_step(
+def _step(
     modes: Float[np.ndarray, "s 3 m"],
     points: Float[np.ndarray, "s 3"],
     met: Float[np.ndarray, "s 3"],
@@ -190,22 +191,11 @@ def _gauss_newton_step(
     turned = (place.scale * planes @ place.rotation).astype(np.float32)  # n^T s R
     along = sum(turned[:, axis, None] * modes[:, axis] for axis in range(3))
     centre = points.mean(axis=0)
-    arm = points - centre
-    swell = np.einsum("nx,nx->n", arm, planes)[:, None]
-    columns = np.concatenate([along, np.cross(arm, planes), planes, swell], axis=1)
-    root = np.sqrt(information)[:, None]
-    weighted = (columns * root).astype(np.float32)
-    residual = np.einsum("nx,nx->n", met - points, planes) * root[:, 0]
-    system = (weighted.T @ weighted).astype(float)
-    system[range(active), range(active)] += 1.0
-    system[range(active, active + 7), range(active, active + 7)] += 1e-3 * np.trace(system) / len(system) * 1e-3
-    right = weighted.T.astype(float) @ residual
-    right[:active] -= z[:active]
-    delta = np.linalg.solve(system, right)
+    columns = np.concatenate([along, motion_columns(points - centre, planes, scale=True)], axis=1)
+    ahead, prior = np.einsum("nx,nx->n", met - points, planes), np.repeat([1.0, 0.0], [active, 7])
+    state = np.concatenate([z[:active], np.zeros(7)])
+    step = solve_with_prior(columns, ahead, information, prior, state, precision=np.float32, ridge=1e-6)
+    step[-1] = np.clip(step[-1], -0.1, 0.1)
     new = z.copy()
-    new[:active] += delta[:active]
-    turn, shift, growth = np.split(delta[active:], [3, 6])
-    twist = rotation_from_vector(turn)
-    grown = float(np.exp(np.clip(growth[0], -0.1, 0.1)))
-    moved = grown * twist @ (place.translation - centre) + centre + shift
-    return new, Similarity(grown * place.scale, twist @ place.rotation, moved)
+    new[:active] += step[:active]
+    return new, motion_about(centre, step[active:]) @ place

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.geometry.registration.rigid import motion_about, motion_columns, solve_with_prior
 from pipeline.geometry.surface_index import Hits, SurfaceIndex
 from pipeline.head_model.model import HeadModel
-from rig.geometry import RigidTransform, rotation_from_vector
+from rig.geometry import RigidTransform
 
 _STEP_MM = 5e-3  # mean move of a step at which the iteration ends
 
@@ -63,9 +64,7 @@ def fit_surface(
         hits = _closest(model, z, pose, level, faces, points)
         scale = max(3.0 * float(np.median(hits.distances)), 3.0 * sigma_mm) if step < 12 else np.inf
         robust = (1 + (hits.distances / scale) ** 2) ** -2
-        moved, z, pose = _gauss_newton_step(
-            basis[: min(active, count)], faces, hits, points, information * robust, z=z, pose=pose
-        )
+        moved, z, pose = _step(basis[: min(active, count)], faces, hits, points, information * robust, z=z, pose=pose)
         used = step + 1
         if step > 12 and moved < _STEP_MM:
             break
@@ -83,7 +82,7 @@ def _closest(
     return SurfaceIndex(pose.apply(model.vertices(z, level)), faces).closest(points)
 
 
-def _gauss_newton_step(
+def _step(
     basis: Float[np.ndarray, "m V 3"],
     faces: Int[np.ndarray, "F 3"],
     hits: Hits,
@@ -94,27 +93,14 @@ def _gauss_newton_step(
     pose: RigidTransform,
 ) -> tuple[float, Float[np.ndarray, " M"], RigidTransform]:
     """Takes one Gauss-Newton step. Returns the mean length of its move (mm), and the new coefficients and pose."""
-    active = len(basis)
-    corners = faces[hits.triangles]
-    normals = hits.normals
+    active, corners, normals = len(basis), faces[hits.triangles], hits.normals
     centre = points.mean(0)
-    jacobian = np.empty((len(points), active + 6))
     turned = normals @ pose.rotation  # n^T R
-    for k in range(active):
-        moves = np.einsum("nc,ncx->nx", hits.weights, basis[k][corners])
-        jacobian[:, k] = np.einsum("nx,nx->n", moves, turned)
-    jacobian[:, active : active + 3] = normals
-    jacobian[:, active + 3 :] = np.cross(hits.points - centre, normals)
-    residual = np.einsum("nx,nx->n", points - hits.points, normals)
-    weighted = jacobian * information[:, None]
-    normal_matrix = weighted.T @ jacobian
-    normal_matrix[range(active), range(active)] += 1.0  # prior
-    gradient = weighted.T @ residual
-    gradient[:active] -= z[:active]
-    delta = np.linalg.solve(normal_matrix, gradient)
+    along = np.einsum("mncx,nc,nx->nm", basis[:, corners], hits.weights, turned, optimize=True)
+    columns = np.concatenate([along, motion_columns(hits.points - centre, normals)], axis=1)
+    ahead, prior = np.einsum("nx,nx->n", points - hits.points, normals), np.repeat([1.0, 0.0], [active, 6])
+    step = solve_with_prior(columns, ahead, information, prior, np.concatenate([z[:active], np.zeros(6)]))
     new = z.copy()
-    new[:active] += delta[:active]
-    twist = rotation_from_vector(delta[active + 3 :])
-    shift = delta[active : active + 3]
-    moved = RigidTransform(twist @ pose.rotation, twist @ (pose.translation - centre) + centre + shift)
-    return float(np.abs(jacobian @ delta).mean()), new, moved
+    new[:active] += step[:active]
+    moved = motion_about(centre, step[active:]) @ pose
+    return float(np.abs(columns @ step).mean()), new, RigidTransform(moved.rotation, moved.translation)

@@ -1,0 +1,104 @@
+"""Searches a rigid motion from many starts, by trimmed iterations of points closest in position and direction (Besl and
+McKay 1992, https://doi.org/10.1109/34.121791): briefly from all of them, longer from the best."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from pipeline.geometry.surface_index import SurfaceIndex
+from rig.geometry import Similarity, nearest_rotation
+
+SURFACE_POINTS = 6000  # of the surface: 6 mm apart on a head
+TURN_MM = 30.0  # distance that a difference of one between unit normals counts as
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Holds one round of the search: how many points and iterations of closest points it uses, and how many of the best
+    starts it keeps."""
+
+    points: int
+    iterations: int
+    share: float  # of the points, the nearest, that count: a scan may lack all but the face
+    kept: int
+
+
+ROUNDS = (Round(50, 6, 0.7, 60), Round(100, 12, 0.7, 16), Round(240, 25, 0.6, 8))
+
+
+def search_motions(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    surface: Float[np.ndarray, "m 3"],
+    facing: Float[np.ndarray, "m 3"],
+    *,
+    turns: Float[np.ndarray, "t 3 3"],
+    places: Float[np.ndarray, "p 3"],
+) -> list[Similarity]:
+    """Returns the best starting motions of points in random order: every turn with the points' middle at every place is
+    tried briefly with few of them, fewer motions longer with more.
+
+    Args:
+        points: with their unit ``normals``.
+        normals: of the points.
+        surface: points of the other surface, with their unit normals ``facing``.
+        facing: of these.
+        turns: rotations to begin with.
+        places: where the points' middle may lie.
+    """
+    middle = points.mean(axis=0)
+    points = points - middle
+    tree = KDTree(np.concatenate([surface, TURN_MM * facing], axis=1))
+    rotations, translations = np.repeat(turns, len(places), axis=0), np.tile(places, (len(turns), 1))
+    for stage in ROUNDS:
+        some = slice(0, stage.points)
+        means, rotations, translations = _closest_points(
+            points[some], normals[some], surface, tree, rotations=rotations, translations=translations, stage=stage
+        )
+        best = np.argsort(means)[: stage.kept]
+        rotations, translations = rotations[best], translations[best]
+    return [Similarity(1.0, r, t - r @ middle) for r, t in zip(rotations, translations, strict=True)]
+
+
+def _closest_points(
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    surface: Float[np.ndarray, "m 3"],
+    tree: KDTree,
+    *,
+    rotations: Float[np.ndarray, "k 3 3"],
+    translations: Float[np.ndarray, "k 3"],
+    stage: Round,
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3 3"], Float[np.ndarray, "k 3"]]:
+    """Runs trimmed iterations of points closest in position and direction, for all starts at once. Returns the mean
+    distance of the points that count, and the motions."""
+    kept, means = int(stage.share * len(points)), np.full(len(rotations), np.inf)
+    for _ in range(stage.iterations):
+        there = np.einsum("kij,nj->kni", rotations, points) + translations[:, None]
+        turned = TURN_MM * np.einsum("kij,nj->kni", rotations, normals)
+        far, near = map(np.asarray, tree.query(np.concatenate([there, turned], axis=2)))
+        order = np.argsort(far, axis=1)[:, :kept]
+        means = np.take_along_axis(far, order, axis=1).mean(axis=1)
+        source, target = points[order], surface[np.take_along_axis(near, order, axis=1)]
+        source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+        moments = np.einsum("kni,knj->kij", target - target_mean[:, None], source - source_mean[:, None])
+        rotations = np.stack([nearest_rotation(moment) for moment in moments])
+        translations = target_mean - np.einsum("kij,kj->ki", rotations, source_mean)
+    return means, rotations, translations
+
+
+def draw_surface_points(
+    surface: SurfaceIndex, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Returns points drawn over a surface by area (middles of triangles), and their normals."""
+    corners = surface.corners
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = draw_rows(area, SURFACE_POINTS, rng)
+    return corners[chosen].mean(axis=1), surface.normals(chosen)
+
+
+def draw_rows(weights: Float[np.ndarray, " n"], count: int, rng: np.random.Generator) -> Int[np.ndarray, " k"]:
+    """Returns at most ``count`` different rows, drawn by their weights."""
+    return rng.choice(len(weights), min(count, int((weights > 0).sum())), replace=False, p=weights / weights.sum())
