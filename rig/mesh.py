@@ -41,3 +41,19 @@ def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     # Both ends are packed into one number: sorting rows takes thirty times as long.
     _, first, count = np.unique((low << 32) | high, return_index=True, return_counts=True)
     return edges[first[count == 1]]
+
+
+def edges_of(
+    faces: Int[np.ndarray, "F 3"],
+) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "F 3"], Int[np.ndarray, " E"]]:
+    """Returns the mesh's edges (sorted pairs of vertices), the index of the edge opposite each corner of each triangle,
+    and the number of triangles at each edge."""
+    directed = np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]]).astype(np.int64)
+    low, high = directed.min(1), directed.max(1)
+    base = int(faces.max()) + 1
+    keys, inverse, counts = np.unique(low * base + high, return_inverse=True, return_counts=True)
+    return (
+        np.stack([keys // base, keys % base], 1).astype(np.int32),
+        inverse.reshape(3, -1).T.astype(np.int32),
+        counts.astype(np.int32),
+    )

@@ -11,7 +11,7 @@ import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 
 from rig.errors import EigenheadError
-from rig.mesh import boundary_edges, face_normals
+from rig.mesh import boundary_edges, edges_of, face_normals
 
 
 class NotAManifold(EigenheadError):
@@ -26,22 +26,6 @@ def row_count(operator: sparse.csr_array) -> int:
     shape = operator.shape
     assert shape is not None
     return int(shape[0])
-
-
-def edges_of(
-    faces: Int[np.ndarray, "F 3"],
-) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "F 3"], Int[np.ndarray, " E"]]:
-    """Returns the mesh's edges (sorted pairs of vertices), the index of the edge opposite each corner of each triangle,
-    and the number of triangles at each edge."""
-    directed = np.concatenate([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]]).astype(np.int64)
-    low, high = directed.min(1), directed.max(1)
-    base = int(faces.max()) + 1
-    keys, inverse, counts = np.unique(low * base + high, return_inverse=True, return_counts=True)
-    return (
-        np.stack([keys // base, keys % base], 1).astype(np.int32),
-        inverse.reshape(3, -1).T.astype(np.int32),
-        counts.astype(np.int32),
-    )
 
 
 def check_manifold(faces: Int[np.ndarray, "F 3"]) -> None:

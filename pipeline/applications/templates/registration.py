@@ -1,7 +1,7 @@
 """Registers a foreign mesh to a head model, once (section 3.2, the other way round).
 
 The model is fitted to the mesh as closely as it can (``fit_model_to_mesh``). Then the mesh's skin is deformed onto that
-head by the non-rigid refinement of ``correspondence``, so that a difference between the two does not appear in results.
+head by ``geometry.registration.nonrigid``, so that a difference between the two does not appear in results.
 Every vertex of the skin now has its point on the model's surface, and deeper ones follow (``carrying``).
 """
 
@@ -13,10 +13,10 @@ import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.applications.model_building.correspondence.correspondence import Search, Target, refined
 from pipeline.applications.templates.carrying import Attachment, SurfaceBinding, bind_vertices, surface_binding
 from pipeline.applications.templates.likeness import CANDIDATES, Likeness, SurfaceMarks, fit_model_to_mesh
 from pipeline.applications.templates.placement import Surface, find_place, outward, place_by_landmarks
+from pipeline.geometry.registration.nonrigid import Search, Target, draw_to_target
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.gaussian_process import spread_nodes
@@ -258,7 +258,7 @@ def _drawn(
     for here, there in marks:
         nearest = int(np.linalg.norm(vertices - here, axis=1).argmin())
         pulled[nearest] = there + vertices[nearest] - here
-    out[rows] = refined(vertices, faces, target, DRAWN, STIFFNESS, marks=pulled, mark_weight=MARK_WEIGHT)
+    out[rows] = draw_to_target(vertices, faces, target, DRAWN, STIFFNESS, marks=pulled, mark_weight=MARK_WEIGHT)
     return out
 
 

@@ -1,7 +1,7 @@
 """Brings a template onto a scan that lies where the mean head lies: first the model, then the template's own vertices.
 
 The first step is that of a template's registration (``templates``), with the scan in the template's place. The second
-is the non-rigid refinement of ``correspondence``, with exact closest points of the scan's triangles.
+is that of ``geometry.registration.nonrigid``, with exact closest points of the scan's triangles.
 """
 
 from dataclasses import dataclass
@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.applications.model_building.correspondence.correspondence import relaxed
 from pipeline.applications.templates.likeness import Likeness, MetSurface, Stage, SurfaceMarks, fit_model_to_mesh
 from pipeline.applications.templates.placement import Surface
 from pipeline.applications.templates.registration import components, weld
 from pipeline.applications.templates.template_file import Template
 from pipeline.fusion.untangling import topology_of, untangled
+from pipeline.geometry.registration.nonrigid import draw_to_matches
 from pipeline.head_model.model import HeadModel, with_expressions
 from rig.mesh import vertex_normals
 from rig.progress import Progress
@@ -81,7 +81,7 @@ def drawn_onto(
     outside = skin | ~_near_face(start, model)
 
     known = np.where(skin, 1.0, np.where(outside, FOLLOWING, 0.0))
-    start = relaxed(start, faces, lambda shape: (goal, known), (CARRYING,))
+    start = draw_to_matches(start, faces, lambda shape: (goal, known), (CARRYING,))
     weight = np.zeros(len(rows))
     reaches = iter(REACH_MM)
 
@@ -93,7 +93,7 @@ def drawn_onto(
         along = np.einsum("nx,nx->n", met - shape, planes)
         return shape + along[:, None] * planes, weight
 
-    drawn = relaxed(start, faces, match, STIFFNESS)
+    drawn = draw_to_matches(start, faces, match, STIFFNESS)
     drawn = untangled(drawn, topology_of(faces, len(drawn)))
     whole, met = np.zeros((len(parts), 3)), np.zeros(len(parts), bool)
     whole[rows], met[rows] = drawn, weight > 0.0

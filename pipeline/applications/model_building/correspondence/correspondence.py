@@ -7,42 +7,36 @@ the surface free to slide between them, so by default a refinement follows: the 
 heads (``prior``), given the scan's landmarks and surface, and from there a smooth displacement along the normals onto
 the scan."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from types import MappingProxyType
 
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Float32, Int
-from scipy.sparse.linalg import splu
-from scipy.spatial import KDTree
 
 from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex, coordinates, points_at
 from pipeline.applications.model_building.correspondence.parallel import Workers, workers
 from pipeline.applications.model_building.correspondence.prior import Prior, registration_prior
 from pipeline.applications.model_building.correspondence.scans import Scan
+from pipeline.geometry.registration.nonrigid import Search, Target, dots, draw_to_target, match_points, oriented_tree
+from pipeline.geometry.registration.rigid import motion_columns, solve_with_prior
 from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.landmarks import NAMES, stacked
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.pca import align
-from pipeline.head_model.subdivision import edges_of, vertex_areas
-from rig.geometry import RigidTransform, cross_matrix, rigid_fit
-from rig.mesh import vertex_normals
+from pipeline.head_model.subdivision import vertex_areas
+from rig.geometry import RigidTransform, rigid_fit
+from rig.mesh import edges_of, vertex_normals
 from rig.progress import Progress
 
 _TAUBIN = (0.5, -0.53)  # weights of a step that smooths and of one that restores the size
 _SMOOTHINGS = 4  # pairs of steps: they halve the noise of points; 8 would remove fine shape too
 
 
-@dataclass(frozen=True, slots=True)
-class Search:
-    """Holds the limits of one stage in which points of a head are searched on a scan. Lengths in mm."""
-
-    steps: int
-    reach_mm: float  # a match farther than this is another part of the head
-    normal_mm: float  # a right angle between normals counts as much as this many mm
-    plane_mm: float  # residual that weighs as much as one standard deviation of a mode, per cm2
+# Normals lead while the shape is millimetres off; close by they would pin a vertex to where its own, still wrong,
+# normal points (0.43 mm instead of 0.19 on heads inside the span), so there nearness decides.
+BROAD, FINE = Search(5, 15.0, 12.0, 1.0), Search(4, 4.0, 1.0, 0.05)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,10 +46,8 @@ class Matching:
     refine: bool = True
     reach_mm: float = 15.0  # a sample farther than this from the warped vertex is another part of the head: void
     landmark_smoothing_mm: float = 1.0  # landmarks are marked to about 0.5 mm; the warp must not follow such errors
-    # Normals lead while the shape is millimetres off; close by they would pin a vertex to where its own, still wrong,
-    # normal points (0.43 mm instead of 0.19 on heads inside the span), so there nearness decides.
-    broad: Search = Search(5, 15.0, 12.0, 1.0)
-    fine: Search = Search(4, 4.0, 1.0, 0.05)
+    broad: Search = BROAD
+    fine: Search = FINE
     mark_mm: float = 0.5  # standard deviation of a marked landmark, per axis
     reference_stiffness: tuple[float, ...] = (30.0, 30.0, 10.0, 10.0, 3.0, 3.0, 1.0, 1.0, 0.5, 0.5)  # per iteration
     stiffness: tuple[float, ...] = (3.0, 1.0, 0.5)
@@ -72,15 +64,6 @@ class Correspondence:
     void: Bool[np.ndarray, "N V"]
     reference: int
     frame_from_scan: list[RigidTransform]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Target:
-    """Holds a scan in the common frame (mm), prepared for refinement; ``marks`` are its landmarks."""
-
-    vertices: Float[np.ndarray, "S 3"]
-    normals: Float[np.ndarray, "S 3"]
-    marks: Float[np.ndarray, "26 3"]
 
 
 def correspond(
@@ -151,7 +134,7 @@ def on_reference(target: Target, template: HeadModel, matching: Matching) -> Flo
     index = _landmark_rows(template)
     warped = landmark_warp(surface[index], target.marks, surface)
     fixed = {int(row): mark for row, mark in zip(index, target.marks, strict=True)}
-    return refined(
+    return draw_to_target(
         warped,
         template.levels["cage"].faces,
         target,
@@ -217,16 +200,11 @@ def _most_probable(
     scan, frame = placed_scan
     target = prepared(scan, frame)
     fitted = statistical(prior, faces, index, target, matching)
-    return refined(fitted, faces, target, matching.fine, matching.stiffness)
+    return draw_to_target(fitted, faces, target, matching.fine, matching.stiffness)
 
 
 def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
     return np.array([template.landmarks[name] for name in NAMES])
-
-
-def _tree(target: Target, search: Search) -> KDTree:
-    """Returns a search tree of the scan's points by position and normal together."""
-    return KDTree(np.concatenate([target.vertices, target.normals * search.normal_mm], 1), balanced_tree=False)
 
 
 def statistical(
@@ -244,10 +222,10 @@ def statistical(
     shape = landmark_warp(prior.mean[index], target.marks, prior.mean, smoothing=20.0)
     areas = vertex_areas(prior.mean, faces)
     for search, count in ((matching.broad, prior.broad), (matching.fine, len(prior.modes))):
-        tree = _tree(target, search)
+        tree = oriented_tree(target, search)
         modes = np.ascontiguousarray(prior.modes[:count].transpose(1, 2, 0))
         for _ in range(search.steps):
-            near, weight = _matched(shape, faces, target, tree, search)
+            near, weight = match_points(shape, faces, target, tree, search)
             information = weight * areas / 100.0 / search.plane_mm**2
             shape = _posterior_mean(prior.mean, modes, index, target, near, information, mark_mm=matching.mark_mm)
     return shape
@@ -263,93 +241,17 @@ def _posterior_mean(
     *,
     mark_mm: float,
 ) -> Float[np.ndarray, "V 3"]:
-    """Returns the posterior mean for vertices on the planes of their matches. Single precision suffices, since the
-    prior regularises the system."""
+    """Returns the posterior mean for vertices on the planes of their matches; a landmark is three planes. Single
+    precision suffices, since the prior regularises the system."""
     planes, count = target.normals[near], modes.shape[2]
     along = sum(planes[:, axis, None].astype(np.float32) * modes[:, axis] for axis in range(3))
-    lever = np.concatenate([planes, np.cross(mean, planes)], 1)
-    turns = np.concatenate([-cross_matrix(point) for point in mean[index]])
-    mark_lever = np.concatenate([np.tile(np.eye(3), (len(index), 1)), turns], 1)
-    root = np.sqrt(np.concatenate([information, np.full(3 * len(index), mark_mm**-2)]))[:, None]
-    offsets = np.concatenate([_dots(target.vertices[near] - mean, planes), (target.marks - mean[index]).ravel()])
-    rows = np.block([[along, lever], [modes[index].reshape(-1, count), mark_lever]])
-    weighted = (rows * root).astype(np.float32)
-    system = (weighted.T @ weighted).astype(float)
-    system[range(count), range(count)] += 1.0
-    solution = np.linalg.solve(system, weighted.T.astype(float) @ (offsets * root[:, 0]))
-    z, shift, turn = np.split(solution, [count, count + 3])
+    points = np.concatenate([mean, np.repeat(mean[index], 3, axis=0)])
+    normals = np.concatenate([planes, np.tile(np.eye(3), (len(index), 1))])
+    moves = np.concatenate([along, modes[index].reshape(-1, count)])
+    columns = np.concatenate([moves, motion_columns(points, normals)], axis=1)
+    ahead = np.concatenate([dots(target.vertices[near] - mean, planes), (target.marks - mean[index]).ravel()])
+    known = np.concatenate([information, np.full(3 * len(index), mark_mm**-2)])
+    prior = np.repeat([1.0, 0.0], [count, 6])
+    solution = solve_with_prior(columns, ahead, known, prior, np.zeros(count + 6), precision=np.float32)
+    z, turn, shift = np.split(solution, [count, count + 3])
     return mean + modes @ z + shift + np.cross(turn, mean)
-
-
-def refined(
-    start: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    target: Target,
-    search: Search,
-    stiffnesses: Sequence[float],
-    *,
-    marks: Mapping[int, Float[np.ndarray, " 3"]] = MappingProxyType({}),
-    mark_weight: float = 0.0,
-) -> Float[np.ndarray, "V 3"]:
-    """Refines a warped reference onto a target by non-rigid closest points (``relaxed``). Matches are nearest by
-    position and normal together. ``marks`` are target positions of vertices (mm)."""
-    tree, fixed = _tree(target, search), np.array(list(marks), int)
-
-    def match(shape: Float[np.ndarray, "V 3"]) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, " V"]]:
-        near, weight = _matched(shape, faces, target, tree, search)
-        normals = target.normals[near]
-        wanted = shape + _dots(target.vertices[near] - shape, normals)[:, None] * normals
-        if marks:
-            wanted[fixed], weight[fixed] = np.array(list(marks.values())), mark_weight
-        return wanted, weight
-
-    return relaxed(start, faces, match, stiffnesses)
-
-
-def relaxed(
-    start: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    match: Callable[[Float[np.ndarray, "V 3"]], tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, " V"]]],
-    stiffnesses: Sequence[float],
-) -> Float[np.ndarray, "V 3"]:
-    """Moves a mesh smoothly to where its vertices match: non-rigid closest points, a step for each stiffness.
-
-    Each step solves (W + k L^T L) u = W d for the displacements u from ``start``. L is the graph Laplacian, so that
-    nearly affine motions cost little; all three axes share the matrix. ``match`` returns the wanted position and the
-    weight of every vertex of a shape (mm). It should move a vertex along the normal of its match and leave it in place
-    in the tangent plane."""
-    bending, shape = _bending(faces, start), start
-    for stiffness in stiffnesses:
-        wanted, weight = match(shape)
-        system = sparse.csc_array(sparse.diags_array(weight + 1e-4) + stiffness * bending)
-        solver = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        shape = start + solver.solve(weight[:, None] * (wanted - start))
-    return shape
-
-
-def _matched(
-    shape: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], target: Target, tree: KDTree, search: Search
-) -> tuple[Int[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Returns the nearest scan points, and weights: 1 where the match is near and its normal similar, otherwise 0."""
-    normals = vertex_normals(shape, faces)
-    near = np.asarray(tree.query(np.concatenate([shape, normals * search.normal_mm], 1), workers=1)[1])
-    distance = np.linalg.norm(target.vertices[near] - shape, axis=1)
-    facing = _dots(normals, target.normals[near])
-    return near, np.where((distance < search.reach_mm) & (facing > 0.7), 1.0, 0.0)
-
-
-def _dots(a: Float[np.ndarray, "N 3"], b: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
-    return np.einsum("nx,nx->n", a, b)
-
-
-def _bending(faces: Int[np.ndarray, "F 3"], vertices: Float[np.ndarray, "V 3"]) -> sparse.csr_array:
-    """Returns L^T L of a graph Laplacian whose weights fall with edge length, because vertices are unevenly dense."""
-    edges, _, _ = edges_of(faces)
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    weight = 1 / np.maximum(length, 0.5)
-    count = len(vertices)
-    both = np.concatenate([edges, edges[:, ::-1]])
-    graph = sparse.csr_array((np.tile(weight, 2), (both[:, 0], both[:, 1])), shape=(count, count))
-    degree = np.asarray(graph.sum(1)).ravel()
-    laplacian = sparse.identity(count) - sparse.diags_array(1 / np.maximum(degree, 1e-12)) @ graph
-    return sparse.csr_array(laplacian.T @ laplacian)

@@ -15,7 +15,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from pipeline.head_model.subdivision import edges_of
+from rig.mesh import edges_of
 
 GLOBAL, LOCAL = 0.8, 0.6  # factors of both parts' standard deviations; their squares add up to 1
 LENGTH_MM = 60.0  # of the Gaussian of the distance between vertices

@@ -11,8 +11,8 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
 from pipeline.head_model.decimation import decimate
-from pipeline.head_model.subdivision import edges_of
 from rig.formats.meshes.polygon_obj import PolygonMesh
+from rig.mesh import edges_of
 
 CM = 10.0
 
