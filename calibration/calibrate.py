@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from calibration.adjustment.bundle import CAUCHY, HUBER, BundleSolution, Free, corner_sigma, solve
+from calibration.adjustment.bundle import CAUCHY, HUBER, BundleSolution, Free, adjust, corner_sigma
 from calibration.adjustment.gauge import effective_pose, gauge_projection, image_sigma, subject_points
 from calibration.adjustment.intrinsics import Lens, estimate_lenses
 from calibration.adjustment.lens_prior import LensPrior, weak_prior
@@ -154,9 +154,9 @@ def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], repor
         if attempt == 0:
             for scale in (8.0, 2.0):
                 sigma = np.sqrt(noise**2 + 0.25) * scale
-                state = solve(state, seen, weak, sigma, loss=CAUCHY, tick=tick).state
+                state = adjust(state, seen, weak, sigma, loss=CAUCHY, tick=tick).state
         sigma, _ = corner_sigma(state, seen, noise)
-        state = solve(state, seen, _prior(weak, names, lenses, noise, sigma), sigma, loss=CAUCHY, tick=tick).state
+        state = adjust(state, seen, _prior(weak, names, lenses, noise, sigma), sigma, loss=CAUCHY, tick=tick).state
         bad = bad_views(state, seen)
         if not bad.any():
             break
@@ -205,7 +205,7 @@ def _finish(
         report("bundle", 0.9)
         if used:
             state = replace(state, velocities=board_velocities(state))
-        solution = solve(state, everything.subset(kept), prior, sigma, free=free, loss=HUBER)
+        solution = adjust(state, everything.subset(kept), prior, sigma, free=free, loss=HUBER)
         state = solution.state
         if round_number == 2:
             break

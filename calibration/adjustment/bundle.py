@@ -91,7 +91,7 @@ def corner_sigma(
     return np.sqrt(lens_noise**2 + shared), float(np.sqrt(shared))
 
 
-def solve(
+def adjust(
     state: BundleState,
     seen: Observations,
     prior: LensPrior,

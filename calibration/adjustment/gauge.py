@@ -7,11 +7,13 @@ let ``A`` (6 C x 6) be the motions of all cameras under a motion of the world. T
 A)^-1 A^T W`` (an S-transformation: W. Baarda, 1973; Triggs et al., "Bundle Adjustment: A Modern Synthesis", section
 9)."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.estimation.levenberg_marquardt import Limits, minimise
+from pipeline.estimation.terms import Problem, Residuals
 from rig.camera import Camera, lens_jacobians
 from rig.geometry import RigidTransform, cross_matrix, nearest_rotation, rotation_from_vector
 from rig.rig import Rig
@@ -88,21 +90,29 @@ def align_world(rig: Rig, reference: Rig, *, scale: bool = False) -> Rig:
     """Returns ``rig`` with its world moved, and with ``scale`` also scaled, so that its cameras see the subject's
     region as nearly as possible where those of ``reference`` see it.
 
-    Gauss-Newton minimises the distances in the images, starting from the mean motion between the cameras' frames."""
-    aligned = _brought_together(rig, reference)
+    The distances in the images are minimised, starting from the mean motion between the cameras' frames."""
     points = subject_points(reference)
-    target = np.concatenate([reference[camera.name].project(points) for camera in rig]).ravel()
-    for _ in range(12):
-        moves = world_motions(aligned, scale=scale).reshape(len(rig), 6, -1)
-        jacobian = np.concatenate([pose_jacobian(c, points) @ m for c, m in zip(aligned, moves, strict=True)])
-        jacobian = jacobian.reshape(-1, moves.shape[2])
-        miss = target - np.concatenate([camera.project(points) for camera in aligned]).ravel()
-        good = np.isfinite(miss) & np.isfinite(jacobian).all(axis=1)
-        step = np.linalg.lstsq(jacobian[good], miss[good], rcond=None)[0]
-        aligned = _shifted(aligned, step)
-        if np.abs(step[:3]).max() < 1e-12 and np.abs(step[3:]).max() < 1e-9:
-            break
-    return aligned
+    target = np.concatenate([reference[camera.name].project(points) for camera in rig])
+    problem = Problem((_ImageTerm(points, target, scale),), 7 if scale else 6, _shifted)
+    return minimise(
+        problem, _brought_together(rig, reference), Limits(steps=12, tolerance=1e-18, first_damping=0.0)
+    ).value
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ImageTerm:
+    """Computes how far from ``target`` (px) the cameras of a rig see the points; what a lens does not show counts 0."""
+
+    points: Float[np.ndarray, "n 3"]
+    target: Float[np.ndarray, "m 2"]
+    scale: bool
+
+    def at(self, rig: Rig) -> Residuals:
+        moves = world_motions(rig, scale=self.scale).reshape(len(rig), 6, -1)
+        rows = np.concatenate([pose_jacobian(c, self.points) @ m for c, m in zip(rig, moves, strict=True)])
+        miss = np.concatenate([camera.project(self.points) for camera in rig]) - self.target
+        good = np.isfinite(miss).all(axis=1) & np.isfinite(rows).all(axis=(1, 2))
+        return Residuals(np.where(good[:, None], miss, 0.0), lambda: np.where(good[:, None, None], rows, 0.0))
 
 
 def _shifted(rig: Rig, step: np.ndarray) -> Rig:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from calibration.adjustment.bundle import CAUCHY, BundleSolution, solve
+from calibration.adjustment.bundle import CAUCHY, BundleSolution, adjust
 from calibration.adjustment.lens_prior import weak_prior
 from calibration.adjustment.state import (
     INTRINSICS,
@@ -81,12 +81,12 @@ def estimate_lens(views: Sequence[View], size: tuple[int, int], board: Board) ->
     seen = observations(views, [views[0].camera], shots, board)
     state = _start(views, size, board)
     prior, sigma = weak_prior([size]), np.array([1.0])
-    solution = solve(state, seen, prior, sigma, loss=CAUCHY)
+    solution = adjust(state, seen, prior, sigma, loss=CAUCHY)
     # Whole views that no pose explains (a misread grid) must not bend the lens: Cauchy's rho downweights them, and its
     # scale becomes the camera's own noise here.
     for _ in range(2):
         sigma = np.array([noise_of(residuals(solution.state, seen))])
-        solution = solve(solution.state, seen, prior, sigma, loss=CAUCHY)
+        solution = adjust(solution.state, seen, prior, sigma, loss=CAUCHY)
     state = orthonormal(solution.state)
     return _lens(views, size, solution, state, float(sigma[0]), residuals(state, seen))
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from calibration.adjustment.bundle import HUBER, Free, solve
+from calibration.adjustment.bundle import HUBER, Free, adjust
 from calibration.adjustment.lens_prior import LensPrior
 from calibration.adjustment.state import BundleState, Observations, residuals, rms
 from rig.geometry import RigidTransform, vector_from_rotation
@@ -49,9 +49,9 @@ def estimate_offsets(
     """Estimates the offsets by solving the bundle again with them, starting from its solution ``state``."""
     before = rms(residuals(state, seen))
     state = replace(state, velocities=board_velocities(state))
-    first = solve(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER).state
+    first = adjust(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER).state
     state = replace(first, velocities=board_velocities(first))  # which follow the poses, and those moved a little
-    solution = solve(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER)
+    solution = adjust(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER)
     state = solution.state
     cameras = len(state.intrinsics)
     spread = np.sqrt(np.diag(solution.covariance())[-cameras:])

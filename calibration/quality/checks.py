@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from calibration.adjustment.bundle import HUBER, Free, solve
+from calibration.adjustment.bundle import HUBER, Free, adjust
 from calibration.adjustment.gauge import align_world, image_distance
 from calibration.adjustment.lens_prior import LensPrior, fixed_prior
 from calibration.adjustment.state import BundleState, Observations, residuals
@@ -68,10 +68,10 @@ def check_held_out(
     if len(held) < 2 or len(several) - len(held) < 4:
         return Check("held-out shots", None, compose("held-out-too-few", shots=len(several)))
     out = np.isin(seen.shot[seen.view_of], held)
-    trained = solve(state, seen.subset(~out), prior, sigma, free=free, loss=HUBER, tick=tick, steps=25).state
+    trained = adjust(state, seen.subset(~out), prior, sigma, free=free, loss=HUBER, tick=tick, steps=25).state
     boards = replace(free, intrinsics=False, poses=False, offsets=False)
     rest = seen.subset(out)
-    tested = solve(trained, rest, fixed_prior(trained.intrinsics), sigma, free=boards, loss=HUBER, tick=tick).state
+    tested = adjust(trained, rest, fixed_prior(trained.intrinsics), sigma, free=boards, loss=HUBER, tick=tick).state
     inside, outside = (
         float(np.sqrt((residuals(s, o) ** 2).sum(axis=1).mean())) for s, o in ((state, seen), (tested, rest))
     )
@@ -213,7 +213,7 @@ def measure_aspect(
     costs = []
     for stretch in (-step, 0.0, step):
         stretched = replace(seen, points=seen.points * [1.0, 1.0 + stretch, 1.0])
-        costs.append(solve(state, stretched, prior, sigma, free=free, loss=HUBER, steps=12).cost)
+        costs.append(adjust(state, stretched, prior, sigma, free=free, loss=HUBER, steps=12).cost)
     low, middle, high = costs
     curvature = second_difference(low, middle, high)
     if curvature <= 0:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
-from pipeline.geometry.procrustes import block_diagonal, generalised_procrustes, procrustes
+from pipeline.geometry.registration.procrustes import block_diagonal, generalised_procrustes, procrustes
 from pipeline.head_model.landmarks import LANDMARK_NOISE_MM, NAMES, SEVEN_POINTS, mirrored
 from pipeline.head_model.model import HeadModel
 from pipeline.multiview.triangulation import CLICK_NOISE_PX, TriangulatedPoint

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float
 
 from pipeline.faces.landmark_map import LandmarkMap
 from pipeline.faces.matching import MatchedFaces
-from pipeline.geometry.procrustes import procrustes
 from pipeline.geometry.raster import camera_depths, depth_map
+from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.model import HeadModel
 from rig.camera import Camera

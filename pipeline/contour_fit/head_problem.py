@@ -41,6 +41,7 @@ class FeatureTerm:
     problem: ContourProblem
     observed: Observed
     stage: Stage
+    landmark_noise_mm: float = LANDMARK_NOISE_MM
 
     def at(self, state: State) -> Residuals:
         """Returns the offsets of all projected landmarks from their feature points, in standard deviations of a feature
@@ -60,7 +61,7 @@ class FeatureTerm:
         """Returns the standard deviation (px) of each feature point: a click's noise together with the landmark's
         variation between heads."""
         pixels_per_mm = np.linalg.norm(slopes, axis=(1, 2)) / np.sqrt(2.0)
-        return np.hypot(CLICK_NOISE_PX, LANDMARK_NOISE_MM * pixels_per_mm)
+        return np.hypot(CLICK_NOISE_PX, self.landmark_noise_mm * pixels_per_mm)
 
     def _rows(
         self, state: State, points: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2 3"]

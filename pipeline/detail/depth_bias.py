@@ -14,7 +14,9 @@ from jaxtyping import Bool, Float, Int
 from pipeline.compute.trace import traced
 from pipeline.detail.association import associate, interpolated
 from pipeline.detail.surface_points import SurfacePoints
+from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.robust import Cauchy
+from pipeline.estimation.terms import Linear, Problem
 from pipeline.part_labels.codes import Part
 from pipeline.stereo.window_bias import WindowBias, windowed_height
 from rig.mesh import Mesh
@@ -59,10 +61,9 @@ def measure_bias(seen: OnFace) -> WindowBias:
     if len(seen.row) < MIN_POINTS:
         return WindowBias()
     columns = np.stack([np.ones(len(seen.row)), seen.windowed_mm], axis=1)
-    line, loss = np.array([np.median(seen.off_mm), 0.0]), Cauchy(ROBUST_MM)
-    for _ in range(ROUNDS):
-        weight = np.sqrt(loss.weight((seen.off_mm - columns @ line) ** 2))
-        line = np.linalg.lstsq(columns * weight[:, None], seen.off_mm * weight, rcond=None)[0]
+    problem = Problem((Linear(columns, seen.off_mm, Cauchy(ROBUST_MM)),), 2, np.add)
+    limits = Limits(steps=ROUNDS, tolerance=1e-9, first_damping=0.0)
+    line = minimise(problem, np.array([np.median(seen.off_mm), 0.0]), limits).value
     return WindowBias(float(np.clip(line[0], -MAX_MM, MAX_MM)), float(np.clip(line[1], 0.0, MAX_SHARE)))
 
 

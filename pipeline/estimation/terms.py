@@ -92,6 +92,20 @@ class Residuals:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """Holds the residuals ``columns @ x - observed`` of a vector x, in standard deviations."""
+
+    columns: Float[np.ndarray, "n p"]
+    observed: Float[np.ndarray, " n"]
+    loss: Loss = field(default_factory=LeastSquares)
+
+    def at(self, value: Float[np.ndarray, " p"]) -> Residuals:
+        """Returns the residuals of the vector ``value``."""
+        residual = self.columns @ value - self.observed
+        return Residuals(residual[:, None], lambda: self.columns[:, None], self.loss)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Quadratic:
     """Holds the quadratic form ``(x - c)^T M (x - c) - 2 g^T (x - c)`` of a vector x, with ``matrix`` M, ``centre`` c
     and ``pull`` g (towards the minimum). With g zero it is a Gaussian prior; it can also summarise another problem that

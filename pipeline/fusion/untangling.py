@@ -20,7 +20,7 @@ from pipeline.compute.array_cache import cached_arrays
 from pipeline.estimation.sparse_factor import factorised
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.net_kernels import component_of
-from pipeline.geometry.procrustes import procrustes
+from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.head_model.model import HeadModel
 from rig.mesh import Mesh, face_normals
 

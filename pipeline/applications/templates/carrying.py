@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.geometry.procrustes import procrustes
+from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.gaussian_process import spread_nodes

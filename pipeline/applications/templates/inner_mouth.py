@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from pipeline.applications.templates.pivots import Points
 from pipeline.fusion.crossings import crossing_faces
-from pipeline.geometry.procrustes import procrustes
+from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.head_model.inner_mouth_file import ANCHORS, load_inner_mouth
 from pipeline.head_model.visemes import VISEMES, mixed
 from rig.geometry import RigidTransform

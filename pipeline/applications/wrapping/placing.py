@@ -13,7 +13,7 @@ from pipeline.applications.wrapping.sighting import ScanSighting, nearest_axis, 
 from pipeline.faces.landmark_map import landmark_map
 from pipeline.faces.networks import load_networks
 from pipeline.faces.points import RIGHT_EYE_OUTLINE, point_table
-from pipeline.geometry.procrustes import procrustes
+from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals

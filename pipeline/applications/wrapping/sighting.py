@@ -18,7 +18,7 @@ from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.points import point_table
 from pipeline.faces.subject import find_subject
-from pipeline.geometry.procrustes import procrustes
+from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.multiview.triangulation import NoPoint, triangulate_many
 from rig.camera import Camera, Intrinsics
 from rig.errors import InputError

@@ -190,8 +190,7 @@ def features_of_a_head() -> Case:
     state = replace(state, camera_shift=np.zeros_like(state.camera_shift))
     picked = problem.features
     assert picked is not None
-    problem = replace(problem, settings=replace(problem.settings, landmark_noise_mm=0.0))
-    term = FeatureTerm(problem, picked, stage)
+    term = FeatureTerm(problem, picked, stage, landmark_noise_mm=0.0)
     return replace(
         case(term, state, lambda s, step: apply_step(s, step, stage), head_steps(problem, stage)), tolerance=1e-4
     )
