@@ -150,7 +150,12 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
 
     views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
     lenses = judge_distortion(views.capture.images, views.silhouettes, rig)
-    warnings = [*views.warnings, *lenses, *(chart_colours(shot, rig)[1] if chosen.texture.chart else ())]
+    warnings = [
+        *chosen.warnings,
+        *views.warnings,
+        *lenses,
+        *(chart_colours(shot, rig)[1] if chosen.texture.chart else ()),
+    ]
     return documents_of(warnings)
 
 

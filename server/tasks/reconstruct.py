@@ -1,14 +1,24 @@
 """The task of a job, which runs in a worker's child process: it reads files, calls ``reconstruct()`` and writes
-files."""
+files.
+
+Both kinds of job end in ``run_job``: a service's, whose capture was checked and stored before, and the command line's
+(``server.tasks.reconstruct_folder``), whose cameras and masks may have to be estimated first.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
+from rig.progress import Progress
 from server.processes import share_one_heap, tidied
 from server.tasks.child import Report, WorkerContext
+
+if TYPE_CHECKING:
+    from pipeline.settings import Settings
+    from pipeline.stages.context import Segment
+    from server.tasks.photographs import Prepared
 
 DONE = "done"  # the pipeline's last word, when nothing is written yet
 
@@ -52,26 +62,62 @@ def reconstruct_capture(
     """
     report("read", 0.0)  # a fresh child loads for seconds what this takes
     share_one_heap()
+    from pipeline.settings import settings_from_document
+    from server.storage.silhouette_cache import segment_once
+    from server.tasks.photographs import Prepared, calibration_warnings, read_scaled_capture
+
+    folder, chosen = Path(capture), settings_from_document(settings)
+    run_job(
+        context,
+        report,
+        Prepared(*read_scaled_capture(folder), calibration_warnings(folder) or ()),
+        Path(result),
+        folders=(folder, folder),
+        model=model,
+        chosen=chosen,
+        segment=partial(segment_once, Path(cache)),
+        preparation=lambda _, share: report("compiling", share),
+    )
+
+
+def run_job(
+    context: WorkerContext,
+    report: Report,
+    prepared: "Prepared",
+    out: Path,
+    *,
+    folders: tuple[Path, Path],
+    model: str | None,
+    chosen: "Settings",
+    segment: "Segment",
+    preparation: Progress,
+) -> None:
+    """Reconstructs a capture that was read, and writes the result to the folder ``out``. ``folders`` are those of the
+    capture's files and of cameras that were estimated; ``preparation`` receives the progress of compiling loops.
+
+    Raises the errors of the pipeline, OSError for a full disk, and Cancelled if ``report`` raises it.
+    """
     from pipeline.applications.templates.write.writers import load_template_writers
+    from pipeline.compute.trace import span
     from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
-    from pipeline.settings import settings_from_document
     from pipeline.stages.context import ReconstructionContext
     from rig.render.renderer import Renderer
-    from server.storage.silhouette_cache import segment_once
     from server.tasks.matching_device import matching_device
-    from server.tasks.photographs import calibration_warnings, full_size_pictures, read_scaled_capture
+    from server.tasks.photographs import full_size_pictures
     from server.tasks.prepare import prepare_kernels
 
-    chosen, once = settings_from_document(settings), partial(segment_once, Path(cache))
-    kind = f"{chosen.detail} {chosen.outputs.surface}"
-    context.keep(f"loops {kind}", lambda: prepare_kernels(lambda _, share: report("compiling", share), chosen))
+    kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
+    with span("stage", "compiling"):
+        context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))
+    report("read", 0.0)
     name = model or "default"
-    head_model = context.keep(f"model {name}", lambda: load_model(name))
-    writers = load_template_writers(chosen.outputs.template, head_model)
-    renderer = context.keep("renderer", Renderer.create)
-    shot, rig = read_scaled_capture(Path(capture))
+    with span("stage", "read"):
+        head_model = context.keep(f"model {name}", lambda: load_model(name))
+        writers = load_template_writers(chosen.outputs.template, head_model)
+        renderer = context.keep("renderer", Renderer.create)
+        device = matching_device(context, chosen, renderer)
 
     def tell(stage: str, fraction: float) -> None:
         if stage != DONE:  # the files are still to be written
@@ -79,18 +125,18 @@ def reconstruct_capture(
 
     done = reconstruct(
         ReconstructionContext(
-            shot,
-            rig,
+            prepared.capture,
+            prepared.rig,
             head_model,
             chosen,
             renderer,
             tidied(tell),
-            once,
-            device=matching_device(context, chosen, renderer),
-            read_original=full_size_pictures(Path(capture), Path(capture)) if chosen.detail == "pores" else None,
+            segment,
+            device=device,
+            read_original=full_size_pictures(*folders) if chosen.detail == "pores" else None,
         )
     )
     report("write", 0.0)
-    warnings = calibration_warnings(Path(capture)) or ()
-    done = replace(done, warnings=(*warnings, *done.warnings))
-    write_result(Path(result), done, shot, writers)
+    done = replace(done, warnings=(*prepared.warnings, *done.warnings))
+    with span("stage", "write"):
+        write_result(out, done, prepared.capture, writers)

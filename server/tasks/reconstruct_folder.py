@@ -8,15 +8,15 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig.formats.captures.archive import extract_archive
 from rig.progress import Progress
-from server.processes import end_with_parent, share_one_heap, tidied
+from server.processes import end_with_parent, share_one_heap
 from server.tasks.child import WorkerContext
+from server.tasks.reconstruct import run_job
 
 if TYPE_CHECKING:
     from pipeline.settings import Settings
@@ -52,46 +52,21 @@ def reconstruct_folder(
     of the pipeline, and OSError for a full disk.
     """
     from pipeline.compute.trace import span
-    from server.tasks.photographs import full_size_pictures, keep_masks, read_or_calibrate
-    from server.tasks.prepare import prepare_kernels
+    from server.tasks.photographs import keep_masks, read_or_calibrate
 
     with span("stage", "read"):
         prepared = read_or_calibrate(folder, kept, front=chosen.front, report=preparation)
-    kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
-    with span("stage", "compiling"):
-        context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))
-    from pipeline.applications.templates.write.writers import load_template_writers
-    from pipeline.head_model.model import load_model
-    from pipeline.reconstruct import reconstruct
-    from pipeline.results.write import write_result
-    from pipeline.stages.context import ReconstructionContext
-    from rig.render.renderer import Renderer
-    from server.tasks.matching_device import matching_device
-
-    report("read", 0.0)
-    name = model or "default"
-    with span("stage", "read"):
-        head_model = context.keep(f"model {name}", lambda: load_model(name))
-        writers = load_template_writers(chosen.outputs.template, head_model)
-        renderer = context.keep("renderer", Renderer.create)
-        device = matching_device(context, chosen, renderer)
-    segment = partial(keep_masks, kept)
-    reconstruction = ReconstructionContext(
-        prepared.capture,
-        prepared.rig,
-        head_model,
-        chosen,
-        renderer,
-        tidied(report),
-        segment,
-        device=device,
-        read_original=full_size_pictures(folder, kept) if chosen.detail == "pores" else None,
+    run_job(
+        context,
+        report,
+        prepared,
+        out,
+        folders=(folder, kept),
+        model=model,
+        chosen=chosen,
+        segment=partial(keep_masks, kept),
+        preparation=preparation,
     )
-    done = reconstruct(reconstruction)
-    done = replace(done, warnings=(*prepared.warnings, *done.warnings))
-    report("write", 0.0)
-    with span("stage", "write"):
-        write_result(out, done, prepared.capture, writers)
 
 
 def reconstruct_beside(
