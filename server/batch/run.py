@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Concatenate, Literal, Protocol
 
 from rig.errors import Cancelled, EigenheadError, InputError
 from rig.messages.message import compose
@@ -65,27 +65,6 @@ def _of_work(error: WorkFailed) -> Message:
 EXAMINERS = 4  # captures whose files are compared at once: hashing releases the interpreter lock
 
 
-class FolderWork(Protocol):
-    """Declares the function that a worker runs for a capture: ``reconstruct_beside``."""
-
-    def __call__(
-        self,
-        context: WorkerContext,
-        report: Progress,
-        /,
-        *,
-        parent: int,
-        capture: str,
-        result: str,
-        scratch: str,
-        model: str | None,
-        settings: Mapping[str, object],
-    ) -> None:
-        """Reconstructs ``capture`` into the new folder ``result``, with temporary files in ``scratch``; ends with the
-        process ``parent``."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Outcome:
     """Holds how a capture ended: ``made`` by this process, ``kept`` from an earlier run, or ``failed``."""
@@ -128,7 +107,7 @@ class BatchRun:
         variables: Mapping[str, str],
         observer: Observer,
         shard: Shard = WHOLE,
-        work: FolderWork = reconstruct_beside,
+        work: Callable[Concatenate[WorkerContext, Progress, ...], None] = reconstruct_beside,
     ) -> None:
         self._folder, self._tasks, self._workers, self._variables = folder, tasks, workers, variables
         self._observer, self._shard, self._work = observer, shard, work

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from rig.progress import Progress
 from server.processes import share_one_heap, tidied
@@ -23,27 +23,6 @@ if TYPE_CHECKING:
 DONE = "done"  # the pipeline's last word, when nothing is written yet
 
 
-class CaptureWork(Protocol):
-    """Declares the function that a worker runs for a job: ``reconstruct_capture``, or the one that the setting ``work``
-    names."""
-
-    def __call__(
-        self,
-        context: WorkerContext,
-        report: Report,
-        /,
-        *,
-        capture: str,
-        result: str,
-        cache: str,
-        model: str | None,
-        settings: Mapping[str, object],
-    ) -> object:
-        """Works on the capture folder ``capture`` and writes the folder ``result``; ``cache`` is a folder for what a
-        later job of the capture may use again."""
-        ...
-
-
 def reconstruct_capture(
     context: WorkerContext,
     report: Report,
@@ -55,7 +34,7 @@ def reconstruct_capture(
     settings: Mapping[str, object],
 ) -> None:
     """Reconstructs the capture folder ``capture`` and writes the result to the folder ``result``. Silhouettes are
-    cached in the folder ``cache``.
+    cached in the folder ``cache``. The service's setting ``work`` may name another function of these parameters.
 
     Raises InputError for an input that cannot be used, other EigenheadErrors of the pipeline, OSError for a full disk,
     and Cancelled if ``report`` raises it.

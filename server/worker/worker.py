@@ -22,6 +22,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from importlib.metadata import version
+from typing import Concatenate
 
 import sqlalchemy as sa
 import structlog
@@ -32,6 +33,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from pipeline.settings import settings_from_document
 from rig.errors import Cancelled, InputError
 from rig.messages.message import compose
+from rig.progress import Progress
 from server.errors import UNWRITABLE, unusable_input
 from server.problem_types import type_of_failure
 from server.processes import process_identity
@@ -54,9 +56,9 @@ from server.storage.records import (
 )
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
-from server.tasks.child import DISK_FULL, ChildProcessPool, WorkFailed, function_at
+from server.tasks.child import DISK_FULL, ChildProcessPool, WorkerContext, WorkFailed, function_at
 from server.tasks.progress import EVERY_S, JobProgress, ProgressMeter
-from server.tasks.reconstruct import CaptureWork, reconstruct_capture
+from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.stage_durations import StageDurations
 from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
@@ -82,7 +84,7 @@ class Worker:
         self.events = EventLog(self.engine)
         self.id = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"[:64]
         self._children = ChildProcessPool(settings.concurrency, niceness=5)  # a busy machine still answers requests
-        self._work: CaptureWork = function_at(settings.work)
+        self._work: Callable[Concatenate[WorkerContext, Progress, ...], object] = function_at(settings.work)
         self._stop = threading.Event()
         self._webhooks = Webhooks(self.engine, settings.webhook_origins)
         self._durations = StageDurations()
