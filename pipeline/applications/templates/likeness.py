@@ -111,7 +111,16 @@ def fit_model_to_mesh(
             points = np.concatenate([head[rows], np.repeat(marks.on(head), 3, axis=0)])
             met = np.concatenate([met, np.repeat(marks.points, 3, axis=0)])
             planes = np.concatenate([planes, np.tile(np.eye(3), (len(marks.points), 1))])  # a mark is three planes
-            z, place = _step(modes[:, :, :active], points, met, planes, information, z=z, place=place)
+            turned = (place.scale * planes @ place.rotation).astype(np.float32)  # n^T s R
+            along = sum(turned[:, axis, None] * modes[:, axis, :active] for axis in range(3))
+            centre = points.mean(axis=0)
+            columns = np.concatenate([along, motion_columns(points - centre, planes, scale=True)], axis=1)
+            ahead, prior = np.einsum("nx,nx->n", met - points, planes), np.repeat([1.0, 0.0], [active, 7])
+            state = np.concatenate([z[:active], np.zeros(7)])
+            step = solve_with_prior(columns, ahead, information, prior, state, precision=np.float32, ridge=1e-6)
+            step[-1] = np.clip(step[-1], -0.1, 0.1)
+            z[:active] += step[:active]
+            place = motion_about(centre, step[active:]) @ place
     head = place.apply(wide.vertices(z))
     normals = vertex_normals(head, full.faces)[rows]
     _, _, off, weight = target.meet(head[rows], normals, replace(STAGES[-1], reach_mm=MET_MM))
@@ -173,29 +182,3 @@ class MetSurface:
         planes = np.einsum("nk,nkx->nx", hits.weights, normals)
         planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-12)
         return hits.points - BULGE * bulge, planes
-
-
-def _step(
-    modes: Float[np.ndarray, "s 3 m"],
-    points: Float[np.ndarray, "s 3"],
-    met: Float[np.ndarray, "s 3"],
-    planes: Float[np.ndarray, "s 3"],
-    information: Float[np.ndarray, " s"],
-    *,
-    z: Float[np.ndarray, " k"],
-    place: Similarity,
-) -> tuple[Float[np.ndarray, " k"], Similarity]:
-    """Returns the coefficients and the pose after one Gauss-Newton step over the active modes, rotation, translation
-    and scale."""
-    active = modes.shape[2]
-    turned = (place.scale * planes @ place.rotation).astype(np.float32)  # n^T s R
-    along = sum(turned[:, axis, None] * modes[:, axis] for axis in range(3))
-    centre = points.mean(axis=0)
-    columns = np.concatenate([along, motion_columns(points - centre, planes, scale=True)], axis=1)
-    ahead, prior = np.einsum("nx,nx->n", met - points, planes), np.repeat([1.0, 0.0], [active, 7])
-    state = np.concatenate([z[:active], np.zeros(7)])
-    step = solve_with_prior(columns, ahead, information, prior, state, precision=np.float32, ridge=1e-6)
-    step[-1] = np.clip(step[-1], -0.1, 0.1)
-    new = z.copy()
-    new[:active] += step[:active]
-    return new, motion_about(centre, step[active:]) @ place

@@ -34,20 +34,9 @@ def fit_motion(
     still_mm: float,
     scale: bool = False,
 ) -> Similarity | None:
-    """Lays points on a surface by a rigid motion or, with ``scale``, a similarity.
-
-    Args:
-        points: to be moved.
-        meet: finds the counterparts of the points where a motion brings them, within a reach; None if too few.
-        start: the motion to begin with.
-        reach_mm: of the first counterparts.
-        steps: at most.
-        still_mm: a step that moves every point by less is the last, once the reach shrinks no more.
-        scale: whether the size may change.
-
-    Returns:
-        The motion; None once ``meet`` has returned None.
-    """
+    """Lays points on a surface by a rigid motion or, with ``scale``, a similarity. ``meet`` finds the counterparts of
+    the points where a motion brings them, within a reach that is ``reach_mm`` at first; once it returns None, for too
+    few, so does this. A step that moves every point by less than ``still_mm`` is the last, unless the reach shrinks."""
     motion = start
     for _ in range(steps):
         there = motion.apply(points)

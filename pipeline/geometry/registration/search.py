@@ -38,55 +38,29 @@ def search_motions(
     places: Float[np.ndarray, "p 3"],
 ) -> list[Similarity]:
     """Returns the best starting motions of points in random order: every turn with the points' middle at every place is
-    tried briefly with few of them, fewer motions longer with more.
-
-    Args:
-        points: with their unit ``normals``.
-        normals: of the points.
-        surface: points of the other surface, with their unit normals ``facing``.
-        facing: of these.
-        turns: rotations to begin with.
-        places: where the points' middle may lie.
-    """
+    tried briefly with few of them, fewer motions longer with more. ``normals`` and ``facing`` are unit normals of the
+    points and of ``surface``, points of the other surface."""
     middle = points.mean(axis=0)
     points = points - middle
     tree = KDTree(np.concatenate([surface, TURN_MM * facing], axis=1))
     rotations, translations = np.repeat(turns, len(places), axis=0), np.tile(places, (len(turns), 1))
     for stage in ROUNDS:
-        some = slice(0, stage.points)
-        means, rotations, translations = _closest_points(
-            points[some], normals[some], surface, tree, rotations=rotations, translations=translations, stage=stage
-        )
+        some, facing_mm = points[: stage.points], TURN_MM * normals[: stage.points]
+        kept, means = int(stage.share * len(some)), np.full(len(rotations), np.inf)
+        for _ in range(stage.iterations):  # of all starts at once
+            there = np.einsum("kij,nj->kni", rotations, some) + translations[:, None]
+            turned = np.einsum("kij,nj->kni", rotations, facing_mm)
+            far, near = map(np.asarray, tree.query(np.concatenate([there, turned], axis=2)))
+            order = np.argsort(far, axis=1)[:, :kept]
+            means = np.take_along_axis(far, order, axis=1).mean(axis=1)
+            source, target = some[order], surface[np.take_along_axis(near, order, axis=1)]
+            source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+            moments = np.einsum("kni,knj->kij", target - target_mean[:, None], source - source_mean[:, None])
+            rotations = np.stack([nearest_rotation(moment) for moment in moments])
+            translations = target_mean - np.einsum("kij,kj->ki", rotations, source_mean)
         best = np.argsort(means)[: stage.kept]
         rotations, translations = rotations[best], translations[best]
     return [Similarity(1.0, r, t - r @ middle) for r, t in zip(rotations, translations, strict=True)]
-
-
-def _closest_points(
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    surface: Float[np.ndarray, "m 3"],
-    tree: KDTree,
-    *,
-    rotations: Float[np.ndarray, "k 3 3"],
-    translations: Float[np.ndarray, "k 3"],
-    stage: Round,
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k 3 3"], Float[np.ndarray, "k 3"]]:
-    """Runs trimmed iterations of points closest in position and direction, for all starts at once. Returns the mean
-    distance of the points that count, and the motions."""
-    kept, means = int(stage.share * len(points)), np.full(len(rotations), np.inf)
-    for _ in range(stage.iterations):
-        there = np.einsum("kij,nj->kni", rotations, points) + translations[:, None]
-        turned = TURN_MM * np.einsum("kij,nj->kni", rotations, normals)
-        far, near = map(np.asarray, tree.query(np.concatenate([there, turned], axis=2)))
-        order = np.argsort(far, axis=1)[:, :kept]
-        means = np.take_along_axis(far, order, axis=1).mean(axis=1)
-        source, target = points[order], surface[np.take_along_axis(near, order, axis=1)]
-        source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
-        moments = np.einsum("kni,knj->kij", target - target_mean[:, None], source - source_mean[:, None])
-        rotations = np.stack([nearest_rotation(moment) for moment in moments])
-        translations = target_mean - np.einsum("kij,kj->ki", rotations, source_mean)
-    return means, rotations, translations
 
 
 def draw_surface_points(

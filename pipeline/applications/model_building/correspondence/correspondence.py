@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 
 from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex, coordinates, points_at
 from pipeline.applications.model_building.correspondence.parallel import Workers, workers
@@ -219,39 +219,24 @@ def statistical(
 
     Smoothness cannot determine where on a plain cheek a vertex belongs; statistics of other heads can. Residuals are
     point-to-plane and count per cm2 of surface, landmarks along all three axes; six columns are the pose."""
-    shape = landmark_warp(prior.mean[index], target.marks, prior.mean, smoothing=20.0)
-    areas = vertex_areas(prior.mean, faces)
+    mean, areas = prior.mean, vertex_areas(prior.mean, faces)
+    shape = landmark_warp(mean[index], target.marks, mean, smoothing=20.0)
+    points = np.concatenate([mean, np.repeat(mean[index], 3, axis=0)])  # a landmark is three planes
     for search, count in ((matching.broad, prior.broad), (matching.fine, len(prior.modes))):
         tree = oriented_tree(target, search)
         modes = np.ascontiguousarray(prior.modes[:count].transpose(1, 2, 0))
         for _ in range(search.steps):
             near, weight = match_points(shape, faces, target, tree, search)
+            planes = target.normals[near]
+            along = sum(planes[:, axis, None].astype(np.float32) * modes[:, axis] for axis in range(3))
+            moves = np.concatenate([along, modes[index].reshape(-1, count)])
+            normals = np.concatenate([planes, np.tile(np.eye(3), (len(index), 1))])
+            columns = np.concatenate([moves, motion_columns(points, normals)], axis=1)
+            ahead = np.concatenate([dots(target.vertices[near] - mean, planes), (target.marks - mean[index]).ravel()])
             information = weight * areas / 100.0 / search.plane_mm**2
-            shape = _posterior_mean(prior.mean, modes, index, target, near, information, mark_mm=matching.mark_mm)
+            known = np.concatenate([information, np.full(3 * len(index), matching.mark_mm**-2)])
+            priors = np.repeat([1.0, 0.0], [count, 6])
+            solution = solve_with_prior(columns, ahead, known, priors, np.zeros(count + 6), precision=np.float32)
+            z, turn, shift = np.split(solution, [count, count + 3])
+            shape = mean + modes @ z + shift + np.cross(turn, mean)
     return shape
-
-
-def _posterior_mean(
-    mean: Float[np.ndarray, "V 3"],
-    modes: Float32[np.ndarray, "V 3 K"],
-    index: Int[np.ndarray, " L"],
-    target: Target,
-    near: Int[np.ndarray, " V"],
-    information: Float[np.ndarray, " V"],
-    *,
-    mark_mm: float,
-) -> Float[np.ndarray, "V 3"]:
-    """Returns the posterior mean for vertices on the planes of their matches; a landmark is three planes. Single
-    precision suffices, since the prior regularises the system."""
-    planes, count = target.normals[near], modes.shape[2]
-    along = sum(planes[:, axis, None].astype(np.float32) * modes[:, axis] for axis in range(3))
-    points = np.concatenate([mean, np.repeat(mean[index], 3, axis=0)])
-    normals = np.concatenate([planes, np.tile(np.eye(3), (len(index), 1))])
-    moves = np.concatenate([along, modes[index].reshape(-1, count)])
-    columns = np.concatenate([moves, motion_columns(points, normals)], axis=1)
-    ahead = np.concatenate([dots(target.vertices[near] - mean, planes), (target.marks - mean[index]).ravel()])
-    known = np.concatenate([information, np.full(3 * len(index), mark_mm**-2)])
-    prior = np.repeat([1.0, 0.0], [count, 6])
-    solution = solve_with_prior(columns, ahead, known, prior, np.zeros(count + 6), precision=np.float32)
-    z, turn, shift = np.split(solution, [count, count + 3])
-    return mean + modes @ z + shift + np.cross(turn, mean)

@@ -64,9 +64,17 @@ def fit_surface(
         hits = _closest(model, z, pose, level, faces, points)
         scale = max(3.0 * float(np.median(hits.distances)), 3.0 * sigma_mm) if step < 12 else np.inf
         robust = (1 + (hits.distances / scale) ** 2) ** -2
-        moved, z, pose = _step(basis[: min(active, count)], faces, hits, points, information * robust, z=z, pose=pose)
-        used = step + 1
-        if step > 12 and moved < _STEP_MM:
+        few, normals, centre = basis[:active], hits.normals, points.mean(0)
+        turned = normals @ pose.rotation  # n^T R
+        along = np.einsum("mncx,nc,nx->nm", few[:, faces[hits.triangles]], hits.weights, turned, optimize=True)
+        columns = np.concatenate([along, motion_columns(hits.points - centre, normals)], axis=1)
+        ahead, prior = np.einsum("nx,nx->n", points - hits.points, normals), np.repeat([1.0, 0.0], [len(few), 6])
+        state = np.concatenate([z[: len(few)], np.zeros(6)])
+        delta = solve_with_prior(columns, ahead, information * robust, prior, state)
+        z[: len(few)] += delta[: len(few)]
+        moved = motion_about(centre, delta[len(few) :]) @ pose
+        pose, used = RigidTransform(moved.rotation, moved.translation), step + 1
+        if step > 12 and float(np.abs(columns @ delta).mean()) < _STEP_MM:
             break
     return SurfaceFit(z, pose, _closest(model, z, pose, level, faces, points).distances, used)
 
@@ -80,27 +88,3 @@ def _closest(
     points: Float[np.ndarray, "N 3"],
 ) -> Hits:
     return SurfaceIndex(pose.apply(model.vertices(z, level)), faces).closest(points)
-
-
-def _step(
-    basis: Float[np.ndarray, "m V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    hits: Hits,
-    points: Float[np.ndarray, "N 3"],
-    information: Float[np.ndarray, " N"],
-    *,
-    z: Float[np.ndarray, " M"],
-    pose: RigidTransform,
-) -> tuple[float, Float[np.ndarray, " M"], RigidTransform]:
-    """Takes one Gauss-Newton step. Returns the mean length of its move (mm), and the new coefficients and pose."""
-    active, corners, normals = len(basis), faces[hits.triangles], hits.normals
-    centre = points.mean(0)
-    turned = normals @ pose.rotation  # n^T R
-    along = np.einsum("mncx,nc,nx->nm", basis[:, corners], hits.weights, turned, optimize=True)
-    columns = np.concatenate([along, motion_columns(hits.points - centre, normals)], axis=1)
-    ahead, prior = np.einsum("nx,nx->n", points - hits.points, normals), np.repeat([1.0, 0.0], [active, 6])
-    step = solve_with_prior(columns, ahead, information, prior, np.concatenate([z[:active], np.zeros(6)]))
-    new = z.copy()
-    new[:active] += step[:active]
-    moved = motion_about(centre, step[active:]) @ pose
-    return float(np.abs(columns @ step).mean()), new, RigidTransform(moved.rotation, moved.translation)
