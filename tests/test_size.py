@@ -20,9 +20,6 @@ def test_no_total_passes_its_ceiling() -> None:
     totals = count_all()
     over = {name: f"{totals[name]} > {ceiling}" for name, ceiling in ceilings.items() if totals[name] > ceiling}
     assert over == {}, "less code, not a higher ceiling: `python -m tests.tools.counts --list` shows where it is"
-
-
-def test_least_squares_are_solved_in_their_rooms() -> None:
     assert set(list_solver_loops()) == SOLVER_LOOPS.keys()
 
 

@@ -22,6 +22,7 @@ def nested(depth: int) -> list[Any]:
         ({"fail_on": ["\ud800"]}, "fail_on is "),
         ({"\ud800": 1}, r"unknown key '\ud800'"),
         ({"outputs": {"\ud800": 1}}, r"unknown key 'outputs.\ud800'"),
+        ({"warnings": []}, "unknown key 'warnings'"),
         ({"surface": "head"}, "unknown key 'surface'; did you mean 'outputs.surface'?"),
         ({"outputs": {"texture_sizes": 1}}, "unknown key 'outputs.texture_sizes'; did you mean 'texture_size'?"),
         ({"bust": {"spacing_mm": 10**400}}, "bust.spacing_mm is 1000"),
@@ -66,8 +67,3 @@ def test_the_old_names_of_the_albedo_are_read() -> None:
             assert settings.outputs == OutputSettings(albedo=albedo), outputs
             assert {warning.code for warning in settings.warnings} == {"setting-renamed"}
             assert len(settings.warnings) == len(outputs.keys() - {"albedo"})
-
-
-def test_warnings_are_no_setting() -> None:
-    with pytest.raises(InputError, match="unknown key 'warnings'"):
-        settings_from_document({"warnings": []})
