@@ -12,7 +12,7 @@ SOLVER_LOOPS = {
     "pipeline.texturing.light.fit_light": "its bounds are inequalities over a sphere, which each step states anew",
     "rig.camera.remove": "inverts the lens for all pixels at once; rig knows no estimator",
     "rig.studio.scene.subject.scattered": "solves once for each colour, and no least squares",
-}  # where `estimation` and `geometry.registration` do not serve, and why
+}  # why the rooms of least squares do not serve
 
 
 def test_no_total_passes_its_ceiling() -> None:

@@ -50,7 +50,6 @@ def test_numbers_of_earlier_versions_are_passed_over_with_one_warning() -> None:
     old = {"segmentation": {"evidence": 8.0}, "fitting": {"modes": 40, "bare_px": 3}, "texture": {"selection": {}}}
     settings = settings_from_document(old)
     (warning,) = settings.warnings
-    assert warning.code == "old-setting"
     assert warning.parameters["setting"] == "segmentation, fitting.bare_px, texture.selection"
     assert settings.fitting.modes == 40
     assert document_from_settings(settings).keys() == document_from_settings(Settings()).keys()
@@ -59,11 +58,13 @@ def test_numbers_of_earlier_versions_are_passed_over_with_one_warning() -> None:
 
 def test_the_old_names_of_the_albedo_are_read() -> None:
     read = {"none": [{"delight": False}, {"delight": True, "albedo": "none"}], "glb": [{"skin": "albedo"}]}
-    read |= {"file": [{"delight": True, "skin": "photograph"}]}
-    read["glb"] += [{"delight": True, "skin": "albedo"}]
+    read |= {
+        "file": [{"delight": True, "skin": "photograph"}],
+        "glb": [*read["glb"], {"delight": True, "skin": "albedo"}],
+    }
     for albedo, documents in read.items():
         for outputs in documents:
             settings = settings_from_document({"outputs": outputs})
             assert settings.outputs == OutputSettings(albedo=albedo), outputs
-            assert {warning.code for warning in settings.warnings} == {"setting-renamed"}
-            assert len(settings.warnings) == len(outputs.keys() - {"albedo"})
+            codes = [warning.code for warning in settings.warnings]
+            assert codes == ["setting-renamed"] * len(outputs.keys() - {"albedo"})
