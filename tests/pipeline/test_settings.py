@@ -53,7 +53,6 @@ def test_numbers_of_earlier_versions_are_passed_over_with_one_warning() -> None:
     assert warning.parameters["setting"] == "segmentation, fitting.bare_px, texture.selection"
     assert settings.fitting.modes == 40
     assert document_from_settings(settings).keys() == document_from_settings(Settings()).keys()
-    assert not settings_from_document(document_from_settings(settings)).warnings
 
 
 def test_the_old_names_of_the_albedo_are_read() -> None:
