@@ -31,6 +31,7 @@ WARNING_CODES = (
     "masks-exchanged",
     "masks-of-alpha",
     "masks-off-edges",
+    "moments-differ",
     "no-albedo",
     "no-bust",
     "no-chart",

@@ -99,6 +99,8 @@ GUARDS = (
     Guard(("view-left-out",), ("contrast along the outline, or area against the other cameras",),
           "a head pressed into a wrong outline", kind="warns"),
     Guard(("mask-contradicted",), ("dense depth of other views outside a silhouette",), "a cut bust", kind="warns"),
+    Guard(("moments-differ",), ("landmarks of a view against those of the others",), "a face between two moments",
+          kind="warns"),
     Guard(("lens-doubtful",), ("rays of points on the subject",), "a head bent by a wrong lens", kind="warns"),
     Guard(("mask-loose",), ("tangent planes of one camera",), "a head widened by a loose mask", kind="warns"),
     Guard(("scale-implausible",), ("diameters in the outlines",), "a head of the wrong size", kind="warns"),

@@ -3,7 +3,7 @@
 If most cameras contradict the others, other interpretations are tried: all pictures reflected about their principal
 points, as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 if they
 are square; poses written in another convention (``rig.plausibility``), which a rig whose cameras stand on a sphere
-around the world's origin does not reveal by itself; and intrinsics of other pictures (``lens_reading``). The one under
+around the world's origin does not reveal by itself; and intrinsics of pictures that were cropped, reduced or taken at another zoom (``LensReading``). The one under
 which tangent planes touch both outlines of each pair is named. If there is none, the calibration is another rig's, or
 older than a change of this one; unless many planes meet closely nevertheless, for then the masks are loose, with a
 shadow on the wall or hair that some of them lack. If a single camera contradicts the others, it is named.
@@ -12,7 +12,7 @@ Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothin
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +20,6 @@ from jaxtyping import Float
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import outer_hull
 from pipeline.view_checks.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
-from pipeline.view_checks.lens_reading import find_lens_reading
 from rig.camera import Camera, Intrinsics
 from rig.messages.message import Message, compose
 from rig.plausibility import alternative_conventions
@@ -45,6 +44,14 @@ LOOSE_BIMODAL, MAX_LOOSE_QUARTER = 0.28, 35e-4  # a better quarter's share of it
 # others whole, 0.03 to 0.25 with shadows in all of 11 views; a wrong rig's misses have one spread, 0.34 and more
 MIN_MISPLACED = 0.6  # of one camera among good ones: 0.95 with its rotation transposed; good ones reach 0.25
 MISPLACED_AMONG = 5  # cameras; of four, one that is wrong leaves three, who have six planes at most
+
+FACTORS = (1.0, 0.5, 0.67, 1.5, 2.0)  # of the focal lengths, of which the best are searched from
+MAX_SEARCHED_CAMERAS = 12  # of many: the search takes time by their square, and three numbers need no more
+SEARCHES, STEPS = 2, 90  # and how often the misses are asked in each
+STRIDE = 0.1  # of a factor's logarithm, and of a picture's side
+OTHER_FACTOR, OTHER_SHIFT = 0.15, 0.03  # of a factor's logarithm and a side: what makes a rig contradict itself
+MIN_FACTOR = 0.04  # from one; less is not told
+MIN_SHIFT = 0.02  # of the picture's width; less is not told
 
 Pixels = Float[np.ndarray, "_ 2"]
 Turn = Callable[[Pixels, Intrinsics], Pixels]
@@ -108,6 +115,72 @@ def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
     if len(seen) < MIN_CAMERAS:
         return False
     return _median_misfit([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen) >= MIN_WRONG
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensReading:
+    """Holds the rig with all focal lengths multiplied by ``factor`` and all principal points moved by ``shift``
+    (relative to the pictures' width and height)."""
+
+    rig: Rig
+    factor: float
+    shift: tuple[float, float]
+
+    @property
+    def is_other(self) -> bool:
+        """Tells whether the intrinsics differ from the calibrated ones by more than loose outlines alone would
+        cause."""
+        return bool(abs(np.log(self.factor)) >= OTHER_FACTOR or max(map(abs, self.shift)) >= OTHER_SHIFT)
+
+    def message(self) -> Message:
+        """Returns the message that refuses the rig and says by how much its lenses differ."""
+        k = self.rig.cameras[0].intrinsics
+        changes = []
+        if abs(self.factor - 1.0) >= MIN_FACTOR:
+            changes.append(compose("focal-lengths-times", factor=self.factor))
+        if max(map(abs, self.shift)) >= MIN_SHIFT:
+            right, down = self.shift[0] * k.width, self.shift[1] * k.height
+            changes.append(compose("principal-points-moved", right_px=right, down_px=down))
+        return compose("other-lenses", changes=changes)
+
+
+def find_lens_reading(hulls: Sequence[Pixels], rig: Rig, misfit: Callable[[Rig], float]) -> LensReading:
+    """Searches for the focal factor and principal shift with the smallest ``misfit``, starting from several focal
+    lengths (``FACTORS``).
+
+    Args:
+        hulls: convex hulls of the outlines (px), in the order of the rig.
+        rig: the cameras as calibrated.
+        misfit: returns how badly a rig fits.
+    """
+    from scipy.optimize import minimize  # a quarter of a second, and few rigs are wrong
+
+    searched = np.unique(np.linspace(0, len(rig) - 1, MAX_SEARCHED_CAMERAS).round().astype(int))
+    some, some_hulls = Rig(tuple(rig.cameras[k] for k in searched)), [hulls[k] for k in searched]
+
+    def cost(at: Float[np.ndarray, " 3"]) -> float:
+        misses = np.abs(tangency_errors_px(some_hulls, _with_lenses(some, at)))
+        known = misses[np.isfinite(misses)]
+        return float(np.mean(np.sqrt(known))) if len(known) >= misses.size / 4 else 1e6
+
+    found = []
+    for start in sorted((np.array([np.log(factor), 0.0, 0.0]) for factor in FACTORS), key=cost)[:SEARCHES]:
+        simplex = start + np.vstack([np.zeros(3), STRIDE * np.eye(3)])
+        options = {"initial_simplex": simplex, "maxfev": STEPS, "xatol": 1e-4, "fatol": 1e-4}
+        found.append(minimize(cost, start, method="Nelder-Mead", options=options).x)
+    log_factor, right, down = min(found, key=lambda at: misfit(_with_lenses(rig, at)))
+    read = _with_lenses(rig, np.array([log_factor, right, down]))
+    return LensReading(read, float(np.exp(log_factor)), (float(right), float(down)))
+
+
+def _with_lenses(rig: Rig, at: Float[np.ndarray, " 3"]) -> Rig:
+    factor = float(np.exp(np.clip(at[0], -2.0, 2.0)))
+    cameras = []
+    for camera in rig:
+        k = camera.intrinsics
+        cx, cy = k.cx + float(at[1]) * k.width, k.cy + float(at[2]) * k.height
+        cameras.append(replace(camera, intrinsics=replace(k, fx=k.fx * factor, fy=k.fy * factor, cx=cx, cy=cy)))
+    return Rig(tuple(cameras))
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:

@@ -209,8 +209,9 @@ TRANSFORMS: Table = {
         "nothing", "", "enable_depth_loading", "integer_depth_scale", "sharpen", "envmap", "timestamp", "camera_id"
     ),
     **_keys("nothing", "of a data set that `eigenhead export` wrote", "unit", "fg_mask_path", "camera_index"),
-    **_keys("nothing", "of a data set that `eigenhead export` wrote", "timestep_index", "camera_indices"),
-    **_keys("nothing", "of a data set that `eigenhead export` wrote", "timestep_indices"),
+    **_keys("nothing", "of a data set that `eigenhead export` wrote", "camera_indices"),
+    **_keys("read", "of several moments the first in `timestep_indices` is read, or the smallest", "timestep_index"),
+    **_keys("read", "the moments of the file; list another one first to read it", "timestep_indices"),
     **_keys("nothing", "", "auxiliary_data", "format_version", "dataset_id", "ids", "time", "fps", "num_exposures"),
 }
 
