@@ -1,12 +1,13 @@
 """Checks whether these cameras took the pictures, from silhouettes and calibration, before the fit.
 
 If most cameras contradict the others, other interpretations are tried: all pictures reflected about their principal
-points, as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 if they
-are square; poses written in another convention (``rig.plausibility``), which a rig whose cameras stand on a sphere
-around the world's origin does not reveal by itself; and intrinsics of pictures that were cropped, reduced or taken at another zoom (``LensReading``). The one under
-which tangent planes touch both outlines of each pair is named. If there is none, the calibration is another rig's, or
-older than a change of this one; unless many planes meet closely nevertheless, for then the masks are loose, with a
-shadow on the wall or hair that some of them lack. If a single camera contradicts the others, it is named.
+points, as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 if
+they are square; poses written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
+sphere around the world's origin does not reveal by itself; and intrinsics of pictures that were cropped, reduced or
+taken at another zoom (``LensReading``). The one under which tangent planes touch both outlines of each pair is named.
+If there is none, the calibration is another rig's, or older than a change of this one; unless many planes meet closely
+nevertheless, for then the masks are loose, with a shadow on the wall or hair that some of them lack. If a single
+camera contradicts the others, it is named.
 
 Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothing.
 """
@@ -32,9 +33,8 @@ MAX_RIGHT = 0.25  # of a reading that is believed
 MAX_CLEAR = 0.32  # of one by which the others are worse: 0.28 where the wrong rig has spoilt the outlines, which are
 # found with each other's help ...
 CLEARLY = 0.45  # ... and its share of theirs: 0.34 there
-MANY_LOST = (
-    0.33  # share of the views that only the others contradict, so that they are asked too: 6 of 11 of a wrong rig
-)
+MANY_LOST = 0.33  # share of the views that only the others contradict, so that they are asked too: 6 of 11 of a wrong
+# rig
 JUDGED_BY_OTHERS = "strange_share"  # a figure of views that were of use before the others were asked
 MAX_LENSES = 0.2  # of one in which focal lengths and principal points were sought: 0.01 to 0.15 where they are wrong
 # Of the picture's width, that half of all planes miss at most in a right rig with loose masks: 50e-4 with long hair
