@@ -19,7 +19,7 @@ from jaxtyping import Float
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.scene_tracks import SceneTracks, find_tracks, misses_px
 from pipeline.warnings import ReportWarning
-from rig.camera import Camera, Distortion
+from rig.camera import Distortion
 from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig
@@ -123,11 +123,8 @@ def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence
 
 
 def _with(rig: Rig, lens: Callable[[Distortion], Distortion]) -> Rig:
-    def read(camera: Camera) -> Camera:
-        k = camera.intrinsics
-        return replace(camera, intrinsics=replace(k, distortion=lens(k.distortion)))
-
-    return Rig(tuple(map(read, rig)))
+    lenses = [replace(camera.intrinsics, distortion=lens(camera.intrinsics.distortion)) for camera in rig]
+    return Rig(tuple(replace(camera, intrinsics=k) for camera, k in zip(rig, lenses, strict=True)))
 
 
 def _times(lens: Distortion, share: float) -> Distortion:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import outer_hull
 from pipeline.view_checks.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
-from rig.camera import Camera, Intrinsics
+from rig.camera import Intrinsics
 from rig.messages.message import Message, compose
 from rig.plausibility import alternative_conventions
 from rig.rig import Rig
@@ -174,13 +174,11 @@ def find_lens_reading(hulls: Sequence[Pixels], rig: Rig, misfit: Callable[[Rig],
 
 
 def _with_lenses(rig: Rig, at: Float[np.ndarray, " 3"]) -> Rig:
-    factor = float(np.exp(np.clip(at[0], -2.0, 2.0)))
-    cameras = []
-    for camera in rig:
-        k = camera.intrinsics
-        cx, cy = k.cx + float(at[1]) * k.width, k.cy + float(at[2]) * k.height
-        cameras.append(replace(camera, intrinsics=replace(k, fx=k.fx * factor, fy=k.fy * factor, cx=cx, cy=cy)))
-    return Rig(tuple(cameras))
+    factor, (right, down) = float(np.exp(np.clip(at[0], -2.0, 2.0))), at[1:].tolist()
+    return _changed(
+        rig,
+        lambda k: replace(k, fx=k.fx * factor, fy=k.fy * factor, cx=k.cx + right * k.width, cy=k.cy + down * k.height),
+    )
 
 
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
@@ -221,25 +219,18 @@ def _missed_shares(hulls: Sequence[Pixels], rig: Rig) -> Float[np.ndarray, "c c 
     return np.abs(tangency_errors_px(hulls, rig)) / together[..., None]
 
 
+def _changed(rig: Rig, change: Callable[[Intrinsics], Intrinsics]) -> Rig:
+    return Rig(tuple(replace(camera, intrinsics=change(camera.intrinsics)) for camera in rig))
+
+
 def _counted_from_below(rig: Rig) -> Rig:
     """Returns the rig with principal points whose rows were counted upwards from the picture's bottom."""
-
-    def read(camera: Camera) -> Camera:
-        k = camera.intrinsics
-        return replace(camera, intrinsics=replace(k, cy=k.height - 1.0 - k.cy))
-
-    return Rig(tuple(map(read, rig)))
+    return _changed(rig, lambda k: replace(k, cy=k.height - 1.0 - k.cy))
 
 
 def _on_its_side(rig: Rig) -> Rig:
     """Returns the rig with the axes of each camera's picture exchanged."""
-
-    def read(camera: Camera) -> Camera:
-        k = camera.intrinsics
-        exchanged = replace(k, width=k.height, height=k.width, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx)
-        return replace(camera, intrinsics=exchanged)
-
-    return Rig(tuple(map(read, rig)))
+    return _changed(rig, lambda k: replace(k, width=k.height, height=k.width, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx))
 
 
 def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:
