@@ -13,14 +13,7 @@ from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from
 from pipeline.part_labels.appearance_cells import head_guide, make_cells
 from pipeline.part_labels.codes import CHANNELS, Part
 from pipeline.part_labels.label_kernels import spread_parts
-from pipeline.part_labels.labelling import (
-    classify_parts,
-    colour_histogram,
-    detail_histogram,
-    guided,
-    posterior,
-    starts,
-)
+from pipeline.part_labels.labelling import classify_parts, colour_histogram, detail_histogram, guided, posterior, starts
 from pipeline.settings import PartSettings
 from rig.mesh import Mesh
 from rig.rig import Rig

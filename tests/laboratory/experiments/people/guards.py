@@ -61,7 +61,7 @@ def guards(
         good = FAULTY not in path.resolve().parts
         capture, rig = read_scaled_capture(path)
         judged.append(judge(path.resolve().parent.name, good, capture, rig))
-        judged += [judge("another moment", False, capture, move_one(rig, number))] * good
+        judged += [judge("another moment", False, capture, move_one(rig, number))] if good else []
     for number in range(subjects):
         bench.report("studio", (len(folders) + number) / (len(folders) + subjects))
         shot = photograph_gaze(model, number, renderer)
@@ -100,16 +100,14 @@ def judge(source: str, good: bool, capture: Capture, rig: Rig) -> Judged:
     except EigenheadError as refusal:
         return Judged(source, good, frozenset(codes_of(refusal.message)))
     lenses = judge_distortion(views.capture.images, views.silhouettes, rig)
-    moments = judge_moments(find_subject(views.capture.images, rig, load_networks()), rig)
-    warnings = (*views.warnings, *lenses, *moments)
+    warnings = (*views.warnings, *lenses, *judge_moments(find_subject(views.capture.images, rig, load_networks()), rig))
     return Judged(source, good, frozenset(code for said in warnings for code in codes_of(said)))
 
 
 def move_one(rig: Rig, number: int) -> Rig:
     """Returns the rig for which one camera's picture shows the subject 10 mm aside, as of another moment."""
-    camera, aside = rig.cameras[number % len(rig)], RigidTransform(np.eye(3), np.array([10.0, 0.0, 0.0]))
-    moved = replace(camera, camera_from_world=aside @ camera.camera_from_world)
-    return Rig(tuple(moved if one is camera else one for one in rig))
+    moved, aside = rig.cameras[number % len(rig)], RigidTransform(np.eye(3), np.array([10.0, 0.0, 0.0]))
+    return Rig(tuple(replace(c, camera_from_world=aside @ c.camera_from_world) if c is moved else c for c in rig))
 
 
 def codes_of(message: Message) -> set[str]:
