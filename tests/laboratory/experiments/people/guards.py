@@ -2,8 +2,8 @@
 
 Each capture goes through reading, masks and the checks of its views, as ``eigenhead check`` does; no head is fitted, so
 that guards after the fit have none. Captures in a folder called ``faulty`` should not pass in silence, all others
-should. The studio adds good captures, and the same with a rig in another unit. Good ones are judged again with one
-camera 10 mm aside (`another moment`). A guard's false alarms are its messages
+should. The studio adds good captures, and the same with a rig in another unit. Good ones are
+judged again with one camera 10 mm aside. A guard's false alarms are its messages
 on good captures, its hits those on faulty ones.
 """
 
@@ -73,7 +73,6 @@ def guards(
     for good, alarm, count in ((True, "false_alarms", "good"), (False, "hits", "faulty")):
         those = [one for one in judged if one.good is good]
         figures |= {alarm: float(sum(not one.codes.isdisjoint(refusing) for one in those)), count: float(len(those))}
-    spoke = [row for row in rows if row["false_alarms"] or row["hits"]]
     header = ("guard", "kind", "captures", "false_alarms", "good", "hits", "faulty", "evidence", "prevents")
     return {
         "figures": figures,
@@ -82,7 +81,8 @@ def guards(
         "lines": [
             f"{row['guard']} ({row['captures']}): {row['false_alarms']} false alarms in {row['good']} good captures, "
             f"{row['hits']} hits in {row['faulty']} faulty ones"
-            for row in spoke
+            for row in rows
+            if row["false_alarms"] or row["hits"]
         ],
     }
 
