@@ -150,8 +150,7 @@ def finished(
     skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
     if head is not None:
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured))
-    if (skin < 1.0).any():
-        mesh = smooth_hair(mesh, skin, seen)
+    mesh = smooth_hair(mesh, skin, seen)
     if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, shares[:, Part.HAIR.channel], silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))

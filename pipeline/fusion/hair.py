@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.compute.trace import traced
+from pipeline.fusion.quality import EDGE_MM, guessed_deviation_mm
 from pipeline.fusion.refinement import neighbours
 from pipeline.fusion.refinement_kernels import blurred_over_mesh
 from pipeline.fusion.skin import skin_share
@@ -54,7 +55,8 @@ def smooth_hair(mesh_world: Mesh, skin: Float[np.ndarray, " v"], seen: Bool[np.n
         seen: by a view; the others are what is seen next to them.
     """
     beside = neighbours(mesh_world.faces, len(seen))
-    share = skin_share(beside, mesh_world.vertices, skin, seen)[:, None]
+    share = skin_share(beside, mesh_world.vertices, skin, seen)
+    share = (share * EDGE_MM / np.maximum(guessed_deviation_mm(mesh_world.vertices, seen), EDGE_MM))[:, None]
     area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / len(seen)
     mean = blurred_over_mesh(mesh_world.vertices, *beside, round(RESOLVED_MM**2 / (STEP_SHARE * area_mm2)))
     return Mesh(share * mesh_world.vertices + (1.0 - share) * mean, mesh_world.faces)

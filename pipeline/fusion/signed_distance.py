@@ -188,12 +188,13 @@ def solve(
 
 
 def firmness(grid: Grid, field: Field, parts: PartVotes | None) -> Field:
-    """Returns by how much each vote counts at the nodes of a whole box, from the parts that lie about its surface: 1, and
+    """Returns by how much each vote counts at the nodes of a whole box, from the parts about its surface: 1, and
     ``SCATTERED_WEIGHT`` in hair."""
     out = np.ones(len(grid), np.float32)
     if parts is not None:
         near = np.flatnonzero(np.abs(field) < REACH * grid.step_mm)
-        out[near] -= (1.0 - SCATTERED_WEIGHT) * part_shares(parts, grid.places(near))[:, Part.HAIR.channel]
+        hair = part_shares(parts, grid.places(near))[:, Part.HAIR.channel]
+        out[near] -= (1.0 - SCATTERED_WEIGHT) * hair
     return out
 
 
