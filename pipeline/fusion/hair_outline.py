@@ -26,7 +26,6 @@ from rig.rig import Rig
 # Median thickness that hair lacks at its rims, from which on it counts as strands, and counts whole: 0.14 and 0.15 mm
 # of two captures of solid hair, 3.4 and 5.3 of two of strands.
 STRANDS_MM = (1.0, 2.0)
-FEW_VIEWS = 4  # tell solid hair, with which nothing else is to be done
 SURELY = 0.5  # probability from which on a vertex of a rim counts as hair
 EVERY = 4  # pixel of a rim is measured
 RIM_PX = 0.5  # by which the pixels of a rim lie inside the outline
@@ -60,14 +59,11 @@ def grown_to_outlines(
     rig = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
     if not sure.any() or not len(rig):
         return mesh_world, np.zeros(len(hair))
-    few = rig.subset(rig.names[:: -(-len(rig) // FEW_VIEWS)])
-    trust = strands_share(rims(mesh_world, sure, silhouettes, few)[1])
-    if trust == 0.0:
-        return mesh_world, np.zeros(len(hair))
-    mesh, beside = mesh_world, neighbours(mesh_world.faces, len(hair))
+    mesh, beside, trust = mesh_world, neighbours(mesh_world.faces, len(hair)), None
     for _ in range(ROUNDS):
         places, missing_mm = rims(mesh, sure, silhouettes, rig)
-        if len(places) < MIN_PLACES:
+        trust = strands_share(missing_mm) if trust is None else trust
+        if len(places) < MIN_PLACES or trust == 0.0:
             break
         outwards = np.zeros(len(hair))
         outwards[hair > 0.0] = missing_thickness(mesh.vertices[hair > 0.0], places, missing_mm)
