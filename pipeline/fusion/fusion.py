@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences
-from pipeline.fusion.hair import parts_over_head, smooth_hair
-from pipeline.fusion.hair_outline import STRAND_SHARE, grown_to_outlines
+from pipeline.fusion.hair import STRAND_SHARE, grown_to_outlines, parts_over_head, smooth_hair
 from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
 from pipeline.fusion.refinement import Measured, refine_vertices
@@ -30,7 +29,6 @@ from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.votes import PartVotes, part_codes, part_shares
-from pipeline.settings import BustSettings
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.window_bias import WindowBias, without_bias
 from pipeline.warnings import ReportWarning
@@ -84,7 +82,7 @@ def fuse(
     head_world: Mesh | None,
     *,
     bias: WindowBias,
-    settings: BustSettings,
+    spacing_mm: float,
     report: Progress,
     hair: SilentHair | None = None,
     parts: PartVotes | None = None,
@@ -97,7 +95,7 @@ def fuse(
         rig: the cameras as calibrated, world frame.
         head_world: the fitted head, closed except at its neck (mm); None if there is none.
         bias: of the matching windows.
-        settings: spacing of the vertices.
+        spacing_mm: distance of the vertices.
         report: called with the stage's progress.
         hair: of which the depth maps say nothing; None if there is none.
         parts: which part each point shows (``parts_over_head``); None counts all as skin.
@@ -110,11 +108,11 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level = solve(maps, views, head_world, settings.spacing_mm, hair, parts)
+    level = solve(maps, views, head_world, spacing_mm, hair, parts)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)
-    mesh, measured = refine_vertices(net, views, settings.spacing_mm)
+    mesh, measured = refine_vertices(net, views, spacing_mm)
     measured = without_islands(mesh, measured)
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(mask_warnings(names, contradicted))

@@ -9,7 +9,6 @@ from pipeline.fusion.hair import OFF_HEAD_MM, STUBBLE_MM, parts_over_head, smoot
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
 from pipeline.part_labels.votes import PartVotes, vote_parts
-from pipeline.settings import BustSettings
 from pipeline.stereo.window_bias import WindowBias
 from rig.mesh import Mesh
 from rig.progress import discard_progress
@@ -64,7 +63,10 @@ def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
 
 
 def test_votes_for_strands_leave_no_gravel() -> None:
-    rng, exact = np.random.default_rng(0), scene([Ellipsoid((0, 0, 0), (RADIUS_MM,) * 3)], fan(400, 300))
+    rng, exact = (
+        np.random.default_rng(0),
+        scene([Ellipsoid((0, 0, 0), (RADIUS_MM, RADIUS_MM, RADIUS_MM))], fan(400, 300)),
+    )
     scattered = [
         replace(each, depth_mm=np.where(each.known, each.depth_mm + rng.normal(0.0, 4.0, each.depth_mm.shape), 0.0))
         for each in exact.maps
@@ -81,7 +83,7 @@ def test_votes_for_strands_leave_no_gravel() -> None:
             exact.rig,
             None,
             bias=WindowBias(),
-            settings=BustSettings(spacing_mm=1.5),
+            spacing_mm=1.5,
             report=discard_progress,
             parts=vote_parts(scattered, labels, exact.rig),
         )

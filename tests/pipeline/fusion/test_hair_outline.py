@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.fusion.hair_outline import grown_to_outlines
+from pipeline.fusion.hair import grown_to_outlines
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from rig.mesh import Mesh
 from tests.support.ellipsoid_depths import Ellipsoid, Scene, scene
