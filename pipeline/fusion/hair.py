@@ -33,7 +33,7 @@ from rig.mesh import Mesh, face_normals
 from rig.rig import Rig
 
 # Height (mm) over the head up to which hair is skin with hair's colour (stubble, brows, a beard), and from which on it
-# is hair: what depth shows of beard-smile's beard lies 0.7 mm over the head, and of its hair 3.6.
+# is hair: the cells of beard-smile's beard lie 0.6 mm over the head in the median, those of its hair 3.5.
 STUBBLE_MM = (1.0, 3.0)
 CELLS = 64  # about a cell, whose mean height counts: 12 mm about it
 RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair and clothes takes: gravel is 2 to 5 mm wide
