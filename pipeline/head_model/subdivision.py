@@ -118,9 +118,8 @@ def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.nd
 
 
 def opened_faces(levels: Mapping[str, Int[np.ndarray, "F 3"]]) -> Int[np.ndarray, "G 3"]:
-    """Returns the triangles of the level ``full`` without those that close eyes and mouth. Models have these last in the
-    level ``cage``, of which every triangle becomes equally many of ``full``. All are returned of a model that closes
-    nothing so."""
+    """Returns the triangles of the level ``full`` without those that close eyes and mouth; all of them if there are
+    none. Models have those last in the level ``cage``, of which every triangle becomes equally many of ``full``."""
     cage, full = levels["cage"], levels["full"]
     first = len(cage)
     for count in range(len(cage) - 1, len(cage) - MAX_CLOSING, -1):

@@ -103,7 +103,9 @@ def _write_bust(folder: Path, result: Reconstruction, bust: Bust) -> None:
         part=bust.surface.part,
         comments=[*ply_comments(result), QUALITY, "part is 0 unseen, 1 skin, 2 hair, 3 clothes"],
     )
-    _write_glb(folder / "bust.glb", result, Mesh(bust.mesh_world.vertices, bust.mesh_world.faces, bust.colours), bust.normals)
+    _write_glb(
+        folder / "bust.glb", result, Mesh(bust.mesh_world.vertices, bust.mesh_world.faces, bust.colours), bust.normals
+    )
 
 
 def _write_hair(folder: Path, result: Reconstruction, hair: HairyHead) -> None:

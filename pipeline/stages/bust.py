@@ -154,9 +154,7 @@ def push_out_hair(
     mesh = Mesh(shell.vertices_world, refined.mesh_world.faces)
     normals, depths, layout = mesh.normals(), depth_maps(rig, mesh), find_layout(context.model, settings)[0]
     around = None if layout is None else layout.around
-    colours = texture(
-        mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture, around=around
-    )
+    colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture, around=around)
     atlas = paint_head(layout, mesh, colours, context.model.levels["full"].face_region, settings)
     made = HairyHead(shell, normals, colours.colours, colours.views, atlas)
     beyond = shell.covered < MIN_COVERED

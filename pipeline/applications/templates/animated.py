@@ -1,6 +1,6 @@
-"""A head that can be animated, in a registered mesh or in the model's own: Apple's 52 shapes, its pivots, and eyeballs,
-teeth and a tongue where its eyes are open and its lips part and it has none. A registered mesh has the visemes, too, and
-shapes without crossing."""
+"""A head that can be animated, in a registered mesh or in the model's own: Apple's 52 shapes, its pivots, and
+eyeballs, teeth and a tongue where its eyes are open and its lips part and it has none. A registered mesh has the
+visemes, too, and shapes without crossing."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

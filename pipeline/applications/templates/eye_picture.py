@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.applications.templates.eyeballs import AHEAD, LIMBUS_MM, Eyeball, turn_to
+from pipeline.applications.templates.eyeballs import LIMBUS_MM, Eyeball, turn_to
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from rig.mesh import Mesh

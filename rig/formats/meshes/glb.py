@@ -1,10 +1,10 @@
 """Writes binary glTF: meshes with vertex colours or textures, morph targets, and nodes at the points that parts turn
 about. It does not use trimesh, whose bytes differ between versions.
 
-The nodes, where there are pivots: ``neck`` over all others, at the joint of skull and spine; under it the parts that turn
-with it and a node at every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part that has a pivot's name is the mesh
-of that node; others are nodes below it. Morph targets are sparse, since an expression moves only a part of the face; their
-names are in ``extras.targetNames``, where three.js, Blender and others look for them.
+The nodes, where there are pivots: ``neck`` over all others, at the joint of skull and spine; under it the parts that
+turn with it and a node at every other pivot (``jaw``, ``eye_right``, ``eye_left``). A part that has a pivot's name is
+the mesh of that node; others are nodes below it. Morph targets are sparse, since an expression moves only a part of the
+face; their names are in ``extras.targetNames``, where three.js, Blender and others look for them.
 """
 
 import json

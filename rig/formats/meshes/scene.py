@@ -19,8 +19,9 @@ class Skin:
     """Holds a texture: coordinates (from the image's upper left corner, v downwards) and the encoded image.
 
     ``source`` says which vertex of the mesh each coordinate belongs to, and ``faces`` are the triangles of coordinates;
-    without them there is a coordinate a vertex. With a normal map (PNG, linear, +Y up), ``tangents`` are the tangents to
-    which it refers, with the signs of the bitangents. ``specular`` is the strength of mirrored light, the alpha of a PNG.
+    without them there is a coordinate a vertex. With a normal map (PNG, linear, +Y up), ``tangents`` are the tangents
+    to which it refers, with the signs of the bitangents. ``specular`` is the strength of mirrored light, the alpha of a
+    PNG.
     """
 
     uv: Float[np.ndarray, "n 2"]

@@ -13,7 +13,8 @@ import trimesh
 from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
 from pipeline.texturing.layout.reduced_layout import ReducedLayout, reduce
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
-from rig.formats.meshes.glb import Skin, glb_bytes
+from rig.formats.meshes.glb import glb_bytes
+from rig.formats.meshes.scene import Skin
 from rig.mesh import Mesh
 
 RADIUS_MM, BUMP_MM, WAVES = 90.0, 0.5, 24.0

@@ -4,11 +4,10 @@ import numpy as np
 import trimesh
 from trimesh.util import wrap_as_stream
 
-from rig.formats.meshes.glb import glb_bytes
-from rig.formats.meshes.glb_document import opened_glb
-from rig.formats.meshes.morph_glb import with_morphs
-from rig.formats.meshes.pivot_glb import with_pivots
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.scene import Part, Scene
 from rig.mesh import Mesh
+from tests.support.glb import opened_glb
 from tests.support.scenes import ellipsoid
 
 PIVOTS = {
@@ -22,10 +21,9 @@ def written() -> tuple[bytes, Mesh, Mesh]:
     head = ellipsoid(3)
     ball = trimesh.creation.icosphere(subdivisions=2, radius=12.0)
     eye = Mesh(np.array(ball.vertices) + PIVOTS["eye_left"], np.array(ball.faces, np.int32))
-    colours = np.full((len(head.vertices), 3), 128, np.uint8)
-    glb = glb_bytes(head, normals=head.normals(), colours=colours)
-    glb = with_morphs(glb, head.vertices, head.faces, {"jawOpen": np.ones_like(head.vertices)}, {})
-    return with_pivots(glb, PIVOTS, {"eye_left": eye}, {"eye_left": [3, 4]}), head, eye
+    skin = Part("head", head, morphs={"jawOpen": np.ones_like(head.vertices)})
+    scene = Scene([skin, Part("eye_left", eye, pivot="eye_left", rows=[3, 4])], PIVOTS)
+    return scene_glb_bytes(scene), head, eye
 
 
 def test_every_part_lies_where_it_was() -> None:
