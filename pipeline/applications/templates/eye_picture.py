@@ -21,16 +21,18 @@ ASIDE_MM = 0.5  # between a point of the ball and the nearest one between the li
 FEATHER_PX = 6  # over which what is seen fades to what is guessed
 RING_DEG = 1.0
 MIN_SEEN = 0.3  # of the iris
+BRIGHT = 0.7  # of what is seen beside the iris, the share that lids and their shadow may be
+DARK_SHARES, DARK = (0.2, 0.9), 0.5  # of what is seen, and of its brightness: a pupil and an iris beside the white
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotographedEyes:
     """Holds the head as photographed (head frame, mm), the numbers of its triangles between lids and lips, and its
-    texture."""
+    texture, if it has one."""
 
     head: Mesh
     between: Int[np.ndarray, " g"]
-    atlas: Atlas
+    atlas: Atlas | None
 
 
 def eyeball_uv(eyeball: Eyeball, mesh: Mesh) -> Float[np.ndarray, "n 2"]:
@@ -44,18 +46,14 @@ def eyeball_uv(eyeball: Eyeball, mesh: Mesh) -> Float[np.ndarray, "n 2"]:
 
 def paint_eyeball(eyeball: Eyeball, photographed: PhotographedEyes) -> UInt8[np.ndarray, "s s 3"] | None:
     """Returns the image of an eyeball (sRGB), or None if too little of its iris is seen."""
-    offsets = (np.arange(SIZE_PX) + 0.5) / SIZE_PX - 0.5
-    x, y = np.meshgrid(offsets, -offsets)
-    angle = 2.0 * np.pi * np.hypot(x, y)
-    front = angle < np.radians(FRONT_DEG)
-    ahead = np.sinc(angle[front] / np.pi)[:, None] * 2.0 * np.pi * np.stack([x[front], y[front]], axis=1)
-    directions = np.column_stack([ahead, np.cos(angle[front])]) @ turn_to(eyeball.gaze).T
+    angle, front, directions = _front(eyeball.gaze)
     colours, seen = _photographed(eyeball, directions, photographed)
     iris = angle[front] < np.arcsin(LIMBUS_MM / eyeball.radius_mm)
     if seen[iris].mean() < MIN_SEEN or not seen[~iris].any():
         return None
     ring = (np.degrees(angle[front]) / RING_DEG).astype(int)
-    white = np.median(colours[seen & ~iris], axis=0)
+    beside, light = seen & ~iris, colours.mean(axis=1)
+    white = np.median(colours[beside & (light >= np.quantile(light[beside], BRIGHT))], axis=0)
     guess = np.tile(white, (len(ring), 1))
     for number in np.unique(ring[iris]):
         rows = ring == number
@@ -68,17 +66,46 @@ def paint_eyeball(eyeball: Eyeball, photographed: PhotographedEyes) -> UInt8[np.
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
+def darkest_direction(eyeball: Eyeball, photographed: PhotographedEyes) -> Float[np.ndarray, " 3"] | None:
+    """Returns the direction (unit vector) from the eyeball to the middle of what is darkest between the lids; None if
+    nothing is much darker than the rest, as between closed lids."""
+    _, _, directions = _front(eyeball.gaze)
+    colours, seen = _photographed(eyeball, directions, photographed)
+    if not seen.any():
+        return None
+    light = colours[seen].mean(axis=1)
+    dark, bright = np.quantile(light, DARK_SHARES)
+    towards = directions[seen][light < dark].mean(axis=0) if dark < DARK * bright else None
+    return None if towards is None else towards / np.linalg.norm(towards)
+
+
+def _front(
+    gaze: Float[np.ndarray, " 3"],
+) -> tuple[Float[np.ndarray, "s s"], Bool[np.ndarray, "s s"], Float[np.ndarray, "n 3"]]:
+    """Returns the angle from the gaze (rad) of each texel, which texels are in front, and their directions."""
+    offsets = (np.arange(SIZE_PX) + 0.5) / SIZE_PX - 0.5
+    x, y = np.meshgrid(offsets, -offsets)
+    angle = 2.0 * np.pi * np.hypot(x, y)
+    front = angle < np.radians(FRONT_DEG)
+    ahead = np.sinc(angle[front] / np.pi)[:, None] * 2.0 * np.pi * np.stack([x[front], y[front]], axis=1)
+    return angle, front, np.column_stack([ahead, np.cos(angle[front])]) @ turn_to(gaze).T
+
+
 def _photographed(
     eyeball: Eyeball, directions: Float[np.ndarray, "n 3"], photographed: PhotographedEyes
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Returns the head's colours (sRGB) where an eyeball lies in these directions, and which of them lids do not
     hide."""
-    head, layout, image = photographed.head, photographed.atlas.layout, photographed.atlas.image
+    head, atlas = photographed.head, photographed.atlas
+    if atlas is None or not len(photographed.between):
+        return np.zeros_like(directions), np.zeros(len(directions), bool)
+    layout, image = atlas.layout, atlas.image
     points = eyeball.centre + eyeball.reach(directions)[:, None] * directions
     hits = SurfaceIndex(head.vertices, head.faces[photographed.between]).closest(points)
     off = hits.points - points
     aside = off - np.einsum("nx,nx->n", off, directions)[:, None] * directions
     corners = layout.uv[layout.faces[photographed.between[hits.triangles]]]
     texels = (np.einsum("nk,nkx->nx", hits.weights, corners) * len(image) - 0.5).astype(np.float32)
-    colours = cv2.remap(image, texels[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(colours, float).reshape(-1, 3), np.linalg.norm(aside, axis=1) < ASIDE_MM
+    rows = np.resize(texels, (-(-len(texels) // SIZE_PX), SIZE_PX, 2))  # remap takes no more than 32,767 in a row
+    colours = cv2.remap(image, rows, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(colours, float).reshape(-1, 3)[: len(texels)], np.linalg.norm(aside, axis=1) < ASIDE_MM

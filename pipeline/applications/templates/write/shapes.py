@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from pipeline.applications.templates.animated import AnimatedMesh, animated_head, animated_mesh
-from pipeline.applications.templates.eye_picture import PhotographedEyes, eyeball_uv, paint_eyeball
+from pipeline.applications.templates.eye_picture import PhotographedEyes, darkest_direction, eyeball_uv, paint_eyeball
 from pipeline.applications.templates.eyeballs import AHEAD, turn_to
 from pipeline.applications.templates.inner_mouth import TONGUE_OUT, WITH_JAW
 from pipeline.applications.templates.template_file import Template
@@ -83,29 +83,33 @@ def write_posed(folder: Path, result: Reconstruction) -> None:
     animated = AnimatedMesh(neutral, shapes, {}, {})
     if len(opened) < len(head.faces):
         animated = animated_head(neutral, opened, shapes, model.landmarks, gazes=_gazes(eyes, from_world))
-        animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world))
+    photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
+    animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world, photographed))
     skin, colours = head_skin(result, head), result.texturing.vertices.colours
     if skin is not None and skin.faces is not None:
         skin = replace(skin, faces=skin.faces[: len(opened)])
     scene = animated_scene(animated, opened, colours, blendshape_rig.weights, skin)
-    if result.texturing.atlas is not None:
-        photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
-        scene = replace(scene, parts=[_with_picture(part, animated, photographed) for part in scene.parts])
+    scene = replace(scene, parts=[_with_picture(part, animated, photographed) for part in scene.parts])
     write_atomically(folder / "posed.glb", scene_glb_bytes(scene, asset_extras(result)))
 
 
 def _towards_irises(
-    animated: AnimatedMesh, eyes: Mapping[str, Iris | UnseenEye], from_world: RigidTransform
+    animated: AnimatedMesh,
+    eyes: Mapping[str, Iris | UnseenEye],
+    from_world: RigidTransform,
+    photographed: PhotographedEyes,
 ) -> dict[str, Float[np.ndarray, " 3"]]:
-    """Returns the directions from added eyeballs to the irises that were seen, so that these lie where they were
-    photographed although the ball lies where the lids let it."""
+    """Returns the directions from added eyeballs to the irises, so that these lie where they were photographed although
+    the ball lies where the lids let it. An iris that was not measured is what is dark between open lids."""
     found = {}
-    for side, eye in eyes.items():
-        ball = animated.added.get(f"eye_{side}")
-        if ball is not None and isinstance(eye, Iris):
+    for name, ball in animated.added.items():
+        eye = eyes.get(name.removeprefix("eye_"))
+        if isinstance(eye, Iris):
             towards = from_world.apply(eye.centre[None])[0] - ball.centre
-            found[f"eye_{side}"] = towards / np.linalg.norm(towards)
-    return found
+            found[name] = towards / np.linalg.norm(towards)
+        elif eye is not None and eye.cause != "closed":
+            found[name] = darkest_direction(ball, photographed)
+    return {name: gaze for name, gaze in found.items() if gaze is not None}
 
 
 def _with_picture(part: Part, animated: AnimatedMesh, photographed: PhotographedEyes) -> Part:
