@@ -12,14 +12,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 
 from pipeline.head_model.subdivision import boundary_loops, close_loop
 from pipeline.results.metadata import QUALITY, asset_extras, ply_comments
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.results.skin_files import write_skin_maps
 from pipeline.texturing.chart_colours import CODES, ENCODED
 from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
+from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.pores.skin_maps import SkinMaps
 from pipeline.texturing.sets.specular import Specular
 from pipeline.texturing.sets.texture_sets import SetTextures
 from pipeline.texturing.visibility import LINEAR
@@ -46,17 +47,10 @@ FAN_MM = 15.0  # a border that reaches so far to all sides is the neck's: it is 
 PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # level 6 takes four times as long for a tenth of the size
 
 
-def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
-    """Writes head.ply and the other head files that ``settings.outputs`` names. Raises NoUsd if the library for USD is
-    missing, and OSError.
-
-    Args:
-        folder: of the result.
-        result: what is written.
-        head: the head's mesh in the head frame, mm.
-    """
-    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.formats, result.texturing.atlas
-    named = atlas is not None and outputs.ply_texture
+def write_head_ply(folder: Path, result: Reconstruction) -> None:
+    """Writes head.ply, and head.png if the settings ask for its texture. Raises OSError."""
+    atlas = result.texturing.atlas
+    named = atlas is not None and result.settings.outputs.ply_texture
     corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
     write_ply(
         folder / "head.ply",
@@ -68,8 +62,20 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         corner_uv=corner_uv,
         comments=[*ply_comments(result), QUALITY, *(["TextureFile head.png"] if named else [])],
     )
-    if atlas is not None and (named or "obj" in formats):
+    if atlas is not None and named:
         write_atomically(folder / "head.png", encoded(atlas.image, "png"))
+
+
+def write_formats(folder: Path, result: Reconstruction, head: Mesh) -> None:
+    """Writes the textures and the other head files that ``settings.outputs`` names. Raises NoUsd if the library for USD
+    is missing, and OSError.
+
+    Args:
+        folder: of the result.
+        result: what is written.
+        head: the head's mesh in the head frame, mm.
+    """
+    formats, atlas = result.settings.outputs.formats, result.texturing.atlas
     if result.texturing.albedo is not None:
         write_atomically(folder / "texture" / "albedo.png", encoded(result.texturing.albedo.atlas.image, "png"))
     if atlas is not None and result.texturing.skin is not None:
@@ -81,8 +87,9 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
     if "glb" in formats:
         write_atomically(folder / "head.glb", _glb(result, head, normals))
     if "obj" in formats:
-        if skin is not None:
+        if atlas is not None:
             write_atomically(folder / "head.mtl", mtl_bytes("head.png"))
+            write_atomically(folder / "head.png", encoded(atlas.image, "png"))
         part = Part("head", Mesh(result.mesh_world.vertices, head.faces, head.colours), result.texturing.normals, skin)
         write_atomically(folder / "head.obj", scene_obj_bytes(Scene([part]), "head.mtl" if skin else None))
     if "usdz" in formats and atlas is not None:
@@ -185,6 +192,12 @@ def write_set_textures(folder: Path, sets: SetTextures) -> None:
         write_exr(folder / "specular.exr", light)
 
 
+def write_skin_maps(folder: Path, atlas: Atlas, maps: SkinMaps) -> None:
+    """Writes the maps of a head's skin below ``folder``, each under a temporary name first. Raises OSError."""
+    for name, image in (("colour", atlas.image), ("normals", maps.normals), ("displacement", maps.displacement)):
+        _write_png(folder / f"{name}.png", image)
+
+
 def strength_png(specular: Specular) -> bytes:
     """Returns glTF's specular strength as a PNG whose alpha it is; the colours of the pixels are white."""
     alpha = specular.strength()
@@ -195,6 +208,6 @@ def _encode_light(light: Float[np.ndarray, "s s 3"]) -> UInt8[np.ndarray, "s s 3
     return ENCODED[(CODES * np.clip(light, 0.0, 1.0) + 0.5).astype(np.int32)]
 
 
-def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"]) -> None:
-    stored = np.ascontiguousarray(image[:, :, ::-1])
+def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"] | UInt16[np.ndarray, "s s"]) -> None:
+    stored = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     write_atomically(path, cv2.imencode(".png", stored, PNG_SPEED)[1].tobytes())

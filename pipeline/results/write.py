@@ -24,8 +24,15 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.compute.threads import task_pool
-from pipeline.evidence.expression import BlendshapeRig
-from pipeline.results.head_files import ENCODINGS, encoded, head_from_world, head_mesh, head_skin, write_head
+from pipeline.results.head_files import (
+    ENCODINGS,
+    encoded,
+    head_from_world,
+    head_mesh,
+    head_skin,
+    write_formats,
+    write_head_ply,
+)
 from pipeline.results.metadata import QUALITY, asset_extras, ply_comments
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
 from pipeline.results.reconstruction import Reconstruction
@@ -68,13 +75,13 @@ def write_result(
         extra_writers: what writes further files of the result, such as the head in a template's vertex order.
     """
     capture = reassign_images(capture, pictures=result.views.assignment)
-    head, neutral = head_mesh(result), result.evidence.blendshape_rig if result.settings.outputs.neutral else None
+    head = head_mesh(result)
     with task_pool(THREADS) as pool:
         extra_jobs = [pool.submit(write, folder, result) for write in extra_writers]
         jobs = [
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),
-            *([] if not neutral else [pool.submit(_write_neutral, folder, result, neutral)]),
+            pool.submit(write_neutral, folder, result),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
             *([] if result.hair is None else [pool.submit(_write_hair, folder, result, result.hair)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
@@ -127,9 +134,12 @@ def _write_hair(folder: Path, result: Reconstruction, hair: HairyHead) -> None:
     _write_glb(folder / "head_hair.glb", result, mesh, hair.normals, skin)
 
 
-def _write_neutral(folder: Path, result: Reconstruction, blendshape_rig: BlendshapeRig) -> None:
-    """Writes neutral.glb with the colours of the photographed head."""
-    world = blendshape_rig.neutral_world
+def write_neutral(folder: Path, result: Reconstruction) -> None:
+    """Writes neutral.glb, with the texture of the photographed head, if the settings ask for it and the model has
+    expressions. Raises OSError."""
+    if result.evidence.blendshape_rig is None or not result.settings.outputs.neutral:
+        return
+    world = result.evidence.blendshape_rig.neutral_world
     mesh = Mesh(world.vertices, world.faces, result.texturing.vertices.colours)
     _write_glb(folder / "neutral.glb", result, mesh, mesh.normals(), head_skin(result, head_mesh(result)))
 
@@ -147,7 +157,8 @@ def _write_glb(
 def _write_meshes(folder: Path, result: Reconstruction, head: Mesh) -> None:
     if result.settings.outputs.surface == "bust" and result.bust is not None:
         return
-    write_head(folder, result, head)
+    write_head_ply(folder, result)
+    write_formats(folder, result, head)
 
 
 def _shown(result: Reconstruction, capture: Capture) -> list[str]:

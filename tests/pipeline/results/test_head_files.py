@@ -15,7 +15,7 @@ import trimesh
 from pipeline.applications.templates.write.writers import load_template_writers
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import load_model
-from pipeline.results.head_files import head_mesh, printable, write_head
+from pipeline.results.head_files import head_mesh, printable, write_formats, write_head_ply
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.report import report_document
 from pipeline.results.write import write_result
@@ -59,7 +59,8 @@ def reduced_result(result: Reconstruction) -> Reconstruction:
 
 def written(result: Reconstruction, folder: Path, **outputs: object) -> set[str]:
     chosen = replace(result, settings=Settings(outputs=replace(OutputSettings(), **outputs)))
-    write_head(folder, chosen, head_mesh(chosen))
+    write_head_ply(folder, chosen)
+    write_formats(folder, chosen, head_mesh(chosen))
     return {path.name for path in folder.iterdir()}
 
 
