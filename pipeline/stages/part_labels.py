@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from pipeline.head_model.model import HeadModel
@@ -12,14 +12,18 @@ from pipeline.head_model.model_basis import model_basis
 from pipeline.part_labels.cap import Cap, find_cap
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap, classify_parts
+from pipeline.part_labels.votes import shown_parts
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
+from rig.camera import Camera
 from rig.colour_space import linear_from_srgb, srgb_from_text
 from rig.mesh import Mesh
 from rig.messages.message import compose
+
+OTHER_SHARE = 0.5  # of a pixel that hair or clothes are: it does not show the skin behind them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +37,17 @@ class PartLabels:
     def hiding_probability(self) -> "OnePart":
         """Returns, for each camera, the probability at every pixel that hair, or the cap, hides the skin."""
         return OnePart(self.maps, Part.HAIR, {} if self.cap is None else self.cap.masks)
+
+    def shows_skin(
+        self, camera: Camera, points: Float[np.ndarray, "v 3"], hairless: Bool[np.ndarray, " v"]
+    ) -> Bool[np.ndarray, " v"]:
+        """Tells of which points (world, mm) of the head a view may show the skin: not where its pixel shows clothes,
+        nor at ``hairless`` points where it shows hair. True without a part map."""
+        if camera.name not in self.maps:
+            return np.ones(len(points), bool)
+        shown = shown_parts(points, self.maps[camera.name], camera)
+        other = shown[:, Part.CLOTHES.channel] + hairless * shown[:, Part.HAIR.channel]
+        return other < OTHER_SHARE
 
     def skin_probability(self) -> "OnePart":
         """Returns, for each camera, the probability of skin at every pixel."""

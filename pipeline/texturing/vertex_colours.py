@@ -12,7 +12,7 @@ differs from the others in any channel, be it brighter (a highlight moves with t
 alone sees), and less weight to cameras with a large correction. Where no camera sees the head it is filled smoothly.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -79,13 +79,16 @@ def texture(
     settings: TextureSettings,
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
+    shows: Callable[[Camera], Bool[np.ndarray, " v"]] = lambda _: np.True_,
+    within: Bool[np.ndarray, " v"] | None = None,
 ) -> Texture:
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
 
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
-    weight are no brighter.
+    weight are no brighter. A view colours only the vertices that it ``shows``; unseen vertices ``within`` a part of the
+    mesh are filled from that part alone.
     """
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
@@ -102,6 +105,8 @@ def texture(
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
+    for weight, camera in zip(weights, views, strict=True):
+        weight *= shows(camera)
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
         gains, offsets = balance(weights, colours)
@@ -119,7 +124,11 @@ def texture(
         )
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around, settings=settings)
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, settings)
-    shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
+    whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
+    if within is not None:
+        faces = mesh_world.faces[within[mesh_world.faces].all(axis=1)]
+        whole = np.where(within[:, None], fill_unknown(agreed, (seen > 0) & within, faces), whole)
+    shown = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
     warnings = _gain_warnings(by_camera)

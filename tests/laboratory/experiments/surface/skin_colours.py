@@ -1,0 +1,77 @@
+"""Measures how many vertices of head.ply carry another part's colour: hair's on ears, cloth's on the neck, the wall's.
+
+The truth says where skin, hair and clothes are seen, and the photographs what colours they have there: each true point
+has that of the view that it faces most. A vertex is wrong if its colour is unlike the skin about it, and much more like
+hair or clothes about it, or like the backdrop. Hair that grows on forehead, jaw and neck has a right to its colour.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial import KDTree
+
+from pipeline.geometry.projection import project_points
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.regions import head_regions
+from pipeline.results.reconstruction import Reconstruction
+from rig.mesh import Mesh
+from tests.laboratory.experiments.paper.detail import Known
+
+UNLIKE = 15.0  # colour difference (CIE 1976) from skin: shading and gains of cameras differ by less
+MORE_LIKE = 0.5  # of that difference, to another part
+ABOUT, REACH_MM = 32, 60.0  # points of a part that are compared, and how far hair and clothes may lie
+ON_MM = 5.0  # of true hair: the vertex lies under it
+BACKDROP_STEP, MARGIN_PX = 16, 19  # of the pixels that are compared, and how far off the subject
+HEAD, HAIR, CLOTHES = range(3)  # codes of the truth's parts
+
+
+def wrong_colours(known: Known, found: Reconstruction, model: HeadModel) -> dict[str, float]:
+    """Returns the share of wrong vertices of ears, forehead, jaw and neck."""
+    mesh, true, lab = found.mesh_world, known.visible, _lab(_point_colours(known))
+    shown, own = _lab(found.texturing.vertices.colours), np.full(len(mesh.vertices), np.inf)
+    unlike = {part: _unlike(shown, mesh, true.points[true.part == part], lab[true.part == part]) for part in range(3)}
+    own, other = unlike[HEAD][0], KDTree(_lab(_backdrop(known, found))).query(shown)[0]
+    for part in (HAIR, CLOTHES):
+        other = np.minimum(other, np.where(unlike[part][1] < REACH_MM, unlike[part][0], np.inf))
+    wrong = (own > UNLIKE) & (other < MORE_LIKE * own)
+    grown = unlike[HAIR][1] < ON_MM
+    regions, height = head_regions(model), model.vertices(np.zeros(0))[:, 1]
+    brow, chin = (height[model.landmarks[name]] for name in ("glabella", "sublabiale"))
+    places = {"forehead": regions["face"] & (height > brow + 8.0), "jaw": regions["face"] & (height < chin)}
+    places = {name: place & ~grown for name, place in (places | {"neck": regions["neck"]}).items()}
+    places["ears"] = regions["ears"]
+    return {f"head_{name}_wrong": float(wrong[at].mean()) for name, at in places.items() if at.any()}
+
+
+def _unlike(
+    shown: Float[np.ndarray, "v 3"], mesh: Mesh, points: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
+    """Returns how unlike each vertex is to the most alike of a part's points about it, and how far the nearest is."""
+    if len(points) < ABOUT:
+        return np.full(len(shown), np.inf), np.full(len(shown), np.inf)
+    far, near = KDTree(points).query(mesh.vertices, ABOUT)
+    return np.linalg.norm(colours[near] - shown[:, None], axis=2).min(axis=1), far[:, 0]
+
+
+def _point_colours(known: Known) -> UInt8[np.ndarray, "n 3"]:
+    """Returns the colours of the true points in the views that they face most."""
+    points, normals = known.visible.points.astype(float), known.visible.normals
+    best, out = np.zeros(len(points)), np.zeros((len(points), 3), np.uint8)
+    for camera in known.rig:
+        image, towards = known.capture.images[camera.name], camera.centre_world - points
+        facing = np.einsum("nx,nx->n", normals, towards) / np.linalg.norm(towards, axis=1)
+        at = np.rint(project_points(camera, points)).astype(int)
+        better = (facing > best) & (at >= 0).all(axis=1) & (at < image.shape[1::-1]).all(axis=1)
+        best[better], out[better] = facing[better], image[at[better, 1], at[better, 0]]
+    return out
+
+
+def _backdrop(known: Known, found: Reconstruction) -> UInt8[np.ndarray, "m 3"]:
+    """Returns colours beside the subject."""
+    kernel = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
+    beside = {name: cv2.dilate(view.mask.view(np.uint8), kernel) == 0 for name, view in found.views.silhouettes.items()}
+    return np.concatenate([known.capture.images[name][mask][::BACKDROP_STEP] for name, mask in beside.items()])
+
+
+def _lab(colours: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return cv2.cvtColor((colours / np.float32(255.0))[None], cv2.COLOR_RGB2LAB)[0].astype(float)
