@@ -23,8 +23,6 @@ from rig.colour_space import linear_from_srgb, srgb_from_text
 from rig.mesh import Mesh
 from rig.messages.message import compose
 
-OTHER_SHARE = 0.5  # of a pixel that hair or clothes are: it does not show the skin behind them
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartLabels:
@@ -38,16 +36,21 @@ class PartLabels:
         """Returns, for each camera, the probability at every pixel that hair, or the cap, hides the skin."""
         return OnePart(self.maps, Part.HAIR, {} if self.cap is None else self.cap.masks)
 
-    def shows_skin(
-        self, camera: Camera, points: Float[np.ndarray, "v 3"], hairless: Bool[np.ndarray, " v"]
-    ) -> Bool[np.ndarray, " v"]:
-        """Tells of which points (world, mm) of the head a view may show the skin: not where its pixel shows clothes,
-        nor at ``hairless`` points where it shows hair. True without a part map."""
+    def skin_share(
+        self,
+        camera: Camera,
+        points: Float[np.ndarray, "v 3"],
+        hairless: Bool[np.ndarray, " v"],
+        face: Bool[np.ndarray, " v"],
+    ) -> Float[np.ndarray, " v"]:
+        """Returns how probably (0 to 1) a view shows the head at its points (world, mm), and not clothes or a backdrop
+        before them, nor hair before ``hairless`` ones. In the ``face``, what is of no part is a mouth or a nostril. 1
+        without a part map."""
         if camera.name not in self.maps:
-            return np.ones(len(points), bool)
+            return np.ones(len(points))
         shown = shown_parts(points, self.maps[camera.name], camera)
-        other = shown[:, Part.CLOTHES.channel] + hairless * shown[:, Part.HAIR.channel]
-        return other < OTHER_SHARE
+        of_head = shown[:, Part.SKIN.channel] + ~hairless * shown[:, Part.HAIR.channel]
+        return of_head + face * (1.0 - shown.sum(axis=1))
 
     def skin_probability(self) -> "OnePart":
         """Returns, for each camera, the probability of skin at every pixel."""

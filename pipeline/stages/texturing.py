@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.geometry.raster import depth_maps
-from pipeline.head_model.regions import head_regions
+from pipeline.head_model.regions import head_regions, pinnae
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
@@ -55,7 +55,7 @@ def texture_head(
     chart, chart_warnings = chart_colours(views.capture, rig) if settings.texture.chart else (None, [])
     capture = views.capture if chart is None else with_true_colours(views.capture, chart)
     around = None if layout is None else layout.around
-    regions = head_regions(model)
+    ears = pinnae(model)
     vertices = texture(
         mesh,
         normals,
@@ -66,8 +66,8 @@ def texture_head(
         settings=settings.texture,
         around=around,
         dim_share=DIM_SHARE if settings.outputs.delit else None,
-        shows=lambda camera: labels.shows_skin(camera, mesh.vertices, regions["ears"]),
-        within=~regions["cranium"],
+        skin_share=lambda camera: labels.skin_share(camera, mesh.vertices, ears, face),
+        within=~head_regions(model)["cranium"] | ears,
     )
     close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
     atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.for_texels())

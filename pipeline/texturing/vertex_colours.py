@@ -47,6 +47,7 @@ GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
 
 
+MIN_SKIN, MIN_MEAN_SKIN = 0.5, 0.7  # of a view, and of all: at a collar's soft edge single views are sure of skin
 GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
 
 Rgb = tuple[float, float, float]
@@ -79,7 +80,7 @@ def texture(
     settings: TextureSettings,
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
-    shows: Callable[[Camera], Bool[np.ndarray, " v"]] = lambda _: np.True_,
+    skin_share: Callable[[Camera], Float[np.ndarray, " v"]] | None = None,
     within: Bool[np.ndarray, " v"] | None = None,
 ) -> Texture:
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
@@ -87,8 +88,8 @@ def texture(
 
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
-    weight are no brighter. A view colours only the vertices that it ``shows``; unseen vertices ``within`` a part of the
-    mesh are filled from that part alone.
+    weight are no brighter. No view colours a vertex where the ``skin_share`` that it shows, or the mean of
+    all views, is small; unseen vertices ``within`` a part of the mesh are filled from that part alone.
     """
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
@@ -105,8 +106,10 @@ def texture(
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
-    for weight, camera in zip(weights, views, strict=True):
-        weight *= shows(camera)
+    if skin_share is not None:
+        shares = np.stack([skin_share(camera) for camera in views]).astype(np.float32)
+        mean = (weights * shares).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
+        weights *= (shares > MIN_SKIN) & (mean > MIN_MEAN_SKIN)
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
         gains, offsets = balance(weights, colours)

@@ -11,25 +11,29 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.geometry.projection import project_points
+from pipeline.geometry.raster import camera_depths
 from pipeline.head_model.model import HeadModel
-from pipeline.head_model.regions import head_regions
+from pipeline.head_model.regions import head_regions, pinnae
 from pipeline.results.reconstruction import Reconstruction
 from rig.mesh import Mesh
 from tests.laboratory.experiments.paper.detail import Known
 
 UNLIKE = 15.0  # colour difference (CIE 1976) from skin: shading and gains of cameras differ by less
 MORE_LIKE = 0.5  # of that difference, to another part
-ABOUT, REACH_MM = 32, 60.0  # points of a part that are compared, and how far hair and clothes may lie
+THINNED, ABOUT, REACH_MM = 8, 128, 60.0  # of a part's points, those compared, and how far hair and clothes may lie
+OUTLIERS = 5  # of the compared points: the truth is seen past strands
 ON_MM = 5.0  # of true hair: the vertex lies under it
 BACKDROP_STEP, MARGIN_PX = 16, 19  # of the pixels that are compared, and how far off the subject
+CELL_PX, HIDDEN_MM = 6, 6.0  # a point that lies so far behind another one of its cell is hidden
 HEAD, HAIR, CLOTHES = range(3)  # codes of the truth's parts
 
 
 def wrong_colours(known: Known, found: Reconstruction, model: HeadModel) -> dict[str, float]:
     """Returns the share of wrong vertices of ears, forehead, jaw and neck."""
     mesh, true, lab = found.mesh_world, known.visible, _lab(_point_colours(known))
-    shown, own = _lab(found.texturing.vertices.colours), np.full(len(mesh.vertices), np.inf)
-    unlike = {part: _unlike(shown, mesh, true.points[true.part == part], lab[true.part == part]) for part in range(3)}
+    shown = _lab(found.texturing.vertices.colours)
+    rows = {part: np.flatnonzero(true.part == part)[::THINNED] for part in (HEAD, HAIR, CLOTHES)}
+    unlike = {part: _unlike(shown, mesh, true.points[at], lab[at]) for part, at in rows.items()}
     own, other = unlike[HEAD][0], KDTree(_lab(_backdrop(known, found))).query(shown)[0]
     for part in (HAIR, CLOTHES):
         other = np.minimum(other, np.where(unlike[part][1] < REACH_MM, unlike[part][0], np.inf))
@@ -39,18 +43,20 @@ def wrong_colours(known: Known, found: Reconstruction, model: HeadModel) -> dict
     brow, chin = (height[model.landmarks[name]] for name in ("glabella", "sublabiale"))
     places = {"forehead": regions["face"] & (height > brow + 8.0), "jaw": regions["face"] & (height < chin)}
     places = {name: place & ~grown for name, place in (places | {"neck": regions["neck"]}).items()}
-    places["ears"] = regions["ears"]
+    places["ears"] = pinnae(model)
     return {f"head_{name}_wrong": float(wrong[at].mean()) for name, at in places.items() if at.any()}
 
 
 def _unlike(
     shown: Float[np.ndarray, "v 3"], mesh: Mesh, points: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, " v"], Float[np.ndarray, " v"]]:
-    """Returns how unlike each vertex is to the most alike of a part's points about it, and how far the nearest is."""
+    """Returns how unlike each vertex is to the most alike of a part's points about it but for outliers, and how far the
+    nearest point is."""
     if len(points) < ABOUT:
         return np.full(len(shown), np.inf), np.full(len(shown), np.inf)
     far, near = KDTree(points).query(mesh.vertices, ABOUT)
-    return np.linalg.norm(colours[near] - shown[:, None], axis=2).min(axis=1), far[:, 0]
+    unlike = np.linalg.norm(colours[near] - shown[:, None], axis=2)
+    return np.partition(unlike, OUTLIERS, axis=1)[:, OUTLIERS], far[:, 0]
 
 
 def _point_colours(known: Known) -> UInt8[np.ndarray, "n 3"]:
@@ -61,7 +67,11 @@ def _point_colours(known: Known) -> UInt8[np.ndarray, "n 3"]:
         image, towards = known.capture.images[camera.name], camera.centre_world - points
         facing = np.einsum("nx,nx->n", normals, towards) / np.linalg.norm(towards, axis=1)
         at = np.rint(project_points(camera, points)).astype(int)
-        better = (facing > best) & (at >= 0).all(axis=1) & (at < image.shape[1::-1]).all(axis=1)
+        framed = (at >= 0).all(axis=1) & (at < image.shape[1::-1]).all(axis=1)
+        depth, cell = camera_depths(camera, points), np.where(framed[:, None], at, 0) // CELL_PX
+        nearest = np.full(cell.max(axis=0) + 1, np.inf)
+        np.minimum.at(nearest, tuple(cell[framed].T), depth[framed])
+        better = framed & (facing > best) & (depth < nearest[tuple(cell.T)] + HIDDEN_MM)
         best[better], out[better] = facing[better], image[at[better, 1], at[better, 0]]
     return out
 
@@ -74,4 +84,4 @@ def _backdrop(known: Known, found: Reconstruction) -> UInt8[np.ndarray, "m 3"]:
 
 
 def _lab(colours: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    return cv2.cvtColor((colours / np.float32(255.0))[None], cv2.COLOR_RGB2LAB)[0].astype(float)
+    return cv2.cvtColor((colours / np.float32(255.0))[None], cv2.COLOR_RGB2LAB)[0]
