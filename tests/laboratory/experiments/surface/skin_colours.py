@@ -2,7 +2,8 @@
 
 The truth says where skin, hair and clothes are seen, and the photographs what colours they have there: each true point
 has that of the view that it faces most. A vertex is wrong if its colour is unlike the skin about it, and much more like
-hair or clothes about it, or like the backdrop. Hair that grows on forehead, jaw and neck has a right to its colour.
+hair or clothes about it, or like the backdrop. On forehead, jaw and neck, hair has a right to its colour where it is the
+nearest that is seen, or grows.
 """
 
 import cv2
@@ -22,8 +23,8 @@ UNLIKE = 15.0  # colour difference (CIE 1976) from skin: shading and gains of ca
 MORE_LIKE = 0.5  # of that difference, to another part
 THINNED, ABOUT, REACH_MM = 8, 128, 60.0  # of a part's points, those compared, and how far hair and clothes may lie
 OUTLIERS = 5  # of the compared points: the truth is seen past strands
-ON_MM = 5.0  # of true hair: the vertex lies under it
 BACKDROP_STEP, MARGIN_PX = 16, 19  # of the pixels that are compared, and how far off the subject
+ON_MM = 5.0  # of a strand: hair grows there
 CELL_PX, HIDDEN_MM = 6, 6.0  # a point that lies so far behind another one of its cell is hidden
 HEAD, HAIR, CLOTHES = range(3)  # codes of the truth's parts
 
@@ -38,7 +39,7 @@ def wrong_colours(known: Known, found: Reconstruction, model: HeadModel) -> dict
     for part in (HAIR, CLOTHES):
         other = np.minimum(other, np.where(unlike[part][1] < REACH_MM, unlike[part][0], np.inf))
     wrong = (own > UNLIKE) & (other < MORE_LIKE * own)
-    grown = unlike[HAIR][1] < ON_MM
+    grown = unlike[HAIR][1] < np.maximum(unlike[HEAD][1], ON_MM)
     regions, height = head_regions(model), model.vertices(np.zeros(0))[:, 1]
     brow, chin = (height[model.landmarks[name]] for name in ("glabella", "sublabiale"))
     places = {"forehead": regions["face"] & (height > brow + 8.0), "jaw": regions["face"] & (height < chin)}

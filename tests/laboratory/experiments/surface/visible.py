@@ -53,6 +53,7 @@ from tests.laboratory.experiments.surface.face_skin import (
     normal_figures,
     shining_places,
 )
+from tests.laboratory.experiments.surface.skin_colours import wrong_colours
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
 STYLES = (
@@ -142,6 +143,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
         **{f"{k}_face_{key}": v for k, mesh in faces.items() for key, v in surface_error(subject, mesh).items()},
         **{f"{k}_{key}": v for k, mesh in faces.items() for key, v in normal_figures(places, mesh).items()},
         **craters.figures(),
+        **wrong_colours(subject, found, model),
         **region_errors(subject, found.mesh_world, head_regions(model)),
         "head_to_bust_median_mm": float(np.median(head_to_bust(found.mesh_world, bust))),
         "cpu_s": seconds,
