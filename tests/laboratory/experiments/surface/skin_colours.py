@@ -2,8 +2,8 @@
 
 The truth says where skin, hair and clothes are seen, and the photographs what colours they have there: each true point
 has that of the view that it faces most. A vertex is wrong if its colour is unlike the skin about it, and much more like
-hair or clothes about it, or like the backdrop. On forehead, jaw and neck, hair has a right to its colour where it is the
-nearest that is seen, or grows.
+hair or clothes about it, or like the backdrop. On forehead, jaw and neck, hair has a right to its colour where it is
+the nearest that is seen, or grows.
 """
 
 import cv2
@@ -80,7 +80,10 @@ def _point_colours(known: Known) -> UInt8[np.ndarray, "n 3"]:
 def _backdrop(known: Known, found: Reconstruction) -> UInt8[np.ndarray, "m 3"]:
     """Returns colours beside the subject."""
     kernel = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
-    beside = {name: cv2.dilate(view.mask.view(np.uint8), kernel) == 0 for name, view in found.views.silhouettes.items()}
+    beside = {
+        name: np.asarray(cv2.dilate(view.mask.view(np.uint8), kernel)) == 0
+        for name, view in found.views.silhouettes.items()
+    }
     return np.concatenate([known.capture.images[name][mask][::BACKDROP_STEP] for name, mask in beside.items()])
 
 
