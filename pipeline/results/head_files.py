@@ -110,7 +110,7 @@ def head_skin(result: Reconstruction, head: Mesh) -> Skin | None:
         return None
     strength = None if sets is None or sets.specular is None else strength_png(sets.specular)
     layout, image = atlas.layout, atlas.image
-    if result.settings.outputs.skin == "albedo" and texturing.albedo is not None:
+    if result.settings.outputs.albedo == "glb" and texturing.albedo is not None:
         image = texturing.albedo.atlas.image
     elif sets is not None and sets.diffuse is not None and strength is not None:
         image = sets.diffuse.image  # highlights come from the strength

@@ -65,7 +65,7 @@ def texture_head(
         depths,
         settings=settings.texture,
         around=around,
-        dim_share=DIM_SHARE if settings.outputs.delit else None,
+        dim_share=DIM_SHARE if settings.outputs.albedo != "none" else None,
         skin_share=lambda camera: labels.skin_share(camera, mesh.vertices, ears, face),
         within=~head_regions(model)["cranium"] | ears,
     )
@@ -86,7 +86,7 @@ def texture_head(
         )
     reduced = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
     albedo, albedo_warnings = None, []
-    if settings.outputs.delit:
+    if settings.outputs.albedo != "none":
         albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)
     sets, set_warnings = colour_by_sets(
         capture.texture_sets,
@@ -119,7 +119,6 @@ def _read_pores(
         mesh,
         coloured,
         face,
-        footprint_px=context.settings.texture.footprint_px,
         sources=views.assignment,
         chart=chart,
     )

@@ -82,7 +82,7 @@ def export(
     from pipeline.settings import FORMATS, OutputSettings
 
     if form in FORMATS:
-        outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, delight=albedo)
+        outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
         _export_head(capture, out, outputs, overwrite=overwrite, json_out=json_out)
     elif form == SLICER:
         _export_patient(capture, out, axes, plane, marked=marked, overwrite=overwrite, json_out=json_out)

@@ -145,7 +145,7 @@ def _read_textures(
     maps = [_read_image(folder / "texture" / f"{name}.png") for name in ("displacement", "normals")]
     if maps[0] is not None and maps[1] is not None:
         made = replace(made, skin=SkinMaps(maps[0], maps[1], (), ()))
-    if not outputs.delit:
+    if outputs.albedo == "none":
         return made
     face = model.levels["full"].face_region
     albedo, _ = estimate_albedo(mesh, bare.normals, bare.vertices, made.atlas, face, around)
