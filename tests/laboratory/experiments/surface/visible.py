@@ -64,13 +64,8 @@ SPLAT_MM = 1.8  # half the side of a point of the truth in pictures: points are 
 AZIMUTHS_DEG = (30.0, -75.0)
 SEEN_MM = 2.0  # from a visible point, 1.5 mm apart
 MIN_PLACES = 50  # of a region, for figures of its own
-REGIONS_SCORED = (
-    "face",
-    "eyes",
-    "nose",
-    "mouth",
-    "ears",
-)  # the neck ends where each model ends it, hair hides the rest
+# The neck ends where each model ends it, and hair hides the rest.
+REGIONS_SCORED = ("face", "eyes", "nose", "mouth", "ears")
 
 
 def visible(
@@ -120,8 +115,8 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
     if found.bust is None:
         raise EigenheadError(f"{subject.name}: no bust ({'; '.join(str(warning) for warning in found.warnings)})")
     bust = found.bust.surface
+    in_head = found.head.fit.world_from_head.inverse()
     if picture is not None:
-        in_head = found.head.fit.world_from_head.inverse()
         meshes = {"truth": splats(subject.visible), "bust.ply": bust.mesh_world, "head.ply": found.mesh_world}
         write_image(
             picture, _row(subject.name, {k: Mesh(in_head.apply(m.vertices), m.faces) for k, m in meshes.items()})
@@ -130,7 +125,6 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
     shining = shining_places(places, subject.capture.images, subject.rig, subject.mesh)
     craters = find_craters(places, bust.mesh_world, shining)
     if picture is not None:
-        in_head = found.head.fit.world_from_head.inverse()
         true_local = Mesh(in_head.apply(subject.mesh.vertices), subject.mesh.faces)
         drawn = crater_map(craters, in_head.apply(places.points), true_local)
         write_image(picture.with_name(f"{picture.stem}-craters.png"), drawn)
