@@ -121,8 +121,8 @@ def opened_faces(levels: Mapping[str, Int[np.ndarray, "F 3"]]) -> Int[np.ndarray
     """Returns the triangles of the level ``full`` without those that close eyes and mouth; all of them if there are
     none. Models have those last in the level ``cage``, of which every triangle becomes equally many of ``full``."""
     cage, full = levels["cage"], levels["full"]
-    first = len(cage)
-    for count in range(len(cage) - 1, len(cage) - MAX_CLOSING, -1):
+    first, closing = len(cage), MAX_CLOSING if len(boundary_loops(cage)) == 1 else 0
+    for count in range(len(cage) - 1, len(cage) - closing, -1):
         try:
             borders = len(boundary_loops(cage[:count]))
         except NotAManifold:

@@ -21,7 +21,6 @@ from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import opened_faces
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SEED, SPREAD = 38, 0.8
@@ -41,7 +40,7 @@ def eyeballs(facekit: HeadModel, *, bench: Bench) -> Outcome:
         rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in CROSSING}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
-    return {"figures": figures, "rows": rows, "markdown": _table(rows)}
+    return {"figures": figures, "rows": rows}
 
 
 def _row(model: HeadModel, number: int) -> Row:
@@ -122,9 +121,3 @@ def _crossing(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"],
     about = faces[(np.linalg.norm(vertices - eyeball.centre, axis=1) < ABOUT_MM)[faces].any(axis=1)]
     joined = np.concatenate([about, ball.faces + len(vertices)])
     return int(crossing_faces(np.concatenate([vertices, ball.vertices]), joined)[len(about) :].sum())
-
-
-def _table(rows: list[Row]) -> str:
-    names = ("head", "eyeballs", "shapes", *CROSSING)
-    cells = [[*(row[name] for name in names), f"{row['lift_mm']:.2f}"] for row in rows]
-    return markdown.table((*names, "largest lift, mm"), cells)

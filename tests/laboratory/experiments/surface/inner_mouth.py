@@ -24,7 +24,6 @@ from pipeline.applications.templates.inner_mouth import (
 from pipeline.applications.templates.pivots import jaw_motions
 from pipeline.head_model import inner_mouth_file
 from pipeline.head_model.model import HeadModel
-from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.eyeballs import HEADS, OpenHead, open_head
 
@@ -41,7 +40,7 @@ def inner_mouths(facekit: HeadModel, *, bench: Bench) -> Outcome:
     names = ("meeting_rest", "meeting_before", "meeting_after")
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in names}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
-    return {"figures": figures, "rows": rows, "markdown": _table(rows)}
+    return {"figures": figures, "rows": rows}
 
 
 def _row(model: HeadModel, number: int) -> Row:
@@ -86,9 +85,3 @@ def _meeting(
         for name in (moves if any(weights) else ("jawOpen",))
         for weight in weights
     )
-
-
-def _table(rows: list[Row]) -> str:
-    names = ("head", "parts", "shapes", "meeting_rest", "meeting_before", "meeting_after", "lifted")
-    cells = [[*(row[name] for name in names), f"{row['lift_mm']:.2f} ({row['most_lifted']})"] for row in rows]
-    return markdown.table((*names, "largest lift, mm"), cells)
