@@ -13,7 +13,7 @@ from pipeline.applications.templates.eyeballs import AHEAD, Eyeball
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
 from rig.mesh import Mesh
 
-HALF_MM = (11.0, 8.0)  # of what lids show, seen from ahead
+HALF_MM = (10.0, 7.0)  # of what lids show, seen from ahead
 GAZE = np.array([0.2, 0.1, np.sqrt(0.95)])
 IRIS, PUPIL, WHITE = (90, 60, 30), (20, 20, 20), (210, 205, 200)
 EYEBALL = Eyeball(np.array([31.0, 12.0, 60.0]), GAZE)
@@ -29,12 +29,12 @@ def photographed() -> PhotographedEyes:
     index = np.arange(len(aside)).reshape(41, 41)
     a, b, c, d = (each.ravel() for each in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
-    image = np.full((220, 220, 3), WHITE, np.uint8)
+    image = np.full((200, 200, 3), WHITE, np.uint8)
     uv = 0.5 + aside / (2.0 * HALF_MM[0]) * (1.0, -1.0)
-    at = (np.stack(np.meshgrid(*[(np.arange(220) + 0.5) / 220] * 2), axis=2) - 0.5) * (22.0, -22.0)
+    at = (np.stack(np.meshgrid(*[(np.arange(200) + 0.5) / 200] * 2), axis=2) - 0.5) * (20.0, -20.0)
     flat = at.reshape(-1, 2)
     there = np.column_stack([flat, np.sqrt(np.maximum(144.0 - 0.8 * (flat**2).sum(axis=1), 1.0))])
-    angle = np.arccos(there @ GAZE / np.linalg.norm(there, axis=1)).reshape(220, 220)
+    angle = np.arccos(there @ GAZE / np.linalg.norm(there, axis=1)).reshape(200, 200)
     image[angle < np.arcsin(5.9 / 12.0)], image[angle < np.arcsin(2.0 / 12.0)] = IRIS, PUPIL
     atlas = Atlas(Layout(uv, faces, index.ravel()), image)
     return PhotographedEyes(Mesh(vertices, faces), np.arange(len(faces)), atlas)
@@ -59,5 +59,5 @@ def test_an_iris_that_was_not_measured_is_what_is_dark() -> None:
     assert np.degrees(np.arccos(found @ GAZE)) < 3.0  # an iris is cut by the lids on one side
     seen = photographed()
     assert seen.atlas is not None
-    lid = Atlas(seen.atlas.layout, np.full((220, 220, 3), (190, 140, 120), np.uint8))
+    lid = Atlas(seen.atlas.layout, np.full((200, 200, 3), (190, 140, 120), np.uint8))
     assert darkest_direction(ahead, PhotographedEyes(seen.head, seen.between, lid)) is None
