@@ -22,7 +22,7 @@ from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.pores.close_views import CloseViews, read_close_views
 from pipeline.texturing.pores.skin_maps import SkinMaps, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
-from pipeline.texturing.vertex_colours import Texture, texture
+from pipeline.texturing.vertex_colours import SkinShown, Texture, texture
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
 from rig.mesh import Mesh
@@ -66,8 +66,9 @@ def texture_head(
         settings=settings.texture,
         around=around,
         dim_share=DIM_SHARE if settings.outputs.albedo != "none" else None,
-        skin_share=lambda camera: labels.skin_share(camera, mesh.vertices, ears, face),
-        within=~head_regions(model)["cranium"] | ears,
+        skin=SkinShown(
+            lambda camera: labels.skin_share(camera, mesh.vertices, ears, face), ~head_regions(model)["cranium"] | ears
+        ),
     )
     close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
     atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.for_texels())

@@ -81,6 +81,32 @@ class Texture:
     warnings: tuple[ReportWarning, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinShown:
+    """Says where views show the skin of a head: ``share`` (0 to 1) gives for a camera how probably it does at each
+    vertex. Unseen vertices ``within`` a part of the mesh are filled from that part alone."""
+
+    share: Callable[[Camera], Float[np.ndarray, " v"]]
+    within: Bool[np.ndarray, " v"]
+
+    def shown(self, weights: Float32[np.ndarray, "k v"], views: Rig) -> Bool[np.ndarray, "k v"]:
+        """Tells which views may colour each vertex: not where they, or the mean of all, hardly show its skin."""
+        shares = np.stack([self.share(camera) for camera in views])
+        mean = (weights * shares).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
+        return (shares > MIN_SKIN) & (mean > MIN_MEAN_SKIN)
+
+    def filled(
+        self,
+        colours: Float[np.ndarray, "v 3"],
+        seen: Bool[np.ndarray, " v"],
+        faces: Int[np.ndarray, "f 3"],
+        whole: Float[np.ndarray, "v 3"],
+    ) -> Float[np.ndarray, "v 3"]:
+        """Returns the colours ``whole`` with those of the part filled from the part alone."""
+        inside = faces[self.within[faces].all(axis=1)]
+        return np.where(self.within[:, None], fill_unknown(colours, seen & self.within, inside), whole)
+
+
 @traced
 def texture(
     mesh_world: Mesh,
@@ -93,16 +119,14 @@ def texture(
     settings: TextureSettings,
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
-    skin_share: Callable[[Camera], Float[np.ndarray, " v"]] | None = None,
-    within: Bool[np.ndarray, " v"] | None = None,
+    skin: SkinShown | None = None,
 ) -> Texture:
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
 
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
-    weight are no brighter. No view colours a vertex where the ``skin_share`` that it shows, or the mean of
-    all views, is small; unseen vertices ``within`` a part of the mesh are filled from that part alone.
+    weight are no brighter. With ``skin``, no view colours a vertex where it shows something before the mesh.
     """
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
@@ -119,10 +143,8 @@ def texture(
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
-    if skin_share is not None:
-        shares = np.stack([skin_share(camera) for camera in views]).astype(np.float32)
-        mean = (weights * shares).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
-        weights *= (shares > MIN_SKIN) & (mean > MIN_MEAN_SKIN)
+    if skin is not None:
+        weights *= skin.shown(weights, views)
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
         gains, offsets = balance(weights, colours)
@@ -139,9 +161,7 @@ def texture(
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
-    if within is not None:
-        faces = mesh_world.faces[within[mesh_world.faces].all(axis=1)]
-        whole = np.where(within[:, None], fill_unknown(agreed, (seen > 0) & within, faces), whole)
+    whole = whole if skin is None else skin.filled(agreed, seen > 0, mesh_world.faces, whole)
     shown = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))

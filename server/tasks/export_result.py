@@ -4,22 +4,44 @@ import json
 import struct
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from pipeline.settings import OutputSettings
+from pipeline.applications.clinic.visit import read_visit
+from pipeline.applications.templates.write.writers import load_template_writers
+from pipeline.applications.verification.measured import identity_of, read_report
+from pipeline.contour_fit.fit import Fit
+from pipeline.evidence.expression import Found, build_blendshape_rig
+from pipeline.evidence.measurements import Landmark
+from pipeline.evidence.pose import PoseEvidence
+from pipeline.faces.irises import Iris, UnseenEye
+from pipeline.head_model.model import HeadModel, load_model
+from pipeline.results.head_files import head_mesh, write_formats, write_head_ply
+from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.report_types import EyeReport
+from pipeline.results.write import write_neutral
+from pipeline.settings import OutputSettings, settings_from_document
+from pipeline.stages.alignment import Alignment
+from pipeline.stages.evidence import Evidence
+from pipeline.stages.faces import Faces
+from pipeline.stages.head_fit import HeadFit
+from pipeline.stages.part_labels import PartLabels
+from pipeline.stages.refined_head import RefinedHead
+from pipeline.stages.texturing import Texturing
+from pipeline.stages.views import Views
+from pipeline.texturing.albedo import estimate_albedo
+from pipeline.texturing.layout.model_layout import model_layout
+from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.pores.skin_maps import SkinMaps
+from pipeline.texturing.vertex_colours import Texture
+from pipeline.warnings import Detail
+from rig.capture import Capture
+from rig.colour_space import linear_from_srgb
 from rig.errors import InputError
+from rig.geometry import Similarity
 from rig.mesh import Mesh
-from rig.messages.message import compose
-
-if TYPE_CHECKING:
-    from pipeline.faces.irises import Iris, UnseenEye
-    from pipeline.head_model.model import HeadModel
-    from pipeline.results.reconstruction import Reconstruction
-    from pipeline.results.report_types import EyeReport
-    from pipeline.stages.texturing import Texturing
+from rig.messages.message import compose, verbatim
 
 
 def export_result(folder: Path, out: Path, outputs: OutputSettings) -> list[str]:
@@ -27,12 +49,6 @@ def export_result(folder: Path, out: Path, outputs: OutputSettings) -> list[str]
 
     Raises InputError for a folder that is no result or whose model is not at hand, and what the writers raise.
     """
-    from pipeline.applications.templates.write.writers import load_template_writers
-    from pipeline.applications.verification.measured import identity_of
-    from pipeline.head_model.model import load_model
-    from pipeline.results.head_files import head_mesh, write_formats, write_head_ply
-    from pipeline.results.write import write_neutral
-
     head_model = load_model(identity_of(folder).model)
     writers = load_template_writers(outputs.template, head_model)
     result = _read_reconstruction(folder, head_model, outputs)
@@ -48,31 +64,8 @@ def export_result(folder: Path, out: Path, outputs: OutputSettings) -> list[str]
     return sorted(path.relative_to(out).as_posix() for path in written)
 
 
-def _read_reconstruction(folder: Path, model: "HeadModel", outputs: OutputSettings) -> "Reconstruction":
+def _read_reconstruction(folder: Path, model: HeadModel, outputs: OutputSettings) -> Reconstruction:
     """Returns what a result folder says of its head. What only its photographs say is empty. Raises InputError."""
-    from pipeline.applications.clinic.visit import read_visit
-    from pipeline.applications.verification.measured import read_report
-    from pipeline.contour_fit.fit import Fit
-    from pipeline.evidence.expression import Found, build_blendshape_rig
-    from pipeline.evidence.measurements import Landmark
-    from pipeline.evidence.pose import PoseEvidence
-    from pipeline.results.reconstruction import Reconstruction
-    from pipeline.settings import settings_from_document
-    from pipeline.stages.alignment import Alignment
-    from pipeline.stages.evidence import Evidence
-    from pipeline.stages.faces import Faces
-    from pipeline.stages.head_fit import HeadFit
-    from pipeline.stages.part_labels import PartLabels
-    from pipeline.stages.refined_head import RefinedHead
-    from pipeline.stages.texturing import Texturing
-    from pipeline.stages.views import Views
-    from pipeline.texturing.vertex_colours import Texture
-    from pipeline.warnings import Detail
-    from rig.capture import Capture
-    from rig.colour_space import linear_from_srgb
-    from rig.geometry import Similarity
-    from rig.messages.message import verbatim
-
     visit, report = read_visit(folder, model.name), read_report(folder)
     mesh, head_from_world = visit.measured.mesh_world, visit.measured.head_from_world
     try:
@@ -116,10 +109,8 @@ def _read_reconstruction(folder: Path, model: "HeadModel", outputs: OutputSettin
     )
 
 
-def _eye(eye: "EyeReport") -> "Iris | UnseenEye":
+def _eye(eye: EyeReport) -> Iris | UnseenEye:
     """Returns an eye of a report, without its deviations."""
-    from pipeline.faces.irises import Iris, UnseenEye
-
     iris, radius, gaze = eye["iris"], eye["radius"], eye["gaze"]
     if iris is None or radius is None or gaze is None:
         return UnseenEye("closed" if eye["cause"] == "closed" else "unclear")
@@ -127,16 +118,9 @@ def _eye(eye: "EyeReport") -> "Iris | UnseenEye":
     return Iris(place, np.array(gaze), radius["value"], np.zeros((7, 7)), views, 0.0)
 
 
-def _read_textures(
-    folder: Path, bare: "Texturing", model: "HeadModel", mesh: Mesh, outputs: OutputSettings
-) -> "Texturing":
+def _read_textures(folder: Path, bare: Texturing, model: HeadModel, mesh: Mesh, outputs: OutputSettings) -> Texturing:
     """Returns the texturing with the head's texture, the maps of its skin, and its albedo if that is wanted. An albedo
     that the result lacks is estimated without other views, so that highlights stay in it."""
-    from pipeline.texturing.albedo import estimate_albedo
-    from pipeline.texturing.layout.model_layout import model_layout
-    from pipeline.texturing.layout.uv_unwrap import Atlas
-    from pipeline.texturing.pores.skin_maps import SkinMaps
-
     image = _head_image(folder)
     if image is None:
         return bare

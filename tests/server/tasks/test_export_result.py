@@ -12,12 +12,9 @@ from typer.testing import CliRunner
 
 from pipeline.applications.templates.write.writers import load_template_writers
 from pipeline.evidence.expression import Found, build_blendshape_rig
-from pipeline.faces.irises import UnseenEye
 from pipeline.head_model.model import load_model
-from pipeline.results.reconstruction import Reconstruction
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
-from pipeline.stages.faces import Faces
 from pipeline.texturing.layout.model_layout import model_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from rig.capture import Capture
@@ -30,31 +27,22 @@ FORMATS = ("glb", "ply", "obj", "stl", "3mf")
 
 
 @pytest.fixture(scope="module")
-def result() -> Reconstruction:
-    """The mean head with a smile, its texture red at the left of the layout and blue at the right."""
-    model = load_model()
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a job writes of the mean head with a smile, its texture red at the left and blue at the right."""
+    model, folder = load_model(), tmp_path_factory.mktemp("result")
     image = np.zeros((1024, 1024, 3), np.uint8)
     image[:, :512], image[:, 512:] = (200, 30, 30), (30, 30, 200)
     mesh = Mesh(model.vertices(np.zeros(0)), model.levels["full"].faces)
     made = textured_result(mesh, Atlas(model_layout(model).layout, image))
     found = (Found("mouthSmileLeft", 0.6, None),)
     shapes = build_blendshape_rig(model, made.head.fit.world_from_head, made.mesh_world, found)
-    outputs = OutputSettings(surface="head", formats=FORMATS, morphs=True)
-    return replace(
+    made = replace(
         made,
         model_name="default",
-        model_sha256=model.sha256,
-        settings=Settings(outputs=outputs),
-        faces=Faces(None, {}, {"left": UnseenEye("closed"), "right": UnseenEye("closed")}),
+        settings=Settings(outputs=OutputSettings(surface="head", formats=FORMATS, morphs=True)),
         evidence=replace(made.evidence, expression=found, blendshape_rig=shapes),
     )
-
-
-@pytest.fixture(scope="module")
-def folder(result: Reconstruction, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a job writes, and what is exported of it then."""
-    folder = tmp_path_factory.mktemp("result")
-    write_result(folder, result, Capture({}), load_template_writers(None, load_model()))
+    write_result(folder, made, Capture({}), load_template_writers(None, model))
     return folder
 
 
@@ -79,8 +67,8 @@ def test_a_format_is_the_file_that_the_job_wrote(form: str, folder: Path, tmp_pa
     np.testing.assert_array_equal(ours.faces, theirs.faces)
     np.testing.assert_allclose(unit * ours.vertices, unit * theirs.vertices, atol=2e-4)
     if form == "obj":
-        pictures = [cv2.imread(str(place / "head.png")) for place in (tmp_path, folder)]
-        assert np.array_equal(*map(np.asarray, pictures))
+        ours_png, theirs_png = (np.asarray(cv2.imread(str(place / "head.png"))) for place in (tmp_path, folder))
+        np.testing.assert_array_equal(ours_png, theirs_png)
 
 
 @pytest.mark.slow

@@ -35,10 +35,10 @@ def wrong_colours(known: Known, found: Reconstruction, model: HeadModel) -> dict
     shown = _lab(found.texturing.vertices.colours)
     rows = {part: np.flatnonzero(true.part == part)[::THINNED] for part in (HEAD, HAIR, CLOTHES)}
     unlike = {part: _unlike(shown, mesh, true.points[at], lab[at]) for part, at in rows.items()}
-    own, other = unlike[HEAD][0], KDTree(_lab(_backdrop(known, found))).query(shown)[0]
+    unlike_skin, other = unlike[HEAD][0], KDTree(_lab(_backdrop(known, found))).query(shown)[0]
     for part in (HAIR, CLOTHES):
         other = np.minimum(other, np.where(unlike[part][1] < REACH_MM, unlike[part][0], np.inf))
-    wrong = (own > UNLIKE) & (other < MORE_LIKE * own)
+    wrong = (unlike_skin > UNLIKE) & (other < MORE_LIKE * unlike_skin)
     grown = unlike[HAIR][1] < np.maximum(unlike[HEAD][1], ON_MM)
     regions, height = head_regions(model), model.vertices(np.zeros(0))[:, 1]
     brow, chin = (height[model.landmarks[name]] for name in ("glabella", "sublabiale"))

@@ -78,7 +78,7 @@ def opened(glb: bytes) -> tuple[dict[str, np.ndarray], np.ndarray]:
 def written(ball: Ball, size: int = 1024) -> bytes:
     mapped = normal_mapped(ball.mesh.vertices, true_normals(ball.unit), ball.layout, ball.reduced, size)
     blank = cv2.imencode(".png", np.full((8, 8, 3), 200, np.uint8))[1].tobytes()
-    skin = Skin(mapped.uv, blank, "image/png", png(mapped.image), mapped.tangents)
+    skin = Skin(mapped.uv, blank, "image/png", normal_map=png(mapped.image), tangents=mapped.tangents)
     return glb_bytes(mapped.mesh, normals=mapped.normals, skin=skin)
 
 
