@@ -10,13 +10,11 @@ face; their names are in ``extras.targetNames``, where three.js, Blender and oth
 import json
 import struct
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from rig.atomic_write import write_atomically
 from rig.colour_space import linear_from_srgb
 from rig.formats.meshes.scene import NECK, Part, Scene, Skin, quaternion
 from rig.mesh import Mesh, vertex_normals
@@ -42,11 +40,6 @@ def glb_bytes(
     """Encodes one mesh (head frame, mm), with sRGB ``colours`` if it has no texture."""
     part = Part("head", Mesh(mesh.vertices, mesh.faces, colours), normals, skin)
     return scene_glb_bytes(Scene([part]), extras)
-
-
-def write_glb(path: Path, mesh: Mesh, **properties: Any) -> None:
-    """Writes ``glb_bytes`` to a file, under a temporary name first."""
-    write_atomically(path, glb_bytes(mesh, **properties))
 
 
 def scene_glb_bytes(scene: Scene, extras: Mapping[str, Any] | None = None) -> bytes:
