@@ -2,7 +2,7 @@
 that table's command first.
 
 docs/results/<table>.json keeps what a command printed: the command, the day, the machine and the figures by name.
-docs/results/<table>.md, and <table>.<part>.md for another document, are the words around them, with `{figure:.2f}`
+docs/results/<table>.txt, and <table>.<part>.txt for another document, are the words around them, with `{figure:.2f}`
 where a figure stands, and `{command:}`, `{date:}`, `{machine:}`; figures in plain digits were taken by hand. A document
 shows one between `<!-- table: captures -->` and `<!-- end of table -->`.
 """
@@ -50,7 +50,7 @@ def written(name: str) -> str:
     """The table called ``name`` (of the file of words) with its figures. Raises KeyError where one is not kept."""
     document = kept(name.partition(".")[0])
     figures = document["figures"] | {key: document[key] for key in ("command", "date", "machine")}
-    words = (KEPT / f"{name}.md").read_text(encoding="utf-8").strip()
+    words = (KEPT / f"{name}.txt").read_text(encoding="utf-8").strip()
     return PLACE.sub(lambda place: format(figures[place[1]], place[2]), words)
 
 
