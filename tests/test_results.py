@@ -35,6 +35,16 @@ def test_what_is_kept_says_how_when_and_on_what(name: str) -> None:
     assert all(isinstance(value, int | float) for value in document["figures"].values())
 
 
+def test_the_figure_of_uncertainty_shows_what_the_experiment_found() -> None:
+    """And the page says in how many rows sigma is too small."""
+    figure = results.uncertainty_svg(kept("hidden")["figures"])
+    assert results.UNCERTAINTY.read_text(encoding="utf-8") == figure
+    drawn = [(float(one), float(other)) for one, other in re.findall(r">([\d.]+) / ([\d.]+) mm<", figure)]
+    too_small = sum(measured > predicted for predicted, measured in drawn)
+    page = (results.ROOT / "docs" / "uncertainty.md").read_text(encoding="utf-8")
+    assert f"σ is too small in {too_small} of {len(drawn)} rows" in page
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Kept figures of one table, and a document that shows it twice."""
@@ -49,6 +59,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     )
     monkeypatch.setattr(results, "KEPT", tmp_path)
     monkeypatch.setattr(results, "DOCUMENTS", (tmp_path / "document.md",))
+    monkeypatch.setattr(results, "write_uncertainty", lambda: None)
     return tmp_path
 
 
