@@ -42,7 +42,7 @@ def test_the_figure_of_uncertainty_shows_what_the_experiment_found() -> None:
     drawn = [(float(one), float(other)) for one, other in re.findall(r">([\d.]+) / ([\d.]+) mm<", figure)]
     too_small = sum(measured > predicted for predicted, measured in drawn)
     page = (results.ROOT / "docs" / "uncertainty.md").read_text(encoding="utf-8")
-    assert f"σ is too small in {too_small} of {len(drawn)} rows" in page
+    assert f"too small in {too_small} of {len(drawn)} rows" in page
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ that table's command first.
 docs/results/<table>.json keeps what a command printed: the command, the day, the machine and the figures by name.
 docs/results/<table>.txt, and <table>.<part>.txt for another document, are the words around them, with `{figure:.2f}`
 where a figure stands, and `{command:}`, `{date:}`, `{machine:}`; figures in plain digits were taken by hand. A document
-shows one between `<!-- table: captures -->` and `<!-- end of table -->`. docs/pictures/uncertainty.svg is drawn of the figures
-that the experiment `hidden` printed.
+shows one between `<!-- table: captures -->` and `<!-- end of table -->`. docs/pictures/uncertainty.svg is
+drawn of the figures that the experiment `hidden` printed.
 """
 
 import datetime
@@ -86,7 +86,7 @@ def take(name: str) -> None:
 
 
 def uncertainty_svg(figures: dict[str, float]) -> str:
-    """Draws, for each population and region, the median error that sigma predicts (circle) and the measured one (dot)."""
+    """Draws the median error of each region: as sigma predicts it (circle), and as it was measured (dot)."""
     rows: list[str] = []
     for population, title in POPULATIONS.items():
         rows.append(f'<text x="8" y="{PX_A_ROW * (len(rows) + 1.7)}" font-weight="bold">{title}</text>')
