@@ -17,7 +17,7 @@ from tests.tools.counts import ROOT, parse_modules, read_modules
 
 BLOCK = re.compile(r"\n\s*\n|\n(?=- |\d\. )")
 NO_PROSE = re.compile(r"^(?:[|#<!`]|    |Args:|Attributes:)")
-END = re.compile(r"(?<=[a-z0-9)`\"][.?!]) +(?=[A-Z`*\[])")
+END = re.compile(r"(?<!\b[A-Z]\.)(?<=[.?!]) +(?=[A-Z`*\[])")  # no end after an initial
 MIN_WORDS = 5
 
 
@@ -47,15 +47,15 @@ def _docstrings() -> Iterator[tuple[str, str]]:
                 yield f"{places[name]}:{getattr(node, 'lineno', 1)}", ast.get_docstring(node) or ""
 
 
-def main() -> None:
-    """Prints the sentences that the command line asks for."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True
-    ).stdout
-    count, seed = [*sys.argv[1:], "40", commit.strip()][:2] if len(sys.argv) != 2 else (sys.argv[1], commit.strip())
-    for number, (place, sentence) in enumerate(random.Random(seed).sample(list_sentences(), int(count)), 1):
-        sys.stdout.write(f"{number:3} {place}\n    {sentence}\n")
+def draw(count: int, seed: str) -> list[tuple[str, str]]:
+    """Returns ``count`` sentences with their places, the same ones for the same seed."""
+    return random.Random(seed).sample(list_sentences(), count)
 
 
 if __name__ == "__main__":
-    main()
+    commit = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True
+    ).stdout
+    given = dict(enumerate(sys.argv[1:]))
+    for number, (place, sentence) in enumerate(draw(int(given.get(0, 40)), given.get(1, commit.strip())), 1):
+        sys.stdout.write(f"{number:3} {place}\n    {sentence}\n")

@@ -1,14 +1,6 @@
 """The draw of sentences: from every kind of text, whole ones, the same for one seed."""
 
-import subprocess
-import sys
-
-from tests.tools.sentences import MIN_WORDS, ROOT, list_sentences
-
-
-def drawn(*arguments: str) -> str:
-    command = [sys.executable, "-m", "tests.tools.sentences", *arguments]
-    return subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=60, check=True).stdout
+from tests.tools.sentences import MIN_WORDS, draw, list_sentences
 
 
 def test_sentences_come_from_documents_docstrings_and_messages() -> None:
@@ -19,7 +11,7 @@ def test_sentences_come_from_documents_docstrings_and_messages() -> None:
 
 
 def test_a_seed_draws_the_same_sentences_again() -> None:
-    first = drawn("7", "a")
-    assert first.count("\n") == 14
-    assert first == drawn("7", "a")
-    assert first != drawn("7", "b")
+    first = draw(40, "a")
+    assert len(set(first)) == 40
+    assert first == draw(40, "a")
+    assert first != draw(40, "b")
