@@ -2,7 +2,6 @@
 
 import tomllib
 from importlib.metadata import PackageNotFoundError, metadata
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,12 @@ packages state.
 
 | package | licence | why |
 |---|---|---|
+"""
+NEEDED = """
+## Packages that these need
+
+By licence; `uv tree --invert --package NAME` says which package needs one.
+
 """
 
 
@@ -43,18 +48,14 @@ def licence(name: str) -> str:
 
 
 def page() -> str:
-    packages, why = locked(), reasons()
-    needed_by: dict[str, list[str]] = {}
-    for package in packages:
-        extras = package.get("optional-dependencies", {}).values()
-        for needed in chain(package.get("dependencies", []), *extras):
-            needed_by.setdefault(needed["name"], []).append(package["name"])
-    rows = []
-    for name in sorted({package["name"] for package in packages}):
-        others = sorted(set(needed_by.get(name, [])))
-        reason = why.get(name) or "for " + ", ".join(others[:4]) + (" and others" if len(others) > 4 else "")
-        rows.append(f"| {name} | {licence(name)} | {reason} |\n")
-    return HEAD + "".join(rows)
+    why, packages = reasons(), sorted({package["name"] for package in locked()})
+    rows = [f"| {name} | {licence(name)} | {why[name]} |\n" for name in packages if name in why]
+    needed: dict[str, list[str]] = {}
+    for name in packages:
+        if name not in why:
+            needed.setdefault(licence(name), []).append(name)
+    lists = [f"- {stated}: {', '.join(names)}\n" for stated, names in sorted(needed.items())]
+    return HEAD + "".join(rows) + NEEDED + "".join(lists)
 
 
 if __name__ == "__main__":
