@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.segmentation.mean_field``."""
+"""Compiled loops of ``pipeline.segmentation.foreground``."""
 
 import numpy as np
 

@@ -10,13 +10,20 @@ edges (``pipeline.texturing.visibility``), sharpens photographs where they have 
 each camera (``pipeline.imaging.colour_balance``). Its mean is in linear light and gives little weight to a view that
 differs from the others in any channel, be it brighter (a highlight moves with the camera) or darker (a shadow that it
 alone sees), and less weight to cameras with a large correction. Where no camera sees the head it is filled smoothly.
+
+A model whose eyes are openings has them closed by strips from lid to lid (``close_openings`` of imports). Every vertex
+of a strip lies on the opening's rim, which the lids hide, so that no view would be chosen for it, and the eyeball would
+be painted in the colour of the skin around it. Such a patch takes its colours from the one photograph that sees most of
+it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
@@ -24,23 +31,29 @@ from pipeline.geometry.raster import camera_depths
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
-from pipeline.texturing.blind_patches import fill_unobserved_patches
 from pipeline.texturing.decision import Decision, pack_pictures
 from pipeline.texturing.inpaint import fill_unknown
 from pipeline.texturing.neighbourhood import Neighbourhood
 from pipeline.texturing.paint_kernels import Pictures
 from pipeline.texturing.seam_levelling import level_views
-from pipeline.texturing.vertex_colours_kernels import blend_views
+from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
 from pipeline.texturing.view_selection import add_similar_views, select_views
-from pipeline.texturing.visibility import Sight, see_points, sharpened
+from pipeline.texturing.visibility import Sight, see_points, see_weights, sharpened
 from pipeline.warnings import ReportWarning
 from rig.camera import Camera
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
-from rig.mesh import Mesh
+from rig.mesh import Mesh, face_normals
 from rig.messages.fault_groups import some_of
 from rig.messages.message import compose
 from rig.rig import Rig
+
+INNER = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 2]]) / 6.0  # places in a triangle that are looked at
+MIN_MM2 = 20.0  # of a patch: an open eye has 200, a fold of the skin less
+MIN_SHOWN = 0.5  # of a triangle, in some view
+MIN_SEEN = 0.4  # of the patch's area, in the view that it takes; lids hide its upper third from most
+MAX_KNOWN = 0.5  # of the corners of its triangles, by area, that some view sees: beyond, it is no opening, but skin
+BARELY = np.float32(1e-9)  # weight of a view at a corner that it does not see
 
 REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hidden: a pixel's slope on a steep cheek
 GREY = 0.22  # linear: what a head gets that no camera saw
@@ -95,9 +108,9 @@ def texture(
 
     def read_view(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
-        image = sharpened(capture.images[name], silhouettes[name].mask, settings)
+        image = sharpened(capture.images[name], silhouettes[name].mask, settings.sharpening)
         points, silhouette = mesh_world.vertices, silhouettes[name]
-        sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
+        sight = see_points(camera, image, silhouette, depths[name], points, normals)
         return sight, image
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
@@ -107,18 +120,16 @@ def texture(
         gains, offsets = balance(weights, colours)
     weights *= gain_confidence(gains)[:, None]
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
-    agreed, seen = blend_views(weights, balanced, settings.outlier)
+    agreed, seen = blend_views(weights, balanced, OUTLIER)
     if not seen.any():
         return _untextured(len(seen))
     decision = None
     if around is not None:
         images = [image for _, image in found]
         masks = {name: silhouettes[name].mask for name in views.names}
-        pictures = pack_pictures(
-            views, images, masks, gains, offsets, mesh_world=mesh_world, footprint_px=settings.footprint_px
-        )
-        decision = decide(views, weights, balanced, agreed, gains, pictures, around=around, settings=settings)
-        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, settings)
+        pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world=mesh_world)
+        decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
+        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths)
     shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
@@ -155,16 +166,14 @@ def decide(
     pictures: Pictures,
     *,
     around: Neighbourhood,
-    settings: TextureSettings,
 ) -> Decision:
     """Chooses a view for each vertex, and computes the corrections that level the seams between views."""
-    chosen = settings.selection
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
-    fields = level_views(weights, codes, level_to, around, chosen.levelling)
+    fields = level_views(weights, codes, level_to, around)
     detail = codes + fields[:, :, :3]
-    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around=around, settings=chosen)
-    slots, shares = add_similar_views(labels, options, quality, detail, weights, around=around, settings=chosen)
+    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around=around)
+    slots, shares = add_similar_views(labels, options, quality, detail, weights, around=around)
     corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
     return Decision(views, slots, shares, corrections, weights, pictures)
 
@@ -265,3 +274,87 @@ def _sampled(image: UInt8[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "v 2"]
     top = image[y, x] * (1 - fx) + image[y, x + 1] * fx
     bottom = image[y + 1, x] * (1 - fx) + image[y + 1, x + 1] * fx
     return top * (1 - fy) + bottom * fy
+
+
+def fill_unobserved_patches(
+    decision: Decision,
+    mesh_world: Mesh,
+    silhouettes: Mapping[str, Silhouette],
+    depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+) -> Decision:
+    """Returns the decision with a view added at the corners of every wide patch that a camera sees although it sees
+    none of the corners, such as a strip that closes an eye."""
+    rows = np.flatnonzero(_blind(decision.weights, mesh_world.faces))
+    faces, normals, area = _parts(mesh_world, rows)
+    rows = rows[_wide(faces, area)]
+    if not len(rows):
+        return decision
+    faces, normals, area = _parts(mesh_world, rows)
+    points = np.einsum("pk,fkx->fpx", INNER, mesh_world.vertices[faces]).reshape(-1, 3)
+    facing = np.repeat(normals, len(INNER), axis=0)
+    found = [see_weights(view, silhouettes[view.name], depths[view.name], points, facing) for view in decision.views]
+    seen = np.stack(found).reshape(len(found), len(rows), len(INNER))
+    shown = (seen > 0).mean(axis=2).max(axis=0) >= MIN_SHOWN  # the hidden side of a lid is blind as the eye is
+    faces, area, seen = faces[shown], area[shown], seen[:, shown]
+    wide = _wide(faces, area)
+    return _taken(decision, faces[wide], area[wide], _patches(faces[wide]), seen[:, wide])
+
+
+def _parts(
+    mesh: Mesh, rows: Int[np.ndarray, " f"]
+) -> tuple[Int[np.ndarray, "f 3"], Float[np.ndarray, "f 3"], Float[np.ndarray, " f"]]:
+    """Triangles, their unit normals and areas (mm2)."""
+    faces = mesh.faces[rows]
+    normals = face_normals(mesh.vertices, faces)
+    doubled = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+    return faces, normals / doubled[:, None], 0.5 * doubled
+
+
+def _wide(faces: Int[np.ndarray, "f 3"], area: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
+    """Triangles of patches that are large enough."""
+    patch = _patches(faces)
+    return np.bincount(patch, area)[patch] >= MIN_MM2 if len(faces) else np.zeros(0, bool)
+
+
+def _taken(
+    decision: Decision,
+    faces: Int[np.ndarray, "f 3"],
+    area: Float[np.ndarray, " f"],
+    patch: Int[np.ndarray, " f"],
+    seen: Float32[np.ndarray, "k f p"],
+) -> Decision:
+    slots, shares, weights = decision.slots.copy(), decision.shares.copy(), decision.weights.copy()
+    known = np.any(decision.weights > 0, axis=0)[faces].mean(axis=1)
+    for number in np.unique(patch):
+        rows = np.flatnonzero(patch == number)
+        share = ((seen[:, rows] > 0).mean(axis=2) * area[rows]).sum(axis=1) / area[rows].sum()
+        if (known[rows] * area[rows]).sum() > MAX_KNOWN * area[rows].sum():
+            continue
+        worth = np.where(share >= MIN_SEEN, (seen[:, rows].mean(axis=2) * area[rows]).sum(axis=1), 0.0)
+        best = int(worth.argmax())
+        if worth[best] <= 0:
+            continue
+        corners = np.unique(faces[rows])
+        weights[best, corners] = np.maximum(weights[best, corners], BARELY)
+        unseen = corners[slots[corners, 0] < 0]
+        slots[unseen, 0], shares[unseen, 0] = best, 1.0
+    return replace(decision, slots=slots, shares=shares, weights=weights)
+
+
+def _blind(weights: Float32[np.ndarray, "k v"], faces: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
+    """Triangles of which no view sees all corners."""
+    out = np.ones(len(faces), bool)
+    for view in weights:
+        out &= ~(view[faces] > 0).all(axis=1)
+    return out
+
+
+def _patches(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
+    """The patch of each triangle: they hang together by edges."""
+    count = len(faces)
+    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, edge = np.unique(ends, axis=0, return_inverse=True)
+    owner = np.tile(np.arange(count), 3)
+    shape = (count, int(edge.max(initial=-1)) + 1)
+    touches = sparse.csr_array((np.ones(3 * count), (owner, edge.ravel())), shape=shape)
+    return connected_components(touches @ touches.T, directed=False)[1]

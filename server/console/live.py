@@ -13,12 +13,12 @@ import structlog
 from rig.acquisition.image_checks import blur_px, exposure
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
+from rig.progress import Progress
 from server.console.live_frame import LiveFrame
-from server.console.studio_view import frames
 from server.services.rigs.backend import RigBackend
 from server.services.rigs.previews import jpeg, reduced
 from server.services.service import Service
-from server.tasks.child import Child
+from server.tasks.child import Child, WorkerContext
 from server.wire.problems import problem_from
 
 EVERY_S = 0.25  # four looks a second at most
@@ -170,3 +170,11 @@ def look_bytes(frames: list[LiveFrame], fault: Message | None) -> bytes:
     text = json.dumps({"cameras": header, "fault": None if fault is None else fault.document()}).encode()
     body = b"".join(f["jpeg"] or b"" for f in frames)
     return struct.pack(">II", len(text), len(body)) + text + body
+
+
+def frames(context: WorkerContext, report: Progress, *, look: int) -> list[LiveFrame]:
+    """Returns the present picture of each camera of the simulated studio, drawn in a child process. ``look`` counts the
+    calls."""
+    from server.console import studio_drawing
+
+    return studio_drawing.frames(context, look)

@@ -2,6 +2,9 @@
 results, numbers by vertex.
 
 Each route identifies the caller by the browser's session, as the API does by an API key.
+
+A head can be seen through a camera of the rig: the camera's pose in the head's frame, and its photograph without lens
+distortion, onto which a pinhole camera draws the mesh exactly.
 """
 
 import asyncio
@@ -10,31 +13,48 @@ import threading
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypedDict
 
+import cv2
 import numpy as np
 from fastapi import Depends, Request, Response
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
+from jaxtyping import Bool, UInt8
 from nicegui import app as pages
 
+from pipeline.results.report_types import Report
+from rig.atomic_write import write_atomically
+from rig.camera import Camera
 from rig.errors import EigenheadError, InputError
+from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.formats.pictures.images import open_picture, read_image, write_image
+from rig.geometry import RigidTransform
+from rig.image import ImageRgb
 from rig.messages.message import compose
+from rig.progress import Progress
+from rig.rig import Rig
 from server.console import comparison
 from server.console.found_faces import found_faces
 from server.console.head_pictures import head_picture, result_folder
 from server.console.identity import caller_of, permit, service_of_pages
 from server.console.live import LiveView
-from server.console.look_through import camera_views, rig_of, straightened, straightened_face
 from server.console.page import as_problem
-from server.console.silhouettes import draw
 from server.errors import NotFound
 from server.services.keys import Caller
 from server.services.service import Service
+from server.storage.face_cache import FoundFace
 from server.storage.records import CaptureRecord
+from server.tasks.child import WorkerContext
 from server.wire.batch_files import SheetFormat, TableFormat, send_sheet, send_table
 from server.wire.multipart import receive_calibration_pictures, receive_capture
 from server.wire.send_file import send_archive, send_file
+
+WIDTH_MOST = 1600
+MM = 1000.0
+
+WIDTH = 640
+COLOUR = (108, 178, 255)  # the accent of the pages
+LINE_PX = 3
 
 THUMBNAIL_WIDTH = 480
 THUMBNAIL_QUALITY = 82
@@ -43,6 +63,20 @@ FOREVER = {"Cache-Control": "private, max-age=31536000, immutable"}
 
 _live: dict[int, LiveView] = {}
 _drawing = threading.Lock()
+
+
+class CameraView(TypedDict):
+    """Holds a pinhole camera (px). ``camera_from_head``: rows of a 4 x 4 matrix (metres); the head frame is that of
+    head.glb."""
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    camera_from_head: list[list[float]]
 
 
 def session(scope: str) -> Any:
@@ -304,3 +338,88 @@ def _capture_files(service: Service, job_id: str) -> tuple[Path, CaptureRecord]:
 
 def _floats(values: np.ndarray) -> Response:
     return Response(values.astype("<f4").tobytes(), media_type="application/octet-stream", headers=FOREVER)
+
+
+def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, target: str) -> None:
+    """Draws the subject's outline in each picture of a capture as ``target``/<camera>.png, transparent outside.
+    Silhouettes come from the folder ``cache`` or are stored there. Raises InputError."""
+    from server.storage.silhouette_cache import segment_once
+    from server.tasks.photographs import read_scaled_capture
+
+    shot, rig = read_scaled_capture(Path(capture))
+    found = segment_once(Path(cache), shot, rig, report=report)
+    for name, silhouette in found.items():
+        done, data = cv2.imencode(".png", outline(silhouette.mask)[:, :, [2, 1, 0, 3]])
+        assert done
+        write_atomically(Path(target) / f"{name}.png", data.tobytes())
+
+
+def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
+    """Draws a mask as an RGBA picture, at most ``WIDTH`` pixels wide: the outline solid, the inside lightly tinted."""
+    factor = min(1.0, WIDTH / mask.shape[1])
+    size = (round(mask.shape[1] * factor), round(mask.shape[0] * factor))
+    small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    edges, _ = cv2.findContours(small, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    alpha = small * np.uint8(26)
+    cv2.drawContours(alpha, edges, -1, 255, LINE_PX)
+    return np.dstack([np.full(small.shape, value, np.uint8) for value in COLOUR] + [alpha])
+
+
+def camera_views(rig: Rig, report: Report) -> list[CameraView]:
+    """Returns every camera of a capture as seen from the head. The head's pose is that of ``report``, its size the true
+    one: x_world = R x_head + s t."""
+    place = report["world_from_head"]
+    shift = np.array(place["translation"]) * place["scale"]
+    world_from_head = RigidTransform(np.array(place["rotation"]), shift)
+    return [_view(camera, camera.camera_from_world @ world_from_head) for camera in rig]
+
+
+def rig_of(capture: Path) -> Rig:
+    """Reads the rig from the files of a capture. Raises InputError if there is none or it cannot be read."""
+    found = find_rig_file(capture)
+    if found is None:
+        raise InputError("capture", [compose("no-cameras-json")])
+    return read_rig_file(found)
+
+
+def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:
+    """Removes the lens's distortion from a photograph and reduces it to at most ``WIDTH_MOST`` pixels of width."""
+    lens = camera.intrinsics
+    if camera.recorded is not None:
+        image = camera.recorded.undistort(image, lens.matrix(), smooth=True)
+    factor = min(1.0, WIDTH_MOST / lens.width)
+    size = (round(lens.width * factor), round(lens.height * factor))
+    wanted = np.diag([factor, factor, 1.0]) @ lens.matrix()
+    wanted[:2, 2] += (factor - 1) / 2  # the centre of the first pixel stays 0
+    columns, rows = cv2.initUndistortRectifyMap(
+        lens.matrix(), lens.distortion.opencv(), np.eye(3), wanted, size, cv2.CV_32FC1
+    )
+    return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_AREA), np.uint8)
+
+
+def straightened_face(face: FoundFace, camera: Camera) -> FoundFace:
+    """Converts a face to the pixels of the photograph without distortion, at full size. Points outside the lens are
+    left out."""
+    lens, pixels = camera.intrinsics, np.array(face["points"])
+    if camera.recorded is not None:
+        straight = camera.recorded.undistorted(pixels, lens.matrix())
+    else:
+        straight = camera.undistort(pixels) * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+    straight = straight[np.isfinite(straight).all(axis=1)].round(1)
+    box = [*straight.min(axis=0), *straight.max(axis=0)] if len(straight) else face["box_px"]
+    return {**face, "box_px": [float(side) for side in box], "points": straight.tolist()}
+
+
+def _view(camera: Camera, camera_from_head: RigidTransform) -> CameraView:
+    lens, matrix = camera.intrinsics, np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = camera_from_head.rotation, camera_from_head.translation / MM
+    return {
+        "name": camera.name,
+        "width": lens.width,
+        "height": lens.height,
+        "fx": lens.fx,
+        "fy": lens.fy,
+        "cx": lens.cx,
+        "cy": lens.cy,
+        "camera_from_head": matrix.tolist(),
+    }

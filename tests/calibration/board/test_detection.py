@@ -10,8 +10,7 @@ import pytest
 from calibration.adjustment.intrinsics import estimate_lenses
 from calibration.board.board import Board, read_board
 from calibration.board.corners import detect
-from calibration.board.detection import WrongBoard, detect_folder
-from calibration.board.missing import explain
+from calibration.board.detection import WrongBoard, detect_folder, explain
 from rig.errors import InputError
 from tests.support.board_sessions import CHARUCO, CHECKERBOARD, photograph, session, visible
 from tests.support.shared_data import shared

@@ -15,7 +15,6 @@ import numpy as np
 from pipeline.contour_fit import (
     clutter,
     contour,
-    feature_term,
     head_problem,
     noise_model,
     prior_term,
@@ -33,7 +32,7 @@ from rig.progress import Progress, discard_progress
 
 # What rows of the contour solver depend on, for keys.
 CONTOUR = (
-    *(levenberg_marquardt, terms, contour, problem, head_problem, rim_term, feature_term, prior_term),
+    *(levenberg_marquardt, terms, contour, problem, head_problem, rim_term, prior_term),
     *(clutter, noise_model, rim, rim_kernels, rim_jacobian_kernels, projection_kernels, sampling_kernels),
 )
 

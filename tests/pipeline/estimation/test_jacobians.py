@@ -24,8 +24,7 @@ from calibration.adjustment.state import (
     observations,
 )
 from calibration.silhouette_refinement.tangency_term import PackedTangencies, TangencyTerm
-from pipeline.contour_fit.feature_term import FeatureTerm
-from pipeline.contour_fit.head_problem import apply_step
+from pipeline.contour_fit.head_problem import FeatureTerm, apply_step
 from pipeline.contour_fit.landmark_term import LandmarkTerm, observe_landmarks
 from pipeline.contour_fit.prior_term import PriorTerm
 from pipeline.contour_fit.problem import (

@@ -8,8 +8,7 @@ import pytest
 from pipeline.evidence.pose import cameras_in_front, judge_pose
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.landmark_map import landmark_map
-from pipeline.faces.single_view import match_alone
-from pipeline.faces.subject import SubjectFaces
+from pipeline.faces.subject import SubjectFaces, match_alone
 from pipeline.head_model.model import HeadModel, load_model
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.faces.limbus import EyeView
-from pipeline.faces.pupils import pupils_px
+from pipeline.faces.limbus_fit import pupils_px
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 

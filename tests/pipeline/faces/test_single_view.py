@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.faces.points import point_table
-from pipeline.faces.single_view import DISTANCE_SHARE, match_alone, place_from_one_view
+from pipeline.faces.subject import DISTANCE_SHARE, match_alone, place_from_one_view
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import Similarity, look_at, rotation_from_vector, vector_from_rotation
 from tests.support.drawn_faces import seen_face

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from rig.mesh import Mesh
-from server.console.first_view import GROUND, SIDE, drawn
+from server.console.head_pictures import GROUND, SIDE, drawn
 
 
 def ball(colours: np.ndarray | None = None) -> Mesh:

@@ -11,7 +11,7 @@ from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
-from server.console.look_through import camera_views, straightened, straightened_face
+from server.console.media import camera_views, straightened, straightened_face
 from server.storage.face_cache import FoundFace
 
 LENS = Distortion(-0.14, 0.04, 0.001, -0.0008, 0.0)

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline import reconstruct as composition
-from pipeline.applications.verification import repeatability
-from pipeline.applications.verification.repeatability import scatter
+from pipeline.applications.verification import judgement
+from pipeline.applications.verification.judgement import scatter
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
@@ -64,7 +64,7 @@ class Shot:
 def repeat(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int = SHOTS) -> Outcome:
     """Runs this module's experiment. Returns scatter, stated deviation and repeated error by condition. ``subjects`` is
     the number of shots, two or more."""
-    records = bench.records("repeat", key_of(model.sha256, Settings(), subjects, *CONTOUR, composition, repeatability))
+    records = bench.records("repeat", key_of(model.sha256, Settings(), subjects, *CONTOUR, composition, judgement))
     rows = []
     for i, condition in enumerate(CONDITIONS):
         report_shots = partial(_of_condition, bench.report, condition, i)

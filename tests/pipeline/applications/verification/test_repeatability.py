@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.applications.verification.repeatability import scatter
+from pipeline.applications.verification.judgement import scatter
 from pipeline.head_model.subdivision import vertex_areas
 from rig.geometry import RigidTransform, rotation_from_vector
 from tests.support.scenes import ellipsoid

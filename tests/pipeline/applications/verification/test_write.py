@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.applications.verification.certificate import certificate_pdf
 from pipeline.applications.verification.judgement import judge
 from pipeline.applications.verification.limits import Limits
 from pipeline.applications.verification.measured import ResultIdentity
 from pipeline.applications.verification.pictures import draw, heat_colours, scale_end
 from pipeline.applications.verification.reference import Reference
 from pipeline.applications.verification.report import Occasion, report_document
-from pipeline.applications.verification.write import write_verification
+from pipeline.applications.verification.write import certificate_pdf, write_verification
 from pipeline.results.pdf_page import latin
 from rig.formats.pictures.images import read_image
 from tests.support.measured_heads import mannequin, marks, measured_head

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from rig.formats.cameras.cameras_file import unread_keys, unread_keys_of
 from rig.formats.cameras.cameras_json import FORMAT, document_from_rig, read_rig
-from rig.formats.cameras.unread_keys import unread_keys, unread_keys_of
 from rig.formats.captures.capture_folder import read_capture
 from rig.studio.scene.layout import default_layout
 from tests.support.services import small_capture
