@@ -24,6 +24,7 @@ PROBLEM_TYPES = {
     "delivery-active": "Delivery active",
     "delivery-failed": "Delivery failed",
     "disk-full": "Disk full",
+    "file-damaged": "File damaged",
     "first-key": "First key",
     "foreign-origin": "Foreign origin",
     "idempotency-conflict": "Idempotency conflict",
@@ -234,6 +235,7 @@ FAILURE_TYPES = {
     "bug": "internal-error",
     "crash": "work-crashed",
     "disk-full": "disk-full",
+    "killed": "work-crashed",
     "out-of-memory": "out-of-memory",
 }
 """The type of a failure by the error's class, or by what the child process says of the end of its work."""

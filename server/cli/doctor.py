@@ -1,10 +1,12 @@
 """Implements ``eigenhead doctor``: finds what is wrong with this machine and says what to do about it."""
 
+import json
 import os
 import shutil
 import socket
 import sqlite3
 import sys
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -19,6 +21,7 @@ from rig.errors import EigenheadError
 from rig.text import suggest
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
+from server.storage.objects import sha256_of
 from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_compute, try_egl
 
@@ -35,6 +38,7 @@ NOW = {
     "postgresql": "extract(epoch from clock_timestamp())",
 }
 STORE_S = 3.0  # how long doctor waits for a store at most
+COMPARE_S = 30.0  # how long doctor compares files of results
 MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
@@ -186,25 +190,40 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _results(settings: ServiceSettings) -> tuple[bool, str]:
-    """Names the jobs that succeeded but whose result folder is missing: removed by hand, or not in a restored
-    backup."""
+    """Names the jobs that succeeded but whose result folder is missing, removed by hand or not in a restored backup,
+    and files whose content is not what the job made: the newest first, for ``COMPARE_S`` seconds."""
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
         return True, "none yet"
     with closing(connection):
-        if not _rows(connection, TABLES[kind].format("workflow_status")):
+        if not _rows(connection, TABLES[kind].format("workflow_output")):
             return True, "none yet"
-        query = f"SELECT workflow_uuid FROM {JOBS[kind]} WHERE name = 'reconstruct' AND status = 'SUCCESS'"
-        jobs = [str(job) for (job,) in _rows(connection, query)]
-    missing = [job for job in jobs if not (settings.data / "jobs" / job / "result").is_dir()]
+        outputs = JOBS[kind].replace("status", "output")
+        query = f"SELECT job.workflow_uuid, made.output FROM {JOBS[kind]} AS job LEFT JOIN {outputs} AS made"
+        query += " ON made.workflow_uuid = job.workflow_uuid WHERE job.name = 'reconstruct' AND job.status = 'SUCCESS'"
+        rows = _rows(connection, query + " ORDER BY job.created_at DESC")
+    missing = [job for job, _ in rows if not (settings.data / "jobs" / job / "result").is_dir()]
+    damaged, compared, end = list[str](), 0, time.monotonic() + COMPARE_S
+    for job, output in rows:
+        if job not in missing and str(output).startswith("{") and time.monotonic() < end:  # not an older, pickled one
+            compared += 1
+            damaged += _damaged(settings.data / "jobs" / job, json.loads(output))
+    if damaged:
+        return False, f"changed since their jobs made them: {', '.join(damaged[:5])}; restore them, or restart the jobs"
     if not missing:
-        return True, f"of {len(jobs)} jobs, all there"
+        return True, f"of {len(rows)} jobs, all there; the files of {compared} were compared"
     named = f"{', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}"
     return (
         False,
-        f"of {len(jobs)} jobs {len(missing)} are gone ({named}): restore `jobs` from a backup, or restart them",
+        f"of {len(rows)} jobs {len(missing)} are gone ({named}): restore `jobs` from a backup, or restart them",
     )
+
+
+def _damaged(folder: Path, files: dict[str, dict[str, str]]) -> list[str]:
+    found = ((folder / "result" / name, entry["sha256"]) for name, entry in files.items())
+    there = ((path, sha256) for path, sha256 in found if path.is_file())  # the others may lie in a store
+    return [f"{folder.name}/{path.name}" for path, sha256 in there if sha256_of(path) != sha256]
 
 
 def _kind(settings: ServiceSettings) -> str:

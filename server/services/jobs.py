@@ -20,8 +20,8 @@ from server.errors import Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
 from server.services.deliveries import Deliveries, delivery_of, destination
+from server.services.failures import SERIALIZER, failure
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
-from server.services.failures import failure
 from server.services.job_rows import (
     APPLICATION,
     FINISHED,
@@ -62,7 +62,10 @@ class Jobs:
         self._settings, self._store, self._engine, self._library = settings, store, engine, library
         self.events, self.index, self.batches = EventLog(engine), JobIndex(engine, WORKFLOW), BatchIndex(engine)
         self.client = DBOSClient(
-            system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
+            system_database_url=settings.url,
+            application_name=APPLICATION,
+            retry_connection_errors=False,
+            serializer=SERIALIZER,
         )
         self.deliveries, self.results = Deliveries(self.client), Results(store, settings)
         self.index.complete(self._requests)

@@ -210,11 +210,20 @@ def _deliveries(service: Service) -> int:
 
 
 def _find_missing(service: Service) -> None:
-    """What readiness says of results that somebody else removed, or that a backup lacks."""
-    missing = service.jobs.without_result()
-    detail = (
-        compose("results-missing", count=len(missing), jobs=missing[:3]) if missing else compose("results-complete")
-    )
+    """What readiness says of results that somebody else removed or changed, or that a backup lacks. One job's files are
+    compared at each sweep, in turn."""
+    missing, done = service.jobs.without_result(), service.jobs.index.newest_first(STATUSES["succeeded"])
+    damaged = service.jobs.results.damaged
+    if done:
+        job_id = done[int(time.time() / service.settings.sweep_s) % len(done)]
+        with suppress(EigenheadError):  # removed, or missing
+            service.jobs.results.compare(job_id, service.jobs.files(job_id))
+    damaged.intersection_update({name for name in damaged if name.partition("/")[0] in done})
+    detail = compose("results-complete")
+    if missing:
+        detail = compose("results-missing", count=len(missing), jobs=missing[:3])
+    elif damaged:
+        detail = compose("file-damaged", files=sorted(damaged)[:3])
     service.known["results"] = Check(ok=True, detail=detail)
 
 

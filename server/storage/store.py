@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -36,6 +37,7 @@ from rig.messages.message import Message, compose
 from server.errors import DiskFull, NotFound
 from server.storage.capture_blobs import CaptureBlobs
 from server.storage.folders import move_durably, newest, sync_folder
+from server.storage.objects import sha256_of
 from server.storage.records import (
     CALIBRATION,
     CAPTURE,
@@ -75,6 +77,16 @@ class StoredFile:
 
     path: Path
     sha256: str
+
+    def is_intact(self) -> bool:
+        """Tells whether the file has this content. It is read once, and again when its time, size or inode changes."""
+        said = self.path.stat()
+        return _digest(self.path, said.st_mtime_ns, said.st_size, said.st_ino) == self.sha256
+
+
+@lru_cache(maxsize=1 << 16)
+def _digest(path: Path, *_: int) -> str:
+    return sha256_of(path)
 
 
 class RecordIndex(Protocol):

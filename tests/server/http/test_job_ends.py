@@ -29,8 +29,10 @@ def await_true(condition: Callable[[], bool]) -> None:
 
 def ends(service: RunningService, job: str) -> list[tuple[int, str]]:
     with database(service) as connection:
-        query = "SELECT seq, document ->> 'state' FROM eigenhead_events WHERE job_id = ? AND document ->> 'state' != ?"
-        return connection.execute(query, (job, "running")).fetchall()
+        query = (
+            "SELECT seq, document ->> 'state' AS state FROM eigenhead_events WHERE job_id = ? AND state NOT IN (?, ?)"
+        )
+        return connection.execute(query, (job, "running", "queued")).fetchall()
 
 
 @pytest.mark.parametrize("mode", ["cam00", "fail"])

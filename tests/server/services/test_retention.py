@@ -1,5 +1,6 @@
 """What goes and what stays: by age, by number, by space; nothing that a job needs."""
 
+import os
 import shutil
 import time
 from pathlib import Path
@@ -8,6 +9,8 @@ import httpx
 import pytest
 
 from rig.formats.captures.archive import pack_folder
+from server.cli.doctor import examine
+from server.settings import ServiceSettings
 from tests.support.services import RunningService, await_state, running_service, small_capture
 
 
@@ -59,8 +62,8 @@ def test_only_the_newest_results_stay(tmp_path: Path, capture_file: bytes) -> No
             assert client.get(f"/v1/jobs/{job}/result/head.ply").status_code == 200
 
 
-def test_a_result_that_somebody_removed_is_told_before_it_is_fetched(tmp_path: Path, capture_file: bytes) -> None:
-    """In the job, in the list, by readiness; a restart makes it again."""
+def test_a_result_that_somebody_changed_or_removed_is_told_and_never_sent(tmp_path: Path, capture_file: bytes) -> None:
+    """In the job, in the list, by readiness, by doctor; a restart makes it again."""
     with (
         running_service(tmp_path / "data", sweep_s="0.3") as service,
         httpx.Client(base_url=service.url, timeout=30) as client,
@@ -69,17 +72,39 @@ def test_a_result_that_somebody_removed_is_told_before_it_is_fetched(tmp_path: P
         job = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
         files = await_state(client, job, ("succeeded",))["files"]
         assert client.get(f"/v1/jobs/{job}").json()["notice"] is None
+        head = service.data / "jobs" / job / "result" / "head.ply"
+        whole, times = head.read_bytes(), (head.stat().st_atime_ns, head.stat().st_mtime_ns)
+        assert client.get(f"/v1/jobs/{job}/result/head.ply").content == whole
+        for damaged in (whole[:-1], whole[:-1] + b"?"):
+            head.write_bytes(damaged)
+            for name in ("head.ply", "all.zip"):
+                refused = client.get(f"/v1/jobs/{job}/result/{name}")
+                assert (refused.status_code, refused.json()["type"]) == (500, "urn:eigenhead:problem:file-damaged")
+                assert "head.ply" in refused.json()["detail"]
+        os.utime(head, ns=times)  # as where the disk itself changed it
+        await_results(client, f"{job}/head.ply")
+        assert client.get(f"/v1/jobs/{job}/result/head.ply").status_code == 500
+        assert f"{job}/head.ply" in examine(ServiceSettings(data=service.data))["results"]["detail"]
+        head.write_bytes(whole)
+        await_results(client, "all there")
+        assert client.get(f"/v1/jobs/{job}/result/head.ply").content == whole
+        assert "of 1 were compared" in examine(ServiceSettings(data=service.data))["results"]["detail"]
         shutil.rmtree(service.data / "jobs" / job)
         assert "restart the job" in client.get("/v1/jobs").json()["jobs"][0]["notice"]
         refused = client.get(f"/v1/jobs/{job}/result/head.ply")
         assert (refused.status_code, refused.json()["type"]) == (409, "urn:eigenhead:problem:result-missing")
         assert client.get(f"/v1/jobs/{job}/result").status_code == 409
-        deadline = time.monotonic() + 20
-        while job not in client.get("/readyz").json()["checks"]["results"]["detail"]:
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        await_results(client, job)
         again = client.post(f"/v1/jobs/{job}/restart").json()["id"]
         assert await_state(client, again, ("succeeded",))["files"] == files
+
+
+def await_results(client: httpx.Client, said: str) -> None:
+    """Until readiness says this of the results."""
+    deadline = time.monotonic() + 20
+    while said not in client.get("/readyz").json()["checks"]["results"]["detail"]:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 @pytest.mark.slow

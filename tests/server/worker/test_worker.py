@@ -136,6 +136,7 @@ def test_a_fit_is_published_once_whoever_publishes_it(worker: Worker, capture: s
         ("fail", "invalid-capture", ["cam00 sees nobody", "cam01 sees nobody"]),
         ("crash", "work-crashed", []),
         ("bug", "internal-error", []),
+        ("killed", "out-of-memory", []),
     ],
 )
 def test_work_that_fails_is_told_by_its_kind_and_leaves_nothing(
@@ -146,6 +147,16 @@ def test_work_that_fails_is_told_by_its_kind_and_leaves_nothing(
         worker.fit(JOB, request(capture, mode))
     assert (failed.value.kind, [fault.text for fault in failed.value.errors]) == (kind, faults)
     assert list(worker.store.folder("jobs", JOB).iterdir()) == []
+
+
+@pytest.mark.parametrize(("mode", "warnings"), [("killed once", []), ("killed below photo", ["level-lowered"])])
+def test_work_that_the_system_kills_is_done_again_and_with_less(
+    worker: Worker, capture: str, mode: str, warnings: list[str]
+) -> None:
+    worker.ingest(JOB, request(capture))
+    worker.publish(JOB, worker.fit(JOB, request(capture, mode)))
+    report = worker.store.folder("jobs", JOB) / "result" / "report.json"
+    assert [warning["code"] for warning in warnings_of(report)[2:]] == warnings
 
 
 def test_a_cancelled_job_stops_also_where_it_does_not_listen(worker: Worker, capture: str, engine: Engine) -> None:
