@@ -24,6 +24,7 @@ from server.services.failures import SERIALIZER, failure
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
 from server.services.job_rows import (
     APPLICATION,
+    DELIVERY,
     FINISHED,
     STATES,
     STATUSES,
@@ -35,6 +36,7 @@ from server.services.job_rows import (
 )
 from server.services.records import Delivery, Found, Job
 from server.services.results import Results
+from server.services.webhooks import messages_of
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
@@ -313,6 +315,13 @@ class Jobs:
         self.events.remove([job_id])
         self.client.delete_workflow(job_id)
         self.index.remove(job_id)
+
+    def forget_messages(self, jobs: Collection[str]) -> None:
+        """Removes messages to webhooks about jobs, with addresses and secrets, whether they were delivered or not."""
+        for job_id in jobs:
+            query = {"name": DELIVERY, "workflow_id_prefix": messages_of(job_id), "load_output": False}
+            if rows := self.client.list_workflows(**query, load_input=False):
+                self.client.delete_workflows([row.workflow_id for row in rows])
 
     def _requests(self, jobs: list[str]) -> dict[str, JobRequest]:
         rows = self.client.list_workflows(workflow_ids=jobs, name=WORKFLOW, load_output=False)

@@ -77,7 +77,7 @@ class Webhooks:
         ``enqueue`` is the job engine's function. ``delivered_to``: where the result lies, if it was
         delivered."""
         for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
-            identity = f"hook-{hook_id}-{job_id}-{state}"
+            identity = f"{messages_of(job_id)}{hook_id}-{state}"
             message: WebhookMessage = {
                 "webhook": hook_id,
                 "type": f"job.{state}",
@@ -141,6 +141,11 @@ class Webhooks:
                 .raise_for_status()
                 .status_code
             )
+
+
+def messages_of(job_id: str) -> str:
+    """Returns what the ids of all messages about a job begin with."""
+    return f"hook-{job_id}-"
 
 
 def _delivery(identity: str) -> EnqueueOptions:

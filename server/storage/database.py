@@ -6,6 +6,7 @@ agree on which worker is silent.
 
 import os
 import secrets
+import sqlite3
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +21,7 @@ from rig.errors import EigenheadError
 from server.settings import ServiceSettings
 
 CONNECT_S = 10  # a database that does not even refuse
+ENGINE_TABLES = ("workflow_status", "workflow_input", "workflow_output", "operation_outputs")
 SCRUB_TRIES, SCRUB_PAUSE_S = 20, 0.05
 AWAY = (OperationalError, InterfaceError, InternalError, PoolTimeout)
 """What is raised where the database does not answer. InternalError: PostgreSQL ended a transaction that was silent for
@@ -193,6 +195,13 @@ identities = sa.Table(  # one row: what a store of results knows the database by
 )
 
 
+@event.listens_for(sa.Engine, "connect")
+def _delete_securely(connection: Any, record: Any) -> None:
+    """What is erased stands in no free page of SQLite: rows of the job engine, which connects by itself, included."""
+    if isinstance(connection, sqlite3.Connection):
+        connection.execute("PRAGMA secure_delete=ON")
+
+
 def open_database(settings: ServiceSettings) -> sa.Engine:
     """Opens the service's database, creates missing tables and columns, and returns the engine. Raises
     DatabaseUnavailable."""
@@ -210,7 +219,6 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
             connection.isolation_level = "IMMEDIATE"  # a writer that starts as a reader could not wait for its turn
             connection.execute("PRAGMA busy_timeout=30000")
             connection.execute("PRAGMA journal_mode=WAL")  # kept in the file: the job engine's connections read it too
-            connection.execute("PRAGMA secure_delete=ON")  # names of people who were erased stand in no free page
             connection.execute("PRAGMA synchronous=FULL")  # WAL's default loses the last commits with the power
     else:
         patience = {"connect_timeout": CONNECT_S}
@@ -244,7 +252,8 @@ def scrub(engine: sa.Engine) -> None:
     """Overwrites what deleted rows left in the database's files, names of people included. Pages that another
     connection is reading stay until the next call."""
     if engine.dialect.name != "sqlite":
-        tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
+        tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index, batches))
+        tables += "".join(f", dbos.{name}" for name in ENGINE_TABLES)
         with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.execute(sa.text(f"VACUUM {tables}"))
         return

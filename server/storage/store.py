@@ -293,10 +293,20 @@ class Store:
         with self._change(compose("thing-capture"), identity):
             self.remove(self.folder("captures", identity))
             self.remove(self.cache_of(identity))
+            for path in (self.data / "set-aside").glob(f"captures-{identity}-*"):
+                self.remove(path)
+            for upload in self.ids("uploads"):  # its record names label and session for two days
+                if identity in self._upload_text(upload):
+                    self.remove(self.folder("uploads", upload))
             if self._index is not None:
                 self._index.drop_capture(identity)
         if self.blobs is not None:  # it may have been stored again since
             self.blobs.release(identity, later=later)
+
+    def _upload_text(self, identity: str) -> str:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            return (self.folder("uploads", identity) / "upload.json").read_text(encoding="utf-8")
+        return ""
 
     def cache_of(self, identity: str) -> Path:
         """Returns the folder in which silhouettes, thumbnails and the like of a capture are cached."""
