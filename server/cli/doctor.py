@@ -21,6 +21,7 @@ from rig.errors import EigenheadError
 from rig.text import suggest
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
+from server.storage.folders import STOPPED
 from server.storage.objects import sha256_of
 from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_compute, try_egl
@@ -75,6 +76,7 @@ def examine(settings: ServiceSettings) -> dict[str, Finding]:
         "models": _models,
         "cache": _cache,
         "database": _database,
+        "retention": _retention,
         "results": _results,
         "variables": _variables,
         "rig": _rig,
@@ -224,6 +226,11 @@ def _damaged(folder: Path, files: dict[str, dict[str, str]]) -> list[str]:
     found = ((folder / "result" / name, entry["sha256"]) for name, entry in files.items())
     there = ((path, sha256) for path, sha256 in found if path.is_file())  # the others may lie in a store
     return [f"{folder.name}/{path.name}" for path, sha256 in there if sha256_of(path) != sha256]
+
+
+def _retention(settings: ServiceSettings) -> tuple[bool, str]:
+    stopped = settings.data / STOPPED
+    return not stopped.exists(), stopped.read_text(encoding="utf-8") if stopped.exists() else "the clock is trusted"
 
 
 def _kind(settings: ServiceSettings) -> str:

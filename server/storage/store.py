@@ -9,6 +9,7 @@
     <data>/incoming/<id>/                                what is being received; swept after a crash
     <data>/trash/                                        what is being deleted
     <data>/set-aside/                                    damaged records, moved here and reported
+    <data>/last-sweep.json  retention-stopped.txt         what retention knows of the clock
 
 A folder appears under its final name in one rename, after everything in it reached the disk. What is in the data folder
 and is not named above was put there by somebody else: it is never read and never deleted.

@@ -77,6 +77,8 @@ TEMPLATES = {
     "no-worker-alive": "none alive: start one with `eigenhead worker`",
     "check-starting": "being started; ask again in a few seconds",
     "rig-described": "{kind:word}, {count} cameras",
+    "clock-trusted": "the clock is trusted",
+    "retention-stopped": "The clock has gone {days:.0f} days since the last sweep, which the machine's uptime, or what would be removed, does not bear out: nothing is removed. Set the clock right, then remove {file}.",
     "records-damaged": "{count} damaged records lie in set-aside: {names}",
     "no-record-damaged": "none damaged",
     "store-answers": "{place} answers",

@@ -97,6 +97,8 @@ export default {
   "file-damaged": "Auf der Platte verändert, seit der Auftrag sie schrieb, oder abgeschnitten: {files}. Aus einer Sicherung zurückholen oder den Auftrag neu starten.",
   "killed-for-memory": "Das System hat den Prozess des Auftrags {count}-mal mit Signal 9 beendet, wie bei knappem Speicher; er hatte bis zu {gb:.1f} GB. Dem Worker mehr Speicher geben oder weniger Aufträge zugleich rechnen.",
   "level-lowered": "Das System hat den Prozess des Auftrags zweimal beendet, wie bei knappem Speicher: dieser Kopf ist auf der Stufe photo gerechnet.",
+  "clock-trusted": "der Uhr wird vertraut",
+  "retention-stopped": "Die Uhr ist seit dem letzten Aufräumen {days:.0f} Tage weiter, was zur Laufzeit der Maschine oder zu dem, was gelöscht würde, nicht passt: nichts wird gelöscht. Die Uhr richtig stellen, dann {file} entfernen.",
   "result-missing": "Das Ergebnis ist nicht mehr im Datenordner: aus einer Sicherung zurückholen oder den Auftrag neu starten.",
   "worker-starting": "Der Worker wird gestartet.",
   "no-worker": "Kein Worker bedient die Warteschlange {queue}: einen starten mit `eigenhead worker --queue {queue_name}`.",
