@@ -126,11 +126,13 @@ def keys_remove(key_id: str, data: Data = None) -> None:
 
 @contextmanager
 def _keys(data: Path | None) -> Iterator[Any]:
-    from server.services.keys import Keys
+    from server.services.keys import Keys, note_keys
     from server.storage.database import open_database
 
-    engine = open_database(service_settings(data=data))
+    settings = service_settings(data=data)
+    engine = open_database(settings)
     try:
         yield Keys(engine)
+        note_keys(settings.data, Keys(engine))
     finally:
         engine.dispose()

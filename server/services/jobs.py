@@ -263,6 +263,12 @@ class Jobs:
         done = self.index.newest_first(STATUSES["succeeded"])
         return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
 
+    def orphans(self) -> list[str]:
+        """Lists folders of results that no job of the database has made: the database is another one, or was lost."""
+        there = [job_id for job_id in self._store.ids("jobs") if self._result(job_id).is_dir()]
+        known = {job_id for at in range(0, len(there), 500) for job_id in self.index.known(there[at : at + 500])}
+        return [job_id for job_id in there if job_id not in known]
+
     def _result(self, job_id: str) -> Path:
         return self._store.folder("jobs", job_id) / "result"
 

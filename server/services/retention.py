@@ -1,12 +1,13 @@
 """Retention: removes old jobs, captures and caches by age, by count and by free space.
 
 It never touches what a queued or running job needs, nor files that the service did not make itself. It trusts the clock
-only as far as the last sweep and the machine's uptime bear it out: where the clock seems to have jumped, nothing is removed
-until somebody has looked (``STOPPED``).
+only as far as the last sweep and the machine's uptime bear it out: where the clock seems to have jumped, nothing is
+removed until somebody has looked (``STOPPED``).
 """
 
 import json
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -84,10 +85,9 @@ def _trusts_clock(service: Service) -> bool:
         else:
             doubt = passed > 0 and _removes_half(service, passed)
         if doubt:
-            write_atomically(
-                stopped, compose("retention-stopped", days=passed / DAY_S, file=str(stopped)).text.encode()
-            )
-            log.error("nothing is removed", reason=stopped.read_text())
+            why = compose("retention-stopped", days=passed / DAY_S, file=str(stopped)).text
+            write_atomically(stopped, why.encode())
+            log.error("nothing is removed", reason=why)
         elif last["boot"] != boot and passed < 0:  # a machine whose clock is not set yet
             return not stopped.exists()
     write_atomically(path, json.dumps({"at": now, "up": up, "boot": boot}).encode())
@@ -96,6 +96,7 @@ def _trusts_clock(service: Service) -> bool:
 
 def _removes_half(service: Service, passed_s: float) -> bool:
     s = service.settings
+    ages: list[tuple[float | None, Iterable[str | None]]]
     ages = [(s.keep_captures_days, (record.created for record in service.store.captures()))]
     if s.keep_results_days is not None:
         finished = (job for state in FINISHED for job in service.jobs.find(state=state, limit=100_000))
@@ -262,8 +263,10 @@ def _find_missing(service: Service) -> None:
         with suppress(EigenheadError):  # removed, or missing
             service.jobs.results.compare(job_id, service.jobs.files(job_id))
     damaged.intersection_update({name for name in damaged if name.partition("/")[0] in done})
-    detail = compose("results-complete")
-    if missing:
+    detail, orphans = compose("results-complete"), service.jobs.orphans()
+    if orphans:
+        detail = compose("results-orphaned", count=len(orphans), jobs=orphans[:3])
+    elif missing:
         detail = compose("results-missing", count=len(missing), jobs=missing[:3])
     elif damaged:
         detail = compose("file-damaged", files=sorted(damaged)[:3])

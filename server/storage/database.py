@@ -33,11 +33,12 @@ metadata = sa.MetaData()
 class DatabaseUnavailable(EigenheadError):
     """Reports that the database does not answer, or is damaged."""
 
-    def __init__(self, place: str, error: SQLAlchemyError) -> None:
+    def __init__(self, place: str, error: Exception) -> None:
         why = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
-        super().__init__(
-            f"the job database at {place} cannot be used ({why}): start it, or mend EIGENHEAD_DATABASE_URL"
-        )
+        what = "start it, or mend EIGENHEAD_DATABASE_URL"
+        if "://" not in place:  # SQLite in the data folder
+            what = "keep the file, restore a copy of it, and see `eigenhead doctor`"
+        super().__init__(f"the job database at {place} cannot be used ({why}): {what}")
 
 
 events = sa.Table(
@@ -226,9 +227,21 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
     try:
         metadata.create_all(engine)
         _add_columns(engine)
-    except SQLAlchemyError as error:
+    except (SQLAlchemyError, sqlite3.Error) as error:
         raise DatabaseUnavailable(settings.place, error) from error
     return engine
+
+
+def check_pages(engine: sa.Engine, place: str) -> None:
+    """Raises DatabaseUnavailable for an SQLite file whose pages are damaged, the job engine's tables included."""
+    if engine.dialect.name == "sqlite":
+        try:
+            with engine.connect() as connection:
+                said = connection.scalar(sa.text("PRAGMA quick_check(1)"))
+        except SQLAlchemyError as error:
+            raise DatabaseUnavailable(place, error) from error
+        if said != "ok":
+            raise DatabaseUnavailable(place, ValueError(said))
 
 
 def _add_columns(engine: sa.Engine) -> None:

@@ -10,6 +10,7 @@
     <data>/trash/                                        what is being deleted
     <data>/set-aside/                                    damaged records, moved here and reported
     <data>/last-sweep.json  retention-stopped.txt         what retention knows of the clock
+    <data>/has-keys                                      see server.services.keys
 
 A folder appears under its final name in one rename, after everything in it reached the disk. What is in the data folder
 and is not named above was put there by somebody else: it is never read and never deleted.

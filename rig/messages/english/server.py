@@ -84,6 +84,7 @@ TEMPLATES = {
     "store-answers": "{place} answers",
     "store-none": "captures and results lie in the data folder",
     "results-missing": "{count} jobs have no result folder any more: {jobs}",
+    "results-orphaned": "{count} results are of no job in the database, which was lost or is another: {jobs}; restore it",
     "results-complete": "all there",
     "capture-in-use": "Jobs that are queued or running need this capture; cancel them first.",
     "job-named": "job {job}",
