@@ -59,6 +59,7 @@ PROBLEM_TYPES = {
     "too-few-shots": "Too few shots",
     "too-late": "Too late",
     "too-many-checks": "Too many checks",
+    "too-many-uploads": "Too many uploads",
     "too-many-batches": "Too many batches",
     "too-many-jobs": "Too many jobs",
     "upload-busy": "Upload busy",

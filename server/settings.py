@@ -105,6 +105,7 @@ class ServiceSettings(BaseSettings):
     image_pixels: int = Field(default=64_000_000, ge=1, description="pixels of the largest picture of a capture")
     free_bytes: int = Field(default=256 << 20, ge=0, description="disk space that uploads and jobs must leave")
     jobs_per_key: int = Field(default=200, ge=1, description="queued and running jobs of one API key")
+    uploads_per_key: int = Field(default=100, ge=1, description="unfinished resumable uploads of one API key")
     batches_per_key: int = Field(default=100, ge=1, description="unfinished batches of one API key")
     batch_captures: int = Field(default=10_000, ge=1, description="the most captures of one batch")
     checks_at_once: int = Field(default=2, ge=1, description="processes that unpack and check uploads")

@@ -45,6 +45,7 @@ TEMPLATES = {
     "job-without-result": "The job is {state:word}; it has no result.",
     "job-active": "The job is queued or running; cancel it first.",
     "too-many-jobs": "{count} jobs are queued or running for this key, which is the most; wait for one to end.",
+    "too-many-uploads": "{count} uploads of this key are unfinished, which is the most; end or discard one.",
     "capture-missing": "Its pictures are neither in the data folder nor in the store of captures: restore them from a "
     "backup, or remove the capture.",
     "result-missing": "Its result is not in the data folder any more: restore it from a backup, or restart the job.",

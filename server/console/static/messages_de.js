@@ -100,6 +100,7 @@ export default {
   "clock-trusted": "der Uhr wird vertraut",
   "retention-stopped": "Die Uhr ist seit dem letzten Aufräumen {days:.0f} Tage weiter, was zur Laufzeit der Maschine oder zu dem, was gelöscht würde, nicht passt: nichts wird gelöscht. Die Uhr richtig stellen, dann {file} entfernen.",
   "results-orphaned": "{count} Ergebnisse gehören zu keinem Auftrag der Datenbank, die verloren ging oder eine andere ist: {jobs}; sie wiederherstellen",
+  "too-many-uploads": "{count} Uploads dieses Schlüssels sind unfertig, mehr darf er nicht; einen beenden oder verwerfen.",
   "result-missing": "Das Ergebnis ist nicht mehr im Datenordner: aus einer Sicherung zurückholen oder den Auftrag neu starten.",
   "worker-starting": "Der Worker wird gestartet.",
   "no-worker": "Kein Worker bedient die Warteschlange {queue}: einen starten mit `eigenhead worker --queue {queue_name}`.",
