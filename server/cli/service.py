@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from server.cli.answers import Data, Json, answer, progress_bar, service_settings
+from server.settings import ServiceSettings
 
 app = typer.Typer(rich_markup_mode=None)
 keys_app = typer.Typer(help="API keys of the service.", no_args_is_help=True, rich_markup_mode=None)
@@ -42,15 +43,34 @@ def worker(
     data: Data = None,
     queue: Annotated[str | None, typer.Option(help="The queue to serve.")] = None,
     concurrency: Annotated[int | None, typer.Option(help="Jobs at once.", min=1)] = None,
+    check: Annotated[bool, typer.Option("--check", help="Run none; fail if none of this host is alive.")] = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
 ) -> None:
     """Run a worker that takes jobs from the service's queue."""
+    settings = service_settings(data=data, queue=queue, concurrency=concurrency)
+    if check:
+        sys.exit(not _worker_lives(settings))
     from server.log import set_up
     from server.worker.worker import run_worker
 
-    settings = service_settings(data=data, queue=queue, concurrency=concurrency)
     set_up(settings.log_json, jobs=settings.data / "jobs")
     run_worker(settings, until_eof=until_eof)
+
+
+def _worker_lives(settings: ServiceSettings) -> bool:
+    """Tells whether a worker of this host is alive; yes where the database does not answer, which workers outlast."""
+    import platform
+
+    import sqlalchemy as sa
+
+    from server.storage.database import DatabaseUnavailable, alive_workers, open_database, workers
+
+    try:
+        with open_database(settings).connect() as connection:
+            query = sa.select(workers.c.id).where(alive_workers(connection, settings.silent_s))
+            return connection.scalar(query.where(workers.c.host == platform.node())) is not None
+    except DatabaseUnavailable:
+        return True
 
 
 @app.command(epilog="Example: eigenhead prepare")
