@@ -21,6 +21,7 @@ from sqlalchemy.exc import OperationalError
 
 from rig.formats.captures.archive import pack_folder
 from server.settings import ServiceSettings
+from tests.support.attacks import process_tree
 from tests.support.postgres import running_postgres
 from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture, worker_pids
 
@@ -68,7 +69,7 @@ def submit(service: RunningService, capture: str, number: int, settings: dict[st
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
 @pytest.mark.parametrize(("total", "kills"), [(12, 4), pytest.param(100, 30, marks=NIGHTLY)])
 def test_jobs_survive_kills(kind: str, total: int, kills: int, tmp_path: Path) -> None:
-    """Every third kill takes the service, the others its workers."""
+    """In turn a worker, the child that does its work, the service, and PostgreSQL, which then restarts itself."""
     rng = random.Random(20240501)
     with (
         database(kind) as settings,
@@ -83,18 +84,21 @@ def test_jobs_survive_kills(kind: str, total: int, kills: int, tmp_path: Path) -
             time.sleep(rng.uniform(0.2, 2.0))
             if number < total // 2:
                 jobs.append(submit(service, capture, total // 2 + number))
-            if number % 3 == 2:
+            if number % 4 == 2:
                 service.kill()
                 service.start()
+            elif number % 4 == 3 and settings:
+                kill_a_session(settings["database_url"])
             else:
                 for pid in worker_pids(service):
-                    os.kill(pid, signal.SIGKILL)
+                    for victim in process_tree(pid)[1:] if number % 4 == 1 else [pid]:
+                        os.kill(victim, signal.SIGKILL)
         jobs += [submit(service, capture, number) for number in range(total // 2 + kills, total)]
         assert len(set(jobs)) == total
         with httpx.Client(base_url=service.url, timeout=30) as client:
-            for job in jobs:
-                done = await_state(client, job, ("succeeded", "failed", "cancelled"), 240)
-                assert (done["state"], done["files"]) == ("succeeded", undisturbed)
+            ended = [await_state(client, job, ("succeeded", "failed", "cancelled"), 240) for job in jobs]
+            assert [(job["state"], job["files"]) for job in ended] == [("succeeded", undisturbed)] * total
+            assert [job["finished"] for job in ended] == sorted(job["finished"] for job in ended), "places are kept"
             listed = client.get("/v1/jobs", params={"limit": 1000}).json()["jobs"]
         assert sorted(job["id"] for job in listed) == sorted(jobs)
         heads = {
@@ -136,6 +140,15 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
         ended = [await_state(client, job, ("succeeded", "failed", "cancelled"), 240) for job in jobs]
         assert [job["state"] for job in ended] == ["succeeded"] * total
         assert [files_of(job) for job in ended] == [undisturbed] * total
+
+
+def kill_a_session(url: str) -> None:
+    """SIGKILL of one of PostgreSQL's processes: the server then ends all of them and recovers from its log."""
+    engine = sa.create_engine(ServiceSettings(database_url=url).url)
+    with engine.connect() as connection:
+        mine = "datname IS NOT NULL AND pid != pg_backend_pid()"
+        os.kill(connection.scalar(sa.text(f"SELECT pid FROM pg_stat_activity WHERE {mine} LIMIT 1")), signal.SIGKILL)
+    engine.dispose()
 
 
 def files_of(job: dict[str, Any]) -> dict[str, str]:
