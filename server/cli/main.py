@@ -75,6 +75,10 @@ def main() -> None:
         app()
     except EigenheadError as error:
         fail(str(error))
+    except MemoryError as error:
+        fail(
+            f"this needs more memory than the machine gives ({error}): a file is larger than it may be, or not what it says"
+        )
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
