@@ -76,9 +76,7 @@ def main() -> None:
     except EigenheadError as error:
         fail(str(error))
     except MemoryError as error:
-        fail(
-            f"this needs more memory than the machine gives ({error}): a file is larger than it may be, or not what it says"
-        )
+        fail(f"more memory is needed than there is ({error}): a file is too large, or not what it says")
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:

@@ -19,8 +19,7 @@ import httpx
 import pytest
 
 from rig.formats.captures.archive import pack_folder
-from server.address import is_loopback
-from server.services.keys import SCOPES, KeylessAddress, Keys, check_address
+from server.services.keys import SCOPES, Keys
 from server.settings import ServiceSettings
 from server.storage.database import open_database
 from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture
@@ -138,29 +137,7 @@ def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]
             client.post(f"/v1/jobs/{response.json()['id']}/cancel")
 
 
-def test_the_secret_is_not_stored(guarded: tuple[RunningService, dict[str, str]]) -> None:
-    service, keys = guarded
-    stored = b"".join(path.read_bytes() for path in service.data.glob("eigenhead.sqlite*"))
-    for key in keys.values():
-        assert key.split("_", 2)[2].encode() not in stored
-
-
 def test_no_listening_elsewhere_without_a_key(tmp_path: Path) -> None:
-    assert [is_loopback(host) for host in ("127.0.0.1", "::1", "localhost", "0.0.0.0", "10.0.0.7", "::")] == [
-        *[True] * 3,
-        *[False] * 3,
-    ]
-    open_ = ServiceSettings(data=tmp_path, host="0.0.0.0")
-    proxied = ServiceSettings(data=tmp_path, public_url="https://heads.example")
-    engine = open_database(open_)
-    with pytest.raises(KeylessAddress, match=r"0\.0\.0\.0"):
-        check_address(open_, Keys(engine))
-    with pytest.raises(KeylessAddress, match=r"https://heads\.example"):
-        check_address(proxied, Keys(engine))
-    Keys(engine).add("console", ("read",))
-    check_address(open_, Keys(engine))
-    check_address(proxied, Keys(engine))
-    engine.dispose()
     command = [sys.executable, "-m", "server.cli", "serve", "--host", "0.0.0.0", "--port", "0"]
     refused = subprocess.run(
         command,
