@@ -2,8 +2,7 @@
 to write it."""
 
 import sqlite3
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
 import httpx
@@ -11,20 +10,13 @@ import pytest
 
 from server.cli.client import Client
 from server.storage.events import END
-from tests.support.services import RunningService, await_state, upload
+from tests.support.services import RunningService, await_state, await_true, upload
 
 
 @contextmanager
 def database(service: RunningService) -> Iterator[sqlite3.Connection]:
     with closing(sqlite3.connect(service.data / "eigenhead.sqlite", timeout=30, isolation_level=None)) as connection:
         yield connection
-
-
-def await_true(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 def ends(service: RunningService, job: str) -> list[tuple[int, str]]:

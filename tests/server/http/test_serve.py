@@ -11,17 +11,22 @@ from pathlib import Path
 import httpx
 
 from tests.support.attacks import add_keys
-from tests.support.services import ROOT, RunningService, await_state, running_service, uploaded_capture, worker_pids
+from tests.support.services import (
+    ROOT,
+    RunningService,
+    await_state,
+    await_true,
+    running_service,
+    uploaded_capture,
+    worker_pids,
+)
 
 
 def test_a_signal_to_the_whole_group_ends_both_without_a_word_of_dying(tmp_path: Path) -> None:
     """As `timeout`, a container's runtime or a supervisor sends it."""
     with running_service(tmp_path / "data", forked=False) as service:
         assert service.process is not None
-        deadline = time.monotonic() + 60.0
-        while "worker ready" not in service.log_end():
-            assert time.monotonic() < deadline, "no worker was ready"
-            time.sleep(0.05)
+        await_true(lambda: "worker ready" in service.log_end(), 60.0)
         os.killpg(service.process.pid, signal.SIGTERM)
         service.process.wait(15)
         assert worker_pids(service) == []
@@ -44,10 +49,7 @@ def test_a_lost_database_is_told_and_opens_nothing(tmp_path: Path) -> None:
             assert "restore a copy" in refusal(service)
         database.write_bytes(b"")
         service.start()
-        deadline = time.monotonic() + 20
-        while job not in httpx.get(service.url + "/readyz").json()["checks"]["results"]["detail"]:
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        await_true(lambda: job in httpx.get(service.url + "/readyz").json()["checks"]["results"]["detail"], 20)
         add_keys(service, "admin")
         service.stop()
         service.start()  # which notes that there are keys

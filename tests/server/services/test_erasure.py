@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.support.services import RunningService, await_state, packed_capture, running_service
+from tests.support.services import RunningService, await_state, packed_capture, running_service, served_client
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,7 @@ def test_nothing_that_the_subject_brought_is_left(tmp_path: Path) -> None:
     secret = base64.b64encode(b"of quast, of thirty-two bytes or so").decode()
     who, ink, profile, smirk, tag, head, tus, run = (f"quast{number}-brought" for number in range(8))
     brought = [who, ink, profile, smirk, tag, head, tus, run, f"{HOOK}/quast", secret]
-    with (
-        running_service(tmp_path / "data", webhook_origins=f'["{HOOK}"]') as service,
-        httpx.Client(base_url=service.url, timeout=30) as client,
-    ):
+    with served_client(tmp_path / "data", webhook_origins=f'["{HOOK}"]') as (service, client):
         session = client.post("/v1/sessions", json={"label": who, "consent": ink}).json()["id"]
         fields = {"session": session, "label": profile, "expression": smirk, "tags": tag}
         captures = [upload(client, tmp_path, seed, **fields).json()["id"] for seed in (5, 6)]

@@ -19,7 +19,13 @@ from server.services.service import open_service
 from server.settings import ServiceSettings
 from server.storage.records import CaptureRecord
 from server.storage.store import new_id
-from tests.support.services import RunningService, await_state, running_service, small_capture
+from tests.support.services import (
+    RunningService,
+    await_state,
+    await_true,
+    served_client,
+    small_capture,
+)
 
 
 @pytest.fixture
@@ -33,19 +39,13 @@ def upload(service: RunningService, data: bytes) -> str:
 
 
 def await_gone(client: httpx.Client, path: str, timeout_s: float = 60.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while client.get(path).status_code != 404:
-        assert time.monotonic() < deadline, f"{path} stays"
-        time.sleep(0.1)
+    await_true(lambda: client.get(path).status_code == 404, timeout_s)
 
 
 def test_a_clock_that_jumps_stops_retention_until_somebody_looked(tmp_path: Path, capture_file: bytes) -> None:
     """What a sweep knows of the one before is set back, as if the clock had gone forward since; the capture too, since
     the tests' clock stays."""
-    with (
-        running_service(tmp_path / "data", worker=False, keep_captures_days="30", sweep_s="0.2") as service,
-        httpx.Client(base_url=service.url, timeout=30) as client,
-    ):
+    with served_client(tmp_path / "data", worker=False, keep_captures_days="30", sweep_s="0.2") as (service, client):
         old, new = upload(service, capture_file), upload(service, capture_file)
         last, stopped = service.data / "last-sweep.json", service.data / "retention-stopped.txt"
         await_readiness(client, "retention", "the clock is trusted")
@@ -99,10 +99,7 @@ def set_back(service: RunningService, capture: str, days: float) -> None:
 @pytest.mark.slow
 def test_old_captures_go_unless_a_job_needs_them(tmp_path: Path, capture_file: bytes) -> None:
     age = str(8 / 86400)
-    with (
-        running_service(tmp_path / "data", keep_captures_days=age, sweep_s="0.3") as service,
-        httpx.Client(base_url=service.url, timeout=30) as client,
-    ):
+    with served_client(tmp_path / "data", keep_captures_days=age, sweep_s="0.3") as (service, client):
         needed, idle = upload(service, capture_file), upload(service, capture_file)
         job = client.post("/v1/jobs", json={"capture_id": needed, "settings": {"front": "long"}}).json()["id"]
         await_gone(client, f"/v1/captures/{idle}")
@@ -113,10 +110,7 @@ def test_old_captures_go_unless_a_job_needs_them(tmp_path: Path, capture_file: b
 
 @pytest.mark.slow
 def test_only_the_newest_results_stay(tmp_path: Path, capture_file: bytes) -> None:
-    with (
-        running_service(tmp_path / "data", keep_jobs="2", sweep_s="0.3") as service,
-        httpx.Client(base_url=service.url, timeout=30) as client,
-    ):
+    with served_client(tmp_path / "data", keep_jobs="2", sweep_s="0.3") as (service, client):
         capture = upload(service, capture_file)
         jobs = [client.post("/v1/jobs", json={"capture_id": capture}).json()["id"] for _ in range(4)]
         await_state(client, jobs[-1], ("succeeded",))
@@ -129,10 +123,7 @@ def test_only_the_newest_results_stay(tmp_path: Path, capture_file: bytes) -> No
 
 def test_a_result_that_somebody_changed_or_removed_is_told_and_never_sent(tmp_path: Path, capture_file: bytes) -> None:
     """In the job, in the list, by readiness, by doctor; a restart makes it again."""
-    with (
-        running_service(tmp_path / "data", sweep_s="0.3") as service,
-        httpx.Client(base_url=service.url, timeout=30) as client,
-    ):
+    with served_client(tmp_path / "data", sweep_s="0.3") as (service, client):
         capture = upload(service, capture_file)
         job = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
         files = await_state(client, job, ("succeeded",))["files"]
@@ -166,20 +157,15 @@ def test_a_result_that_somebody_changed_or_removed_is_told_and_never_sent(tmp_pa
 
 def await_readiness(client: httpx.Client, check: str, said: str) -> None:
     """Until readiness says this of a check."""
-    deadline = time.monotonic() + 20
-    while said not in client.get("/readyz").json()["checks"][check]["detail"]:
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    await_true(lambda: said in client.get("/readyz").json()["checks"][check]["detail"], 20)
 
 
 @pytest.mark.slow
 def test_a_result_that_waits_to_be_delivered_stays(tmp_path: Path, capture_file: bytes) -> None:
     nas = tmp_path / "nas"  # not mounted yet
-    with (
-        running_service(
-            tmp_path / "data", keep_jobs="0", sweep_s="0.3", deliver_prefixes=f'["file://{nas}/"]'
-        ) as service,
-        httpx.Client(base_url=service.url, timeout=30) as client,
+    with served_client(tmp_path / "data", keep_jobs="0", sweep_s="0.3", deliver_prefixes=f'["file://{nas}/"]') as (
+        service,
+        client,
     ):
         wanted = {"capture_id": upload(service, capture_file), "deliver_to": f"file://{nas}/"}
         job = client.post("/v1/jobs", json=wanted).json()["id"]

@@ -23,7 +23,17 @@ from rig.formats.captures.archive import pack_folder
 from server.settings import ServiceSettings
 from tests.support.attacks import process_tree
 from tests.support.postgres import running_postgres
-from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture, worker_pids
+from tests.support.services import (
+    ROOT,
+    RunningService,
+    await_state,
+    await_true,
+    running_service,
+    served_client,
+    small_capture,
+    uploaded_capture,
+    worker_pids,
+)
 
 NIGHTLY = pytest.mark.nightly
 
@@ -35,14 +45,6 @@ def database(kind: str) -> Iterator[dict[str, Any]]:
         return
     with running_postgres() as url:
         yield {"database_url": url}
-
-
-def make_capture(service: RunningService, folder: Path) -> str:
-    pack_folder(small_capture(folder), folder.with_suffix(".tar"))
-    with folder.with_suffix(".tar").open("rb") as stream:
-        response = httpx.post(service.url + "/v1/captures/uploads", files={"file": stream}, timeout=60)
-    assert response.status_code == 201, response.text
-    return response.json()["id"]
 
 
 def submit(service: RunningService, capture: str, number: int, settings: dict[str, Any] | None = None) -> str:
@@ -75,7 +77,7 @@ def test_jobs_survive_kills(kind: str, total: int, kills: int, tmp_path: Path) -
         database(kind) as settings,
         running_service(tmp_path / "data", silent_s="5", tiny_s="0.3", jobs_per_key="1000", **settings) as service,
     ):
-        capture = make_capture(service, tmp_path / "capture")
+        capture = uploaded_capture(service, tmp_path)
         jobs = [submit(service, capture, 0)]
         with httpx.Client(base_url=service.url) as client:
             undisturbed = await_state(client, jobs[0], ("succeeded",), 60)["files"]
@@ -116,11 +118,9 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
     """Reconstructions of a simulated shot, SIGKILLs into one that runs: every second one takes the service, too.
     report.json tells times of its own; every other file is the undisturbed one."""
     rng = random.Random(4)
-    with (
-        running_service(
-            tmp_path / "data", work="server.tasks.reconstruct:reconstruct_capture", silent_s="5"
-        ) as service,
-        httpx.Client(base_url=service.url, timeout=120) as client,
+    with served_client(tmp_path / "data", work="server.tasks.reconstruct:reconstruct_capture", silent_s="5") as (
+        service,
+        client,
     ):
         capture = client.post("/v1/captures", json={"seed": 1}).json()["id"]
         settings = {"detail": "span", "outputs": {"surface": "head"}}
@@ -167,10 +167,7 @@ def files_of(job: dict[str, Any]) -> dict[str, str]:
 
 def await_running(client: httpx.Client, jobs: list[str]) -> None:
     """Until one of the jobs runs."""
-    deadline = time.monotonic() + 60
-    while all(client.get(f"/v1/jobs/{job}").json()["state"] != "running" for job in jobs):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    await_true(lambda: not all(client.get(f"/v1/jobs/{job}").json()["state"] != "running" for job in jobs), 60)
 
 
 @contextmanager
@@ -241,7 +238,7 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
         running_service(tmp_path / "data", worker=False, tiny_s="3", **settings) as service,
         httpx.Client(base_url=service.url, timeout=30) as client,
     ):
-        capture = make_capture(service, tmp_path / "capture")
+        capture = uploaded_capture(service, tmp_path)
         with pinned_worker(service) as first:
             job = submit(service, capture, 0)
             await_state(client, job, ("running",))
@@ -288,7 +285,7 @@ def test_killed_uploads_and_restarts_keep_what_was_accepted(tmp_path: Path) -> N
 
 def test_a_damaged_record_is_set_aside_and_reported_and_strangers_files_stay(tmp_path: Path) -> None:
     with running_service(tmp_path / "data", worker=False, sweep_s="0.2") as service:
-        kept, damaged = (make_capture(service, tmp_path / name) for name in ("one", "two"))
+        kept, damaged = (uploaded_capture(service, tmp_path, seed) for seed in (1, 2))
         (service.data / "captures" / damaged / "record.json").write_text('{"format": "eigenhead-capt')
         (service.data / "captures" / "mine").mkdir()
         (service.data / "captures" / "mine" / "notes.txt").write_text("not yours")
