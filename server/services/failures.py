@@ -58,8 +58,7 @@ DefaultSerializer.deserialize = _read_pickled
 def restored(error: Exception | None) -> JobFailed | None:
     """Returns the JobFailed that the job engine kept as ``error``; None for any other error."""
     if isinstance(error, PortableWorkflowError) and error.name == JobFailed.__name__ and isinstance(error.data, dict):
-        kept: dict[str, Any] = error.data
-        return JobFailed(kept["kind"], kept["detail"], kept["errors"])
+        return JobFailed(**error.data)
     return error if isinstance(error, JobFailed) else None
 
 

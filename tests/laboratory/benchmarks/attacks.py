@@ -65,7 +65,10 @@ def run() -> dict[str, Any]:
     """Runs all attacks. Returns the figures and a line for each attack."""
     with tempfile.TemporaryDirectory(prefix="eigenhead-attacks-") as name:
         folder = Path(name)
-        allowed = {"webhook_origins": '["https://*"]', "deliver_prefixes": f'["file://{folder}/heads/"]'}
+        allowed: dict[str, Any] = {
+            "webhook_origins": '["https://*"]',
+            "deliver_prefixes": f'["file://{folder}/heads/"]',
+        }
         with running_service(folder / "data", worker=False, **allowed) as service:
             open_to_all = http_status(service, "POST", "/v1/keys", {"name": "mine", "scopes": ["admin"]})
             rows = [Seen("first key over HTTP", "403", str(open_to_all), open_to_all == 403)]

@@ -21,7 +21,7 @@ from rig.formats.captures.archive import pack_folder
 from tests.rig.formats.captures.test_archive import HOSTILE
 from tests.support.attacks import process_tree
 from tests.support.disks import small_disk
-from tests.support.services import RunningService, await_state, running_service, served_client, small_capture
+from tests.support.services import RunningService, await_state, packed, running_service, served_client, small_capture
 
 MEMORY_MOST = 1 << 30
 
@@ -155,8 +155,7 @@ def bodies(tmp_path: Path) -> Iterator[tuple[str, bytes, str]]:
     for number, (case, (spoil, word)) in enumerate(SPOILT.items()):
         folder = small_capture(tmp_path / f"spoilt{number}")
         spoil(folder)
-        pack_folder(folder, folder.with_suffix(".tar"))
-        yield case, folder.with_suffix(".tar").read_bytes(), word
+        yield case, packed(folder), word
 
 
 def peak_memory(service: RunningService) -> int:
@@ -216,9 +215,7 @@ def fill(disk: Path, leave: int) -> Path:
 @pytest.mark.timeout(300)
 def test_a_full_disk_is_said_and_survived(tmp_path: Path) -> None:
     """During an upload, a fit and the writing of a result; afterwards everything is listed, deletable, and works."""
-    folder = small_capture(tmp_path / "capture", size=200)
-    pack_folder(folder, tmp_path / "capture.tar")
-    data = (tmp_path / "capture.tar").read_bytes()
+    data = packed(small_capture(tmp_path / "capture", size=200))
     with (
         small_disk(tmp_path / "disk", 48) as disk,
         running_service(disk / "data", free_bytes="0", tiny_s="1.5", tiny_bytes=str(6 << 20)) as service,

@@ -11,7 +11,6 @@ import httpx
 import pytest
 
 from rig.atomic_write import write_atomically
-from rig.formats.captures.archive import pack_folder
 from server.cli.doctor import examine
 from server.metrics import Metrics
 from server.services.retention import sweep
@@ -19,7 +18,7 @@ from server.services.service import open_service
 from server.settings import ServiceSettings
 from server.storage.records import CaptureRecord
 from server.storage.store import new_id
-from tests.support.services import (
+from tests.support.services import uploaded_capture, (
     RunningService,
     await_state,
     await_true,
@@ -28,25 +27,15 @@ from tests.support.services import (
 )
 
 
-@pytest.fixture
-def capture_file(tmp_path: Path) -> bytes:
-    pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
-    return (tmp_path / "capture.tar").read_bytes()
-
-
-def upload(service: RunningService, data: bytes) -> str:
-    return httpx.post(service.url + "/v1/captures/uploads", files={"file": data}, timeout=30).json()["id"]
-
-
 def await_gone(client: httpx.Client, path: str, timeout_s: float = 60.0) -> None:
     await_true(lambda: client.get(path).status_code == 404, timeout_s)
 
 
-def test_a_clock_that_jumps_stops_retention_until_somebody_looked(tmp_path: Path, capture_file: bytes) -> None:
+def test_a_clock_that_jumps_stops_retention_until_somebody_looked(tmp_path: Path) -> None:
     """What a sweep knows of the one before is set back, as if the clock had gone forward since; the capture too, since
     the tests' clock stays."""
     with served_client(tmp_path / "data", worker=False, keep_captures_days="30", sweep_s="0.2") as (service, client):
-        old, new = upload(service, capture_file), upload(service, capture_file)
+        old, new = uploaded_capture(service, tmp_path), uploaded_capture(service, tmp_path)
         last, stopped = service.data / "last-sweep.json", service.data / "retention-stopped.txt"
         await_readiness(client, "retention", "the clock is trusted")
         note_sweep(last, days=0.9)  # as after a laptop's night: an ordinary sweep goes on
@@ -97,10 +86,10 @@ def set_back(service: RunningService, capture: str, days: float) -> None:
 
 
 @pytest.mark.slow
-def test_old_captures_go_unless_a_job_needs_them(tmp_path: Path, capture_file: bytes) -> None:
+def test_old_captures_go_unless_a_job_needs_them(tmp_path: Path) -> None:
     age = str(8 / 86400)
     with served_client(tmp_path / "data", keep_captures_days=age, sweep_s="0.3") as (service, client):
-        needed, idle = upload(service, capture_file), upload(service, capture_file)
+        needed, idle = uploaded_capture(service, tmp_path), uploaded_capture(service, tmp_path)
         job = client.post("/v1/jobs", json={"capture_id": needed, "settings": {"front": "long"}}).json()["id"]
         await_gone(client, f"/v1/captures/{idle}")
         assert client.get(f"/v1/captures/{needed}").status_code == 200
@@ -109,9 +98,9 @@ def test_old_captures_go_unless_a_job_needs_them(tmp_path: Path, capture_file: b
 
 
 @pytest.mark.slow
-def test_only_the_newest_results_stay(tmp_path: Path, capture_file: bytes) -> None:
+def test_only_the_newest_results_stay(tmp_path: Path) -> None:
     with served_client(tmp_path / "data", keep_jobs="2", sweep_s="0.3") as (service, client):
-        capture = upload(service, capture_file)
+        capture = uploaded_capture(service, tmp_path)
         jobs = [client.post("/v1/jobs", json={"capture_id": capture}).json()["id"] for _ in range(4)]
         await_state(client, jobs[-1], ("succeeded",))
         for job in jobs[:2]:
@@ -121,10 +110,10 @@ def test_only_the_newest_results_stay(tmp_path: Path, capture_file: bytes) -> No
             assert client.get(f"/v1/jobs/{job}/result/head.ply").status_code == 200
 
 
-def test_a_result_that_somebody_changed_or_removed_is_told_and_never_sent(tmp_path: Path, capture_file: bytes) -> None:
+def test_a_result_that_somebody_changed_or_removed_is_told_and_never_sent(tmp_path: Path) -> None:
     """In the job, in the list, by readiness, by doctor; a restart makes it again."""
     with served_client(tmp_path / "data", sweep_s="0.3") as (service, client):
-        capture = upload(service, capture_file)
+        capture = uploaded_capture(service, tmp_path)
         job = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
         files = await_state(client, job, ("succeeded",))["files"]
         assert client.get(f"/v1/jobs/{job}").json()["notice"] is None
@@ -161,13 +150,13 @@ def await_readiness(client: httpx.Client, check: str, said: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_result_that_waits_to_be_delivered_stays(tmp_path: Path, capture_file: bytes) -> None:
+def test_a_result_that_waits_to_be_delivered_stays(tmp_path: Path) -> None:
     nas = tmp_path / "nas"  # not mounted yet
     with served_client(tmp_path / "data", keep_jobs="0", sweep_s="0.3", deliver_prefixes=f'["file://{nas}/"]') as (
         service,
         client,
     ):
-        wanted = {"capture_id": upload(service, capture_file), "deliver_to": f"file://{nas}/"}
+        wanted = {"capture_id": uploaded_capture(service, tmp_path), "deliver_to": f"file://{nas}/"}
         job = client.post("/v1/jobs", json=wanted).json()["id"]
         await_state(client, job, ("succeeded",))
         time.sleep(2.0)

@@ -19,7 +19,6 @@ import sqlalchemy as sa
 from psycopg.errors import LockNotAvailable
 from sqlalchemy.exc import OperationalError
 
-from rig.formats.captures.archive import pack_folder
 from server.settings import ServiceSettings
 from tests.support.attacks import process_tree
 from tests.support.postgres import running_postgres
@@ -28,6 +27,7 @@ from tests.support.services import (
     RunningService,
     await_state,
     await_true,
+    packed,
     running_service,
     served_client,
     small_capture,
@@ -260,9 +260,7 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
 def test_killed_uploads_and_restarts_keep_what_was_accepted(tmp_path: Path) -> None:
     """The service is killed while uploads run; every accepted capture is there afterwards, whole, and no other."""
     with running_service(tmp_path / "data", worker=False) as service:
-        folder = small_capture(tmp_path / "capture")
-        pack_folder(folder, tmp_path / "capture.tar")
-        data, accepted, rng = (tmp_path / "capture.tar").read_bytes(), [], random.Random(1)
+        data, accepted, rng = packed(small_capture(tmp_path / "capture")), [], random.Random(1)
         for _ in range(6):
             killer = subprocess.Popen(["sleep", str(rng.uniform(0.05, 1.0))])
             while killer.poll() is None:
