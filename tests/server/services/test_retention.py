@@ -18,12 +18,12 @@ from server.services.service import open_service
 from server.settings import ServiceSettings
 from server.storage.records import CaptureRecord
 from server.storage.store import new_id
-from tests.support.services import uploaded_capture, (
+from tests.support.services import (
     RunningService,
     await_state,
     await_true,
     served_client,
-    small_capture,
+    uploaded_capture,
 )
 
 
