@@ -57,13 +57,3 @@ def test_the_end_of_a_job_that_kills_its_workers_is_written_too(
     await_true(lambda: ends(service, job) == [(END, "failed")])
     with database(service) as connection:  # what other tests count
         connection.execute("UPDATE workflow_status SET status = 'SUCCESS' WHERE workflow_uuid = ?", (job,))
-
-
-def test_a_cancelled_job_ends_as_cancelled(
-    service: RunningService, http: httpx.Client, client: Client, archive: bytes
-) -> None:
-    job = client.submit(upload(http, archive).json()["id"], settings={"front": "long"})["id"]
-    await_state(http, job, ("running",))
-    for _ in range(2):
-        assert http.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
-    assert ends(service, job) == [(END, "cancelled")]

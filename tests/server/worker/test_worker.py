@@ -159,15 +159,6 @@ def test_work_that_the_system_kills_is_done_again_and_with_less(
     assert [warning["code"] for warning in warnings_of(report)[2:]] == warnings
 
 
-def test_a_cancelled_job_stops_also_where_it_does_not_listen(worker: Worker, capture: str, engine: Engine) -> None:
-    worker.ingest(JOB, request(capture))
-    engine.status = "CANCELLED"
-    for mode in ("long", "deaf"):  # 120 s each, did nothing stop them
-        with pytest.raises(Cancelled):
-            worker.fit(JOB, request(capture, mode))
-    assert list(worker.store.folder("jobs", JOB).iterdir()) == []
-
-
 def test_the_last_event_names_cameras_that_moved(worker: Worker, capture: str) -> None:
     worker.ingest(JOB, request(capture))
     worker.publish(JOB, worker.fit(JOB, request(capture, "moved")))
