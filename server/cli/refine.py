@@ -52,7 +52,7 @@ def refine_locally(
         faults = _differences(recorded, rig, same_poses=calibration is None)
         if faults:
             raise InputError(path.name, [*faults, compose("captures-of-one-rig")])
-        found = segment(capture, rig, settings.segmentation, report=discard_progress)
+        found = segment(capture, rig, report=discard_progress)
         kept, warnings = without_moved_cameras(found, rig)
         seen.append(kept)
         if head is not None:
