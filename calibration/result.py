@@ -170,7 +170,9 @@ class Calibration:
     def _covered(self, camera: Camera) -> float:
         """Share of the picture's cells that hold a corner."""
         size = (camera.intrinsics.width, camera.intrinsics.height)
-        pixels = np.concatenate([seen for (name, _), (_, seen, _) in self.misses.items() if name == camera.name])
+        pixels = np.concatenate(
+            [observed for (name, _), (_, observed, _) in self.misses.items() if name == camera.name]
+        )
         cells = np.clip((pixels / size * CELLS).astype(int), 0, np.array(CELLS) - 1)
         return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 

@@ -77,7 +77,7 @@ THOROUGH = SearchEffort()
 @dataclass(frozen=True, slots=True, eq=False)
 class SubjectFaces:
     """Holds the faces found in each view that was searched, the best first, and which of them are the subject's. If a
-    single view shows a face, and without doubt, its points are a mean adult's (``single_view``)."""
+    single view shows a face, and without doubt, its points are a mean adult's."""
 
     found: Mapping[str, tuple[FaceDetection, ...]]
     matched: MatchedFaces | None  # None where views that show faces do not agree on one

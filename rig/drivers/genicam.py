@@ -139,14 +139,14 @@ class GenicamDriver:
         wanted = self._camera.identity
         with _discovery:
             self._aravis.call("arv_update_device_list")
-            found = []
+            cameras = []
             for index in range(self._aravis.call("arv_get_n_devices")):
                 device_id = self._aravis.call("arv_get_device_id", index)
                 serial = self._aravis.call("arv_get_device_serial_nbr", index)
                 if wanted in (device_id, serial, self._aravis.call("arv_get_device_physical_id", index)):
                     return device_id
-                found.append(serial or device_id)
-        raise CameraNotFound(self._camera, compose("serial-numbers-found", found=found or ["none"]))
+                cameras.append(serial or device_id)
+        raise CameraNotFound(self._camera, compose("serial-numbers-found", found=cameras or ["none"]))
 
     def _apply(self) -> tuple[Message, ...]:
         camera, unmet = self._camera, []

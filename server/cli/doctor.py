@@ -136,13 +136,13 @@ def _memory(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _data(settings: ServiceSettings) -> tuple[bool, str]:
-    there = next(folder for folder in (settings.data.resolve(), *settings.data.resolve().parents) if folder.exists())
-    if not (there.is_dir() and os.access(there, os.W_OK)):
-        return False, f"{there} cannot be written; give it to the user that runs the service"
-    free = shutil.disk_usage(there).free
+    existing = next(folder for folder in (settings.data.resolve(), *settings.data.resolve().parents) if folder.exists())
+    if not (existing.is_dir() and os.access(existing, os.W_OK)):
+        return False, f"{existing} cannot be written; give it to the user that runs the service"
+    free = shutil.disk_usage(existing).free
     held = (f"{len(list((settings.data / name).glob('*')))} {name}" for name in ("captures", "jobs"))
     detail = f"{settings.data.resolve()}, {', '.join(held)}, {free / 1e9:.1f} GB free"
-    detail += "" if there == settings.data.resolve() else "; `eigenhead serve` will make it"
+    detail += "" if existing == settings.data.resolve() else "; `eigenhead serve` will make it"
     return free > settings.free_bytes, detail if free > settings.free_bytes else detail + ": delete captures or jobs"
 
 
@@ -153,10 +153,10 @@ def _models(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _cache(settings: ServiceSettings) -> tuple[bool, str]:
     folder = cache_folder().resolve()
-    there = next(place for place in (folder, *folder.parents) if place.exists())
-    if not (there.is_dir() and os.access(there, os.W_OK)):
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    if not (existing.is_dir() and os.access(existing, os.W_OK)):
         return False, f"{folder} cannot be written: every start compiles anew; {CACHE} names another folder"
-    return True, f"{folder}, what can be made again" + ("" if there == folder else "; not made yet")
+    return True, f"{folder}, what can be made again" + ("" if existing == folder else "; not made yet")
 
 
 def _database(settings: ServiceSettings) -> tuple[bool, str]:
@@ -257,16 +257,16 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _stores(settings: ServiceSettings) -> tuple[bool, str]:
     """Lists the first object of each place; what may be written there only a delivery shows."""
-    kept = [place for place in (settings.captures_store, settings.results_store) if place is not None]
-    places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *kept])
+    stores = [place for place in (settings.captures_store, settings.results_store) if place is not None]
+    places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *stores])
     if not places:
         return True, "none; EIGENHEAD_IMPORT_PREFIXES and EIGENHEAD_DELIVER_PREFIXES name places"
     from server.storage.object_places import open_objects
 
     faults, hasty = [], settings.model_copy(update={"store_timeout_s": min(settings.store_timeout_s, STORE_S)})
-    for place in places:
+    for store in places:
         try:
-            next(iter(open_objects(place, hasty).entries("")), None)
+            next(iter(open_objects(store, hasty).entries("")), None)
         except EigenheadError as error:
             faults.append(str(error))
     return not faults, " ".join(faults) or f"{', '.join(places)}: answer"

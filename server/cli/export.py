@@ -98,17 +98,23 @@ def _export_dataset(
         raise Overwrites(out / "transforms.json")
     prepare_folder(out)
     with progress_bar() as report, folder_of(capture) as folder:
-        made = export_folder(folder, out, cast(DatasetFormat, form), result=result, chosen=wanted, report=report)
-    for warning in made.warnings:
+        exported = export_folder(folder, out, cast(DatasetFormat, form), result=result, chosen=wanted, report=report)
+    for warning in exported.warnings:
         warn(f"{warning.code}: {warning}")
-    document = {"out": str(out), "as": form, "cameras": made.cameras, "left_out": made.left_out, "points": made.points}
-    document |= {"flame": made.flame}
-    seen = (
-        f"{len(made.cameras)} views"
-        + (", FLAME parameters" if made.flame else "")
-        + (f", without {', '.join(made.left_out)}" if made.left_out else "")
+    document = {
+        "out": str(out),
+        "as": form,
+        "cameras": exported.cameras,
+        "left_out": exported.left_out,
+        "points": exported.points,
+    }
+    document |= {"flame": exported.flame}
+    summary = (
+        f"{len(exported.cameras)} views"
+        + (", FLAME parameters" if exported.flame else "")
+        + (f", without {', '.join(exported.left_out)}" if exported.left_out else "")
     )
-    answer(document, json_out, [f"{out}  {seen}"])
+    answer(document, json_out, [f"{out}  {summary}"])
 
 
 def _export_patient(

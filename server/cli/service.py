@@ -112,9 +112,9 @@ def keys_add(
 def keys_list(data: Data = None, json_out: Json = False) -> None:
     """List the API keys, without their secrets."""
     with _keys(data) as keys:
-        found = keys.all()
-    lines = [f"{key.id}  {key.name}  {' '.join(key.scopes)}" for key in found]
-    answer({"keys": [asdict(key) for key in found]}, json_out, lines)
+        keys_listed = keys.all()
+    lines = [f"{key.id}  {key.name}  {' '.join(key.scopes)}" for key in keys_listed]
+    answer({"keys": [asdict(key) for key in keys_listed]}, json_out, lines)
 
 
 @keys_app.command("remove", epilog="Example: eigenhead keys remove 3f2a90b1c4d5")

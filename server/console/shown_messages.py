@@ -7,8 +7,8 @@ from server.services.records import Failure
 
 def shown_detail(detail: Message) -> Message:
     """Returns the message of a refusal as a page shows it: without the advice to send a document again."""
-    found = detail.parameters.get("found")
-    return found if detail.code == "input-unusable" and isinstance(found, Message) else detail
+    faults = detail.parameters.get("found")
+    return faults if detail.code == "input-unusable" and isinstance(faults, Message) else detail
 
 
 def shown_failure(failure: Failure | None) -> ErrorDocument | None:

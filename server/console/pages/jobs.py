@@ -173,9 +173,9 @@ def active_jobs(service: Service, sought: str, batch: str | None, *, running: bo
     """Returns the jobs that run and those that begin next, ``SHOWN`` at most, and how many more wait. ``running``:
     include those that run."""
     query = JobQuery(sought, ACTIVE if running else STATUSES["queued"], batch=batch)
-    found = service.jobs.page(query, SOUGHT_MOST)
-    jobs = sorted(found.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
-    return jobs[:SHOWN], found.total - min(SHOWN, len(jobs))
+    matching = service.jobs.page(query, SOUGHT_MOST)
+    jobs = sorted(matching.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
+    return jobs[:SHOWN], matching.total - min(SHOWN, len(jobs))
 
 
 def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:

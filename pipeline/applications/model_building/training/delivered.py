@@ -1,7 +1,7 @@
 """Builds a head model from delivered heads, with their stated deviations.
 
 The heads lie in their model's topology already, so nothing has to be corresponded. The model that made them is the
-known population, and what it cannot make comes from them (``population_update``). Topology, landmarks and expressions
+known population, and what it cannot make comes from them. Topology, landmarks and expressions
 stay, so that the new model is used like the old one.
 
 The population is updated by the observed heads, each vertex as far as it is known. Mean and covariance have the normal-
