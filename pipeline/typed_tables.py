@@ -30,7 +30,9 @@ def read_fields(kind: type[T], document: Any, where: str, faults: list[Message])
     if not isinstance(document, Mapping):
         faults.append(compose("setting-no-object", where=where or "settings"))
         return kind()
-    hints = typing.get_type_hints(kind)
+    types = typing.get_type_hints(kind)
+    fields = dataclasses.fields(typing.cast(Any, kind))
+    hints = {field.name: types[field.name] for field in fields if field.metadata.get("key", True)}
     for key in document:
         if key not in hints:
             near = _sections_with(str(key), hints) or suggest(str(key), hints)

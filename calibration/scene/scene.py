@@ -24,7 +24,6 @@ from calibration.silhouette_refinement.single import VIEWS_LEAST, refine_one
 from pipeline.head_model.model import load_model
 from pipeline.multiview.upright import quarter_turns
 from pipeline.segmentation.segment import segment
-from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, CAMERAS_MOST
@@ -162,7 +161,7 @@ def refined_by_masks(calibration: SceneCalibration, masks: Mapping[str, Bool[np.
     if len(known) < VIEWS_LEAST:
         return calibration
     masked = Capture({}, masks={name: masks[name] for name in known})
-    silhouettes = segment(masked, rig.subset(known), SegmentationSettings(), report=lambda stage, share: None)
+    silhouettes = segment(masked, rig.subset(known), report=lambda stage, share: None)
     done = refine_one(silhouettes, rig)
     return calibration if done is None else replace(calibration, rig=done.rig, refinement=done.reason)
 

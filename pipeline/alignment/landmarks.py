@@ -24,10 +24,9 @@ from jaxtyping import Bool, Float
 
 from pipeline.alignment.feature_points import features_as_wholes, locate_features
 from pipeline.geometry.procrustes import block_diagonal, generalised_procrustes, procrustes
-from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS, mirrored
+from pipeline.head_model.landmarks import LANDMARK_NOISE_MM, NAMES, SEVEN_POINTS, mirrored
 from pipeline.head_model.model import HeadModel
-from pipeline.multiview.triangulation import TriangulatedPoint
-from pipeline.settings import AlignmentSettings
+from pipeline.multiview.triangulation import CLICK_NOISE_PX, TriangulatedPoint
 from rig.capture import Features
 from rig.errors import EigenheadError
 from rig.geometry import RigidTransform, Similarity
@@ -78,15 +77,15 @@ class FeatureAlignment:
     remarks: tuple[Message, ...]
 
 
-def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: AlignmentSettings) -> FeatureAlignment:
+def feature_alignment(model: HeadModel, features: Features, rig: Rig) -> FeatureAlignment:
     """Aligns the mean head to picked feature points: rejects outliers, minimises eq. (3), then weighs the points by
     their covariance. Raises TooFewFeatures or WrongFeatures."""
     if features.keys().isdisjoint(NAMES):
         raise WrongFeatures(compose("features-of-no-landmark", names=some_of([*features]), known=SEVEN_POINTS))
-    whole = features_as_wholes(features, rig, noise_px=settings.feature_noise_px)
+    whole = features_as_wholes(features, rig, noise_px=CLICK_NOISE_PX)
     if whole is not None:
         raise WrongFeatures(whole)
-    located = locate_features(features, rig, noise_px=settings.feature_noise_px)
+    located = locate_features(features, rig, noise_px=CLICK_NOISE_PX)
     unknown = [
         compose("feature-not-of-model", name=name, model=model.name)
         for name in located.points
@@ -98,13 +97,13 @@ def feature_alignment(model: HeadModel, features: Features, rig: Rig, settings: 
         raise TooFewFeatures(points, compose("points-usable", count=len(points)), remarks)
     names = list(points)
     target = np.stack([point.position_world for point in points.values()])
-    source, spread = landmark_statistics(model, names, settings.landmark_noise_mm)
+    source, spread = landmark_statistics(model, names, LANDMARK_NOISE_MM)
     noise = np.stack([point.covariance for point in points.values()])
     expected = np.sqrt((_diagonal_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
     kept = consensus(source, target, expected)
     if kept is None:
         raise TooFewFeatures(points, compose("points-on-line"), remarks)
-    if _sides_exchanged(model, names, target, noise, kept, settings):
+    if _sides_exchanged(model, names, target, noise, kept):
         raise WrongFeatures(compose("features-sides-exchanged"))
     procrustes_only = procrustes(source[kept], target[kept])
     rows = np.flatnonzero(np.repeat(kept, 3))
@@ -128,13 +127,12 @@ def _sides_exchanged(
     target: Float[np.ndarray, "n 3"],
     noise: Float[np.ndarray, "n 3 3"],
     kept: Bool[np.ndarray, " n"],
-    settings: AlignmentSettings,
 ) -> bool:
     """Tells whether most points agree with the mean head only after right and left are exchanged in all of them."""
     others = [mirrored(name) for name in names]
     if float(kept.mean()) >= MIN_AGREED_SIDES or others == names or not all(name in model.landmarks for name in others):
         return False
-    source, spread = landmark_statistics(model, others, settings.landmark_noise_mm)
+    source, spread = landmark_statistics(model, others, LANDMARK_NOISE_MM)
     expected = np.sqrt((_diagonal_blocks(spread) + noise).trace(axis1=1, axis2=2) / 3.0)
     found = consensus(source, target, expected)
     return found is not None and float(found.mean()) >= MIN_AGREED_SIDES and bool(found.sum() > kept.sum() + 1)

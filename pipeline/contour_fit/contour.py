@@ -38,6 +38,8 @@ from rig.geometry import Similarity
 from rig.progress import Progress
 from rig.rig import Rig
 
+FIRST_MODES = 15  # of the coarse stage; 10 to 20 measured alike
+TOLERANCE = 0.05  # predicted fall of the cost at which the solver stops: a step of 0.2 sigma
 TRIES = 3  # of a step, each with a hundred times the damping
 NON_MONOTONE = 4  # costs that a step may climb back to
 
@@ -124,7 +126,7 @@ def schedule(settings: FittingSettings, modes: int) -> list[Stage]:
     - the further modes, if the model has any;
     - all modes on the full mesh.
     """
-    few, span = min(settings.modes_first, modes), min(settings.modes, modes)
+    few, span = min(FIRST_MODES, modes), min(settings.modes, modes)
     last = settings.robust_px
     wider = [Stage("p95", modes, True, (2.0 * last, last), False, True, 4)] if modes > span else []
     return [
@@ -147,7 +149,7 @@ def run_stage(
     """
     few = state.coefficients[: stage.modes]
     state = replace(state, coefficients=np.concatenate([few, np.zeros(stage.modes - len(few))]))
-    limits = Limits(stage.steps, problem.settings.tolerance, TRIES, NON_MONOTONE)
+    limits = Limits(stage.steps, TOLERANCE, TRIES, NON_MONOTONE)
     evaluations, reason = 0, "step limit"
     for i, scale in enumerate(stage.scales_px):
         report(i / len(stage.scales_px))

@@ -36,12 +36,12 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
         return solved
     equations = normal_equations(solved)
     count, unknowns = len(state.coefficients), len(equations.gradient)
-    median, diagonal = solved.problem.settings.expression_median, np.arange(count)
+    diagonal = np.arange(count)
     weights = slice(posed.start, posed.stop)
     matrix, gradient = equations.matrix.copy(), equations.gradient.copy()
     matrix[diagonal, diagonal] -= 1.0  # what the evidence says without the priors
     gradient[:count] -= state.coefficients
-    gradient[weights] -= weight_slope(np.maximum(state.coefficients[weights], 0.0), median)
+    gradient[weights] -= weight_slope(np.maximum(state.coefficients[weights], 0.0))
     groups = (diagonal[:eigenheads], diagonal[eigenheads : posed.start], diagonal[posed.stop :])
     variance, now, step = np.ones(count), state.coefficients, np.zeros(unknowns)
     room = weight_bounds(state, posed, unknowns)
@@ -49,7 +49,7 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
         whole, slope = matrix.copy(), gradient.copy()
         whole[diagonal, diagonal] += 1.0 / variance
         slope[:count] += state.coefficients / variance
-        slope[weights] += weight_slope(np.maximum(now[weights], 0.0), median)
+        slope[weights] += weight_slope(np.maximum(now[weights], 0.0))
         step = least_within(whole, slope, *room)
         now = state.coefficients + step[:count]
         covariance = inverse_diagonal(whole)

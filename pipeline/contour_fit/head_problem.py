@@ -26,6 +26,8 @@ from pipeline.contour_fit.rim_term import LinearisedRimTerm, RimTerm
 from pipeline.contour_fit.surface_term import SurfaceTerm
 from pipeline.estimation.robust import GemanMcClure
 from pipeline.estimation.terms import Linearised, Problem, Residuals, Sum, Term
+from pipeline.head_model.landmarks import LANDMARK_NOISE_MM
+from pipeline.multiview.triangulation import CLICK_NOISE_PX
 from rig.geometry import Similarity, rotation_from_vector
 
 FEATURE_SCALE = 4.0  # Geman-McClure scale of a feature point, in its standard deviations
@@ -57,9 +59,8 @@ class FeatureTerm:
     def _deviation_px(self, slopes: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, " n"]:
         """Returns the standard deviation (px) of each feature point: a click's noise together with the landmark's
         variation between heads."""
-        settings = self.problem.settings
         pixels_per_mm = np.linalg.norm(slopes, axis=(1, 2)) / np.sqrt(2.0)
-        return np.hypot(settings.feature_noise_px, settings.landmark_noise_mm * pixels_per_mm)
+        return np.hypot(CLICK_NOISE_PX, LANDMARK_NOISE_MM * pixels_per_mm)
 
     def _rows(
         self, state: State, points: Float[np.ndarray, "n 3"], slopes: Float[np.ndarray, "n 2 3"]

@@ -11,6 +11,9 @@ from pipeline.contour_fit.problem import FIRST_NOISE_PX, ContourProblem, Stage, 
 from pipeline.contour_fit.rim import Rim
 from pipeline.contour_fit.rim_term import observed_rim
 
+BARE_PX = 2.0  # cranium, ears and neck agree with the input to this after a fit to the whole head ...
+BARE_SHARE = 0.8  # ... over this share of their outline: the head is bare, and all of its rim is used
+BARE_LOSS = 1.25  # factor by which the rim of the face may fit worse for it
 START_CLUTTER_MM = 12.0
 BLOCK_PX = 20.0
 BARE_SLACK_PX = 0.1  # noise of a contour's RMS
@@ -89,15 +92,12 @@ def is_hairless(problem: ContourProblem, evidence: StageEvidence, state: State, 
     region = problem.model.levels[stage.level].face_region
     other = np.flatnonzero(~region[rim.corner].all(axis=1))
     face = np.flatnonzero(region[rim.corner].all(axis=1))
-    agrees = np.abs(rim.residual) < problem.settings.bare_px
-    if (rim.length * agrees)[other].sum() <= problem.settings.bare_share * rim.length[other].sum():
+    agrees = np.abs(rim.residual) < BARE_PX
+    if (rim.length * agrees)[other].sum() <= BARE_SHARE * rim.length[other].sum():
         return False
     alone = observed_rim(problem, evidence, from_face, replace(stage, whole_head=False))
     face_alone = np.flatnonzero(region[alone.corner].all(axis=1))
-    return (
-        _robust_deviation_px(rim, face)
-        < problem.settings.bare_loss * _robust_deviation_px(alone, face_alone) + BARE_SLACK_PX
-    )
+    return _robust_deviation_px(rim, face) < BARE_LOSS * _robust_deviation_px(alone, face_alone) + BARE_SLACK_PX
 
 
 def _robust_deviation_px(rim: Rim, chosen: Int[np.ndarray, " s"]) -> float:

@@ -21,6 +21,8 @@ from jaxtyping import Float
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, ContourProblem, Stage, State
 from pipeline.estimation.terms import NormalEquations
 
+EXPRESSION_MEDIAN = 0.1  # t of the prior above
+SCALE_SPREAD = 0.01  # standard deviation of log scale: rigs are metric, and size is a mode
 LOG_SCALE = 6  # its place in the pose
 TAIL = 2.0  # exponent of the weights' prior
 
@@ -31,10 +33,10 @@ def weights_of(problem: ContourProblem, coefficients: Float[np.ndarray, " m"]) -
     return np.maximum(coefficients[problem.model.posed.start : problem.model.posed.stop], 0.0)
 
 
-def weight_slope(weights: Float[np.ndarray, " e"], median: float) -> Float[np.ndarray, " e"]:
-    """Returns ``TAIL / (t + w)`` for each expression weight w, where t is ``median``. It is half the derivative of ``2
-    TAIL log(1 + w / t)``, the part of the weights' prior that is not Gaussian."""
-    return TAIL / (median + weights)
+def weight_slope(weights: Float[np.ndarray, " e"]) -> Float[np.ndarray, " e"]:
+    """Returns ``TAIL / (t + w)`` for each expression weight w, where t is ``EXPRESSION_MEDIAN``. It is half the
+    derivative of ``2 TAIL log(1 + w / t)``, the part of the weights' prior that is not Gaussian."""
+    return TAIL / (EXPRESSION_MEDIAN + weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,9 +64,9 @@ class LinearisedPriorTerm:
         state, problem = self.state, self.term.problem
         shape = float(state.coefficients @ state.coefficients)
         weights = weights_of(problem, state.coefficients)
-        shape += 2.0 * TAIL * float(np.log1p(weights / problem.settings.expression_median).sum())
+        shape += 2.0 * TAIL * float(np.log1p(weights / EXPRESSION_MEDIAN).sum())
         cameras = float(np.einsum("ki,kij,kj->", state.camera_shift, problem.camera_information, state.camera_shift))
-        return shape + cameras + (np.log(state.world_from_head.scale) / problem.settings.scale_spread) ** 2
+        return shape + cameras + (np.log(state.world_from_head.scale) / SCALE_SPREAD) ** 2
 
     def add_to(self, equations: NormalEquations) -> None:
         """Adds the prior of coefficients, expression weights, log scale and, if the stage solves for them, cameras, in
@@ -73,9 +75,9 @@ class LinearisedPriorTerm:
         equations.matrix[np.arange(m), np.arange(m)] += 1.0
         equations.gradient[:m] += state.coefficients
         weights, first = weights_of(problem, state.coefficients), problem.model.posed.start
-        slope = weight_slope(weights, problem.settings.expression_median)
+        slope = weight_slope(weights)
         equations.gradient[first : first + len(weights)] += slope
-        information = problem.settings.scale_spread**-2
+        information = SCALE_SPREAD**-2
         equations.matrix[m + LOG_SCALE, m + LOG_SCALE] += information
         equations.gradient[m + LOG_SCALE] += np.log(state.world_from_head.scale) * information
         if self.term.stage.cameras:

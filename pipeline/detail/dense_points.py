@@ -14,20 +14,21 @@ from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.part_labels.codes import Part, codes_from_channels
 from pipeline.part_labels.votes import PartVotes, part_shares
-from pipeline.settings import FineSettings
 from pipeline.stereo.depth_map import DepthMap, points_world
 from rig.camera import Camera
 from rig.mesh import Mesh, vertex_normals
 
+CELL_MM = 0.8  # points nearer than that become one: three quarters of a pixel of the usual rig
+MAX_VIEWS_NEEDED = 4  # views that agree on a point, at most: with fewer, points beside hair lie 1 mm too deep
+HAIR_OFF_MM = 0.5  # how far beside the skin a point lies that is hair after all
+MIN_FACING = 0.35  # cosine between a point's normal and its view: flatter windows smear
 INSIDE_MM = 4.0  # farther behind the fitted head a point shows something that neither pulls nor bounds it
 EVERY = 4  # vertices of the head stand for the others
 TOGETHER_DEG = 65.0  # between views that may see one place: the dense stage compares no others (angle_widest_deg)
 
 
 @traced
-def dense_points(
-    depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh, settings: FineSettings
-) -> SurfacePoints:
+def dense_points(depth_maps: Sequence[DepthMap], votes: PartVotes | None, head_world: Mesh) -> SurfacePoints:
     """Returns the surface points on which enough views agree. They are thinned to at most one for each cell of a grid,
     part of the head, and side of a thin sheet.
 
@@ -35,41 +36,39 @@ def dense_points(
         depth_maps: one for each view.
         votes: which part each point shows.
         head_world: the fitted head.
-        settings: how many views must agree, and how frontally.
 
     Returns:
         The points, in the order of their cells; none without depth maps or votes.
     """
-    views_needed = count_views_needed([each.camera for each in depth_maps], head_world.vertices.mean(axis=0), settings)
-    clouds = map_in_threads(lambda k: _cloud(depth_maps[k], views_needed, settings), len(depth_maps))
+    views_needed = count_views_needed([each.camera for each in depth_maps], head_world.vertices.mean(axis=0))
+    clouds = map_in_threads(lambda k: _cloud(depth_maps[k], views_needed), len(depth_maps))
     if not clouds or votes is None:
         return SurfacePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.uint8))
     points, normals, deviation = (np.concatenate(column) for column in zip(*clouds, strict=True))
     # A million pixels, a tenth of that in cells.
-    cells = thinned(SurfacePoints(points, normals, deviation, np.zeros(len(points), np.uint8)), settings.cell_mm)
+    cells = thinned(SurfacePoints(points, normals, deviation, np.zeros(len(points), np.uint8)), CELL_MM)
     share = part_shares(votes, cells.points)
     part = codes_from_channels(share.argmax(axis=1))
     # What may be hair may lie where hair does: the deviation of both together.
     skin = share[:, Part.SKIN.channel]
     doubt = np.where(part == Part.SKIN, 1.0 - skin / np.maximum(share.sum(axis=1), 1e-9), 0.0)
-    deviation = np.sqrt(cells.deviation_mm**2 + doubt * settings.hair_off_mm**2)
+    deviation = np.sqrt(cells.deviation_mm**2 + doubt * HAIR_OFF_MM**2)
     part[_behind(cells.points, head_world)] = Part.HAIR  # it bounds nothing there and pulls nothing
     return replace(cells, deviation_mm=deviation, part=part)
 
 
-def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"], settings: FineSettings) -> int:
+def count_views_needed(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> int:
     """Returns how many views must agree on a point near the head: half of the cameras that stand within
-    ``TOGETHER_DEG`` of each other where they are densest, but at least two and at most ``settings.views_least``.
+    ``TOGETHER_DEG`` of each other where they are densest, but at least two and at most ``MAX_VIEWS_NEEDED``.
 
     Args:
         cameras: of the depth maps.
         at_world: about the middle of the head, mm.
-        settings: has the largest number required.
     """
     towards = np.array([camera.centre_world for camera in cameras]).reshape(-1, 3) - at_world
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
     together = (towards @ towards.T > np.cos(np.radians(TOGETHER_DEG))).sum(axis=1)
-    return min(max(int(together.max(initial=0)) // 2, 2), settings.views_least)
+    return min(max(int(together.max(initial=0)) // 2, 2), MAX_VIEWS_NEEDED)
 
 
 def _behind(points: Float[np.ndarray, "n 3"], head_world: Mesh) -> np.ndarray:
@@ -80,14 +79,14 @@ def _behind(points: Float[np.ndarray, "n 3"], head_world: Mesh) -> np.ndarray:
 
 
 def _cloud(
-    depth_map: DepthMap, views_needed: int, settings: FineSettings
+    depth_map: DepthMap, views_needed: int
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     known, camera = depth_map.known, depth_map.camera
     points, normals = points_world(depth_map), depth_map.normal[known].astype(float)
     towards = camera.centre_world - points
     facing = (towards * normals).sum(axis=1) / np.linalg.norm(towards, axis=1)
     views = depth_map.views[known]
-    kept = (views >= views_needed) & (facing >= settings.facing_least)
+    kept = (views >= views_needed) & (facing >= MIN_FACING)
     deviation = depth_map.deviation_mm[known][kept] * facing[kept]  # along the ray, to along the normal
     deviation *= np.where(views[kept] < VIEWS_SURE, ALONE_FACTOR, 1.0)
     return points[kept], normals[kept], deviation

@@ -83,7 +83,6 @@ def with_read_expression(
     observed: Bool[np.ndarray, " v"],
     *,
     eigenheads: int,
-    median: float,
 ) -> Fit:
     """Returns the fit with expression weights, and their deviations, estimated anew from the deformed head. Returns the
     fit unchanged if the model has no expressions, or if the population does not explain the head.
@@ -95,7 +94,6 @@ def with_read_expression(
         vertices_world: the deformed head, full level, mm.
         observed: which of its vertices a point of skin shows.
         eigenheads: how many of the fit's modes are eigenheads.
-        median: of the prior of an expression weight.
     """
     if not len(model.posed):
         return fit
@@ -109,7 +107,7 @@ def with_read_expression(
     for k in range(ROUNDS):
         off = ((here - place) * normal).sum(axis=1)
         information = there * trust / (1.0 + (off / ROBUST_MM) ** 2) ** 2
-        weights, deviation, here, strays = _solved(basis, place, normal, information, len(weights), median)
+        weights, deviation, here, strays = _solved(basis, place, normal, information, len(weights))
         if strays > STRAYS:
             return fit
         if k < ROUNDS - 1:
@@ -128,7 +126,6 @@ def _solved(
     normal: Float[np.ndarray, "n 3"],
     information: Float[np.ndarray, " n"],
     expressions: int,
-    median: float,
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"], Float[np.ndarray, "n 3"], float]:
     """Estimates the expression weights. Returns the weights, their deviations, the modelled places under them (head
     frame, mm) and the variance of the kernel's modes (MacKay 1992, as in ``posterior``)."""
@@ -152,7 +149,7 @@ def _solved(
     covariance = matrix
     for k in range(REWEIGHTED):
         slope = -right
-        slope[weights] += weight_slope(now, median)
+        slope[weights] += weight_slope(now)
         found = least_within(matrix, slope, least, most)
         now = np.maximum(found[weights], 0.0)
         if k < EVIDENCE or k == REWEIGHTED - 1:

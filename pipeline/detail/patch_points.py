@@ -23,7 +23,6 @@ from pipeline.photometric_fit.hair_mask import HairProbability, under_hair
 from pipeline.photometric_fit.images import Photographs, load_photographs
 from pipeline.photometric_fit.patches import Patches, arrays_of, make_patches
 from pipeline.photometric_fit.refine import RADIUS_WINDOWS
-from pipeline.settings import PhotoSettings
 from rig.camera import Camera
 from rig.mesh import Mesh, vertex_normals
 from rig.rig import Rig
@@ -52,7 +51,6 @@ class PatchSearch:
     views: Views
     cameras: tuple[Camera, ...]
     hair: HairProbability
-    settings: PhotoSettings
 
     def places(self, vertices: Float[np.ndarray, "v 3"]) -> PatchPlaces:
         """Measures where the photographs show the surface near a head (world frame, mm). Patches without a clear match
@@ -60,11 +58,9 @@ class PatchSearch:
         level, coarse = self.model.levels["full"], self.model.levels[DEPTH_LEVEL]
         head, hiding = Mesh(vertices, level.faces), Mesh(vertices[coarse.rows], coarse.faces)
         speaks = self.photographs.speaks
-        seen_by = visibility_of(head, hiding, self.cameras, self.views, self.patches, speaks, settings=self.settings)
+        seen_by = visibility_of(head, hiding, self.cameras, self.views, self.patches, speaks)
         scale = pixels_per_mm(self.cameras, vertices.mean(axis=0))
-        found = find_places(
-            self.photographs, self.patches, seen_by, self.views, scale, each=SEARCH, settings=self.settings
-        )
+        found = find_places(self.photographs, self.patches, seen_by, self.views, scale, each=SEARCH)
         centres = self.model.vertices(np.zeros(0))[self.patches.centre]
         hidden = under_hair(self.patches, self.hair, self.views.names, seen_by.pixel, seen_by.facing > 0, centres)
         kept = np.flatnonzero(found.several & found.clear & ~hidden)
@@ -80,8 +76,6 @@ def patch_search(
     distances: Mapping[str, Float32[np.ndarray, "h w"]],
     hair: HairProbability,
     rig: Rig,
-    *,
-    settings: PhotoSettings,
 ) -> PatchSearch:
     """Prepares the search: chooses patches on ``model``, and loads the photographs of the views that have a silhouette.
 
@@ -92,11 +86,10 @@ def patch_search(
         distances: signed distances to the silhouettes (px), by camera.
         hair: for each camera, the probability that a pixel shows hair.
         rig: the cameras as calibrated.
-        settings: thresholds.
     """
     views = pack_views(rig, dict(distances))
     cameras = tuple(corrected(rig[name], fit) for name in views.names)
-    return PatchSearch(model, _patches(model), load_photographs(images, views), views, cameras, hair, settings)
+    return PatchSearch(model, _patches(model), load_photographs(images, views), views, cameras, hair)
 
 
 @lru_cache(maxsize=1)  # studios work with one model

@@ -20,6 +20,7 @@ from pipeline.compute.trace import traced
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.association import Associated, associate, interpolated
 from pipeline.detail.blink import blink_shift, estimate_eyelid_closure, plain_shape
+from pipeline.detail.dense_points import CELL_MM
 from pipeline.detail.ears import with_ears_in_place
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids, with_plain_lids
 from pipeline.detail.folds import unfolded
@@ -40,10 +41,20 @@ from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
-from pipeline.settings import FineSettings
 from rig.mesh import vertex_normals
 from rig.progress import Progress
 
+COARSE_LENGTH_MM = 12.0  # over which a displacement of the nodes fades where nothing is seen
+LENGTH_MM = 5.0  # the same of the displacement along the normals that follows it
+MIN_AMPLITUDE_MM = 0.7  # standard deviation of a displacement where the fit claims to be better
+COARSE_CELL_MM = 2.5  # the same for the nodes, whose edges are 4 mm long
+FLOOR_MM = 0.05  # error of a point that its deviation does not show
+COARSE_FLOOR_MM = 0.3  # the same for the nodes: relief that edges of 4 mm cannot follow
+CORRELATION_MM = 4.0  # radius within which points err alike: windows of dense matching overlap
+COMMON_MM = 0.1  # error beyond that radius that all points share: cameras, shading
+SHARED_ERROR = 0.25  # share of a point's deviation that points beyond it share: means over 16 mm are 0.2 to 1 of it off
+MIN_OBSERVED_SHARE = 0.2  # of the face's vertices that the dense surface must show, or it is of no use
+DRAWS = 24  # of the posterior: its deviation is known to a seventh
 SEED = 16
 
 
@@ -93,7 +104,6 @@ def refine_to_surface(
     fit: Fit,
     model: HeadModel,
     surface: SurfacePoints,
-    settings: FineSettings,
     *,
     eigenheads: int,
     deviation_mm: Float[np.ndarray, " v"],
@@ -108,7 +118,6 @@ def refine_to_surface(
         fit: with its covariance.
         model: with the modes that the fit has.
         surface: the measured surface points, world frame.
-        settings: lengths and lower limits.
         eigenheads: how many of the modes are eigenheads; the rest, expressions apart, are smooth deformations along the
             normals.
         deviation_mm: standard deviation of every vertex in the fit (``vertex_deviation_mm``).
@@ -130,8 +139,8 @@ def refine_to_surface(
     blink = blink_shift(fit, model, lids)
     base = unfolded(shape + blink, base + blink, faces)
     base = bridge_eyelids(base, model, closed.difference(lids) | unexplained)
-    surface = thinned(surface, settings.cell_mm)  # a million points of depth maps, a fiftieth of that in cells
-    base = with_ears_in_place(base, model, thinned(surface, settings.coarse_cell_mm))
+    surface = thinned(surface, CELL_MM)  # a million points of depth maps, a fiftieth of that in cells
+    base = with_ears_in_place(base, model, thinned(surface, COARSE_CELL_MM))
     regions = head_regions(model)
     head = deform_to_points(
         base,
@@ -139,7 +148,6 @@ def refine_to_surface(
         faces,
         solving_nodes(model),
         surface,
-        settings,
         loose=regions["ears"] | regions["neck"],
         look=patches and patches.places,
         outlines=outlines and outlines.observed,
@@ -157,11 +165,11 @@ def deform_to_points(
     faces: Int[np.ndarray, "f 3"],
     nodes: Nodes,
     surface: SurfacePoints,
-    settings: FineSettings,
     *,
     loose: Bool[np.ndarray, " v"],
     look: Callable[[Float[np.ndarray, "v 3"]], PatchPlaces] | None = None,
     outlines: Outlines | None = None,
+    shared_error: float = SHARED_ERROR,
     report: Progress = lambda stage, fraction: None,
 ) -> DeformedSurface:
     """Deforms a surface to measured points, where there are points near it.
@@ -172,28 +180,28 @@ def deform_to_points(
         faces: its triangles.
         nodes: the meshes on which the displacement is solved.
         surface: the points, in the same frame.
-        settings: lengths and lower limits.
         loose: vertices that may be farther off than the others.
         look: measures the surface once more with the photographs; None leaves that out.
         outlines: compares the surface with silhouettes; None leaves that out.
+        shared_error: the share of their deviation by which all points err alike.
         report: called with the share that is done.
 
     Returns:
         The same vertices displaced; far from all points they are unchanged.
     """
-    amplitude = np.maximum(deviation_mm, settings.least_amplitude_mm)
+    amplitude = np.maximum(deviation_mm, MIN_AMPLITUDE_MM)
     informative = surface.chosen((surface.part != Part.UNSEEN) & np.isfinite(surface.deviation_mm))
-    many = thinned(informative, settings.cell_mm)
-    few = thinned(many, settings.coarse_cell_mm)
+    many = thinned(informative, CELL_MM)
+    few = thinned(many, COARSE_CELL_MM)
     now = _coarsely_deformed(
-        vertices, amplitude, faces, nodes.coarse, few, settings, loose=loose, outlines=outlines, report=report
+        vertices, amplitude, faces, nodes.coarse, few, loose=loose, outlines=outlines, report=report
     )
     base = now = unfolded(vertices, now, faces)
     normals = vertex_normals(base, faces)
-    field = _laid_out(nodes.fine, base, settings.length_mm)
+    field = _laid_out(nodes.fine, base, LENGTH_MM)
     directions = normal_directions(nodes.fine, nodes.fine.shape @ amplitude, normals)
     report("fine", len(COARSE) / (len(COARSE) + 1))
-    shown = observe(base, now, faces, many, loose, each=FINE, settings=settings, floor_mm=settings.floor_mm)
+    shown = observe(base, now, faces, many, loose, each=FINE, floor_mm=FLOOR_MM)
     posterior = solve_field(field, directions, with_outlines(shown.observed, outlines, base, now, FINE.robust_mm))
     now = base + directions.moved(posterior.mean)
     for robust_mm in LOOKS_MM:
@@ -204,8 +212,8 @@ def deform_to_points(
         now = base + directions.moved(posterior.mean)
     seen = np.zeros(len(vertices), bool)
     seen[shown.corner] = True
-    common_mm = np.hypot(settings.common_mm, settings.shared_error * typical_deviation(shown, faces, len(vertices)))
-    deviation = field_deviation(posterior, base, normals, amplitude, seen, settings, common_mm=common_mm)
+    common_mm = np.hypot(COMMON_MM, shared_error * typical_deviation(shown, faces, len(vertices)))
+    deviation = field_deviation(posterior, base, normals, amplitude, seen, common_mm=common_mm)
     return DeformedSurface(unfolded(base, now, faces), deviation, seen)
 
 
@@ -215,7 +223,6 @@ def _coarsely_deformed(
     faces: Int[np.ndarray, "f 3"],
     nodes: NodeMesh,
     few: SurfacePoints,
-    settings: FineSettings,
     *,
     loose: Bool[np.ndarray, " v"],
     outlines: Outlines | None,
@@ -223,13 +230,11 @@ def _coarsely_deformed(
 ) -> Float[np.ndarray, "v 3"]:
     """Returns the vertices after the coarse rounds, which move them freely in space."""
     now = vertices
-    field = _laid_out(nodes, vertices, settings.coarse_length_mm)
+    field = _laid_out(nodes, vertices, COARSE_LENGTH_MM)
     directions = free_directions(nodes, nodes.shape @ amplitude)
     for i, each in enumerate(COARSE):
         report("fine", i / (len(COARSE) + 1))
-        shown = observe(
-            vertices, now, faces, few, loose, each=each, settings=settings, floor_mm=settings.coarse_floor_mm
-        )
+        shown = observe(vertices, now, faces, few, loose, each=each, floor_mm=COARSE_FLOOR_MM)
         both = with_outlines(shown.observed, outlines, vertices, now, each.robust_mm)
         now = vertices + directions.moved(solve_field(field, directions, both).mean)
     return now
@@ -258,7 +263,6 @@ def observe(
     loose: Bool[np.ndarray, " v"],
     *,
     each: Round,
-    settings: FineSettings,
     floor_mm: float,
 ) -> Shown:
     """Returns the observations that the points give of the head at ``now``: their offsets (mm) from ``base``. Points of
@@ -287,7 +291,7 @@ def observe(
     speaks = np.where(skin, found.distance_mm <= reach, off < 0.0)  # hair speaks where skin stands out of it
     variance = surface.deviation_mm[found.row] ** 2 + floor_mm**2
     robust = np.where(skin, 1.0 / (1.0 + (off / each.robust_mm) ** 2) ** 2, 1.0)
-    shared = _local_density(found, corner, now, faces, settings.correlation_mm)
+    shared = _local_density(found, corner, now, faces, CORRELATION_MM)
     offset = ((point - interpolated(base[corner], found.blend)) * between).sum(axis=1)
     kept, of_skin = np.flatnonzero(speaks), np.flatnonzero(speaks & skin)
     information = robust / (variance * shared)
@@ -361,19 +365,18 @@ def field_deviation(
     normals: Float[np.ndarray, "v 3"],
     deviation_mm: Float[np.ndarray, " v"],
     observed: Bool[np.ndarray, " v"],
-    settings: FineSettings,
     *,
     common_mm: Float[np.ndarray, " v"],
 ) -> Float[np.ndarray, " v"]:
     """Returns the standard deviation (mm) of every vertex along its normal. Near observed vertices it comes from random
     draws of the posterior and from the error ``common_mm`` that all points share; far from them it is at least
     ``deviation_mm``."""
-    draws = posterior.draws(np.random.default_rng(SEED), settings.draws)
+    draws = posterior.draws(np.random.default_rng(SEED), DRAWS)
     square = common_mm**2
-    for k in range(settings.draws):
-        square += (posterior.directions.moved(draws[:, k]) * normals).sum(axis=1) ** 2 / settings.draws
+    for k in range(DRAWS):
+        square += (posterior.directions.moved(draws[:, k]) * normals).sum(axis=1) ** 2 / DRAWS
     if not observed.any():
         return deviation_mm
-    distance, _ = nearest(PointTree.of(base[observed]), base, within=6.0 * settings.length_mm)
-    near = np.exp(-0.5 * (np.where(np.isfinite(distance), distance, np.inf) / settings.length_mm) ** 2)
+    distance, _ = nearest(PointTree.of(base[observed]), base, within=6.0 * LENGTH_MM)
+    near = np.exp(-0.5 * (np.where(np.isfinite(distance), distance, np.inf) / LENGTH_MM) ** 2)
     return np.sqrt(near * square + (1.0 - near) * np.maximum(square, deviation_mm**2))

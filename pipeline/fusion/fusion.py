@@ -29,7 +29,6 @@ from pipeline.geometry.surface_nets import surface_net
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.votes import PartVotes, part_codes, part_shares
-from pipeline.settings import BustSettings
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.window_bias import WindowBias, without_bias
 from pipeline.warnings import ReportWarning
@@ -83,7 +82,7 @@ def fuse(
     head_world: Mesh | None,
     *,
     bias: WindowBias,
-    settings: BustSettings,
+    spacing_mm: float,
     report: Progress,
     hair: SilentHair | None = None,
 ) -> DepthSurface:
@@ -95,7 +94,7 @@ def fuse(
         rig: the cameras as calibrated, world frame.
         head_world: the fitted head, closed except at its neck (mm); None if there is none.
         bias: of the matching windows.
-        settings: spacing of the vertices.
+        spacing_mm: distance of the vertices.
         report: called with the stage's progress.
         hair: of which the depth maps say nothing; None if there is none.
 
@@ -107,11 +106,11 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level = solve(maps, views, head_world, settings.spacing_mm, hair)
+    level = solve(maps, views, head_world, spacing_mm, hair)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)
-    mesh, measured = refine_vertices(net, views, settings.spacing_mm)
+    mesh, measured = refine_vertices(net, views, spacing_mm)
     measured = without_islands(mesh, measured)
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(mask_warnings(names, contradicted))

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from jaxtyping import Float
 
+LANDMARK_NOISE_MM = 2.0  # position of a landmark against the same landmark of another head
 MIDLINE = (
     "glabella",  # most forward point between the eyebrows
     "nasion",  # deepest point of the nasal root (sellion)

@@ -18,6 +18,7 @@ from rig.geometry import ray_equations
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
+CLICK_NOISE_PX = 1.5  # of a person's click; measured on captures rendered by another program
 LIMITS = Limits(steps=50, tolerance=1e-12, tries=6)  # a step of 1e-6 standard deviations
 STEPS = 10  # of many points at once; three are usual
 SETTLED = 1e-9  # share of the misfit that a last step still takes away

@@ -21,11 +21,15 @@ from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.appearance_cells import Cells, head_guide, make_cells
 from pipeline.part_labels.codes import CHANNELS, Part
 from pipeline.part_labels.label_kernels import spread_parts
-from pipeline.settings import PartSettings
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.rig import Rig
 
+CELL_MM = 2.2  # side of a cell of the grid that is labelled: four pixels of the usual rig
+STEPS = 4  # of expectation and maximisation
+STRENGTH = 0.7  # weight of a cell's appearance: colour and structure of neighbours are not independent
+SMOOTH_MM = 9.0  # window over which neighbours agree
+EDGE = 0.05  # contrast (0 to 1, as displayed) that ends such a window
 SKIN_CHANNEL, HAIR_CHANNEL, CLOTHES_CHANNEL = (part.channel for part in CHANNELS)
 
 RED_BINS, BLUE_BINS, LIGHT_BINS, DETAIL_BINS = 36, 40, 20, 20
@@ -77,7 +81,6 @@ def classify_parts(
     face_region: Bool[np.ndarray, " v"],
     landmarks_world: Mapping[str, Float[np.ndarray, " 3"]],
     *,
-    settings: PartSettings,
     report: Progress,
 ) -> dict[str, PartMap]:
     """Computes, for every usable view with a photograph, the probability that each pixel shows skin, hair or clothes.
@@ -89,7 +92,6 @@ def classify_parts(
         head_world: the fitted head without hair (mm).
         face_region: its vertices from ear to ear and from the lower forehead to under the chin.
         landmarks_world: its 26 landmarks (mm).
-        settings: grid, smoothness and priors.
         report: progress.
 
     Returns:
@@ -99,7 +101,7 @@ def classify_parts(
     used = rig.subset(name for name in rig.names if name in masks)
     report("parts", 0.0)
     head = head_guide(head_world, face_region, landmarks_world)
-    cells = make_cells(images, masks, used, head, settings.cell_mm)
+    cells = make_cells(images, masks, used, head, CELL_MM)
     if not cells:
         return {}
     inside = [view.inside > 0.5 for view in cells]
@@ -114,13 +116,13 @@ def classify_parts(
     unlikeness = by_colour + bearded * lower * (by_both - by_colour)
     place = gathered([place_prior(view, bearded) for view in cells])
     report("parts", 0.4)
-    share = posterior(fit_appearance(appearance, place, start, lower, unlikeness, settings), place)
+    share = posterior(fit_appearance(appearance, place, start, lower, unlikeness), place)
     report("parts", 0.6)
     rows = np.split(share, np.cumsum([np.count_nonzero(mask) for mask in inside])[:-1])
 
     def one(k: int) -> PartMap:
         name = cells[k].camera.name
-        return PartMap(name, upsample_guided(cells[k], inside[k], rows[k], images[name], masks[name], settings))
+        return PartMap(name, upsample_guided(cells[k], inside[k], rows[k], images[name], masks[name]))
 
     found = map_in_threads(one, len(cells))
     report("parts", 1.0)
@@ -229,7 +231,6 @@ def fit_appearance(
     start: Float32[np.ndarray, "n 3"],
     lower: Bool[np.ndarray, " n"],
     unlikeness: Float[np.ndarray, " n"],
-    settings: PartSettings,
 ) -> Float32[np.ndarray, "n 4"]:
     """Learns the appearance of the parts by expectation maximisation. Returns the log likelihood of every cell under
     skin, hair, clothes and an outlier class, plus the evidence that this subject shows the part at all.
@@ -243,12 +244,12 @@ def fit_appearance(
     share[:, CLOTHES_CHANNEL] *= unlikeness
     present = np.log(_presence(unlikeness, start, lower))
     logs = np.empty((len(colour), 4), np.float32)
-    logs[:, 3] = settings.strength * -np.log(OUTLIER_BINS)
-    for step in range(settings.steps):
+    logs[:, 3] = STRENGTH * -np.log(OUTLIER_BINS)
+    for step in range(STEPS):
         for part in (SKIN_CHANNEL, HAIR_CHANNEL, CLOTHES_CHANNEL):
             like = colour_histogram(colour, share[:, part])[colour] * detail_histogram(detail, share[:, part])[detail]
-            logs[:, part] = settings.strength * np.log(like) + present[part]
-        if step < settings.steps - 1:
+            logs[:, part] = STRENGTH * np.log(like) + present[part]
+        if step < STEPS - 1:
             share = posterior(logs, prior)
             share[share < CONFIDENT] = 0.0
     return logs
@@ -299,13 +300,12 @@ def upsample_guided(
     share: Float32[np.ndarray, "n 3"],
     image: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
-    settings: PartSettings,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Returns the cells' probabilities (255ths) at each pixel of the photograph, smooth except at its edges."""
     grid = np.zeros((*inside.shape, 3), np.float32)
     grid[inside] = share
-    radius = max(1, round(0.5 * settings.smooth_mm / settings.cell_mm))
-    slope, offset = guided(view.grey, grid, inside.astype(np.float32), radius, settings.edge)
+    radius = max(1, round(0.5 * SMOOTH_MM / CELL_MM))
+    slope, offset = guided(view.grey, grid, inside.astype(np.float32), radius, EDGE)
     grey, smooth = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), np.zeros((*mask.shape, 3), np.uint8)
     spread_parts(slope, offset, view.size_px, grey, mask, smooth)
     return smooth

@@ -26,7 +26,6 @@ from pipeline.photometric_fit.camera_term import camera_sensitivity, gram_matric
 from pipeline.photometric_fit.correlation_kernels import Members, Pictures, Samples, correlate_views, sweep_pictures
 from pipeline.photometric_fit.images import MIN_BLUR_PX, Photographs, blurred, distance_of
 from pipeline.photometric_fit.patches import Patches
-from pipeline.settings import PhotoSettings
 from rig.camera import Camera
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
@@ -34,6 +33,15 @@ from rig.parabola import second_difference, vertex_offset
 
 MIN_VIEW = 0.08  # squared cosine of a view that may still speak: 73 degrees
 
+CENTRE_MM = 3.0  # distance of patches
+MAX_VIEWS = 5  # most frontal views between which a patch is compared
+MIN_SEEN = 0.85  # of a patch's weight: a view that sees less of it does not count
+MIN_CORRELATION = 0.6  # a lower peak is discarded ...
+MIN_TEXTURE_CORRELATION = 0.35  # ... and without shading, where skin has 0.4 to 0.6
+FLOOR_MM = 0.15  # error of an observation that no correlation shows: highlights, the patch's own relief
+RIG_SCALE_SPREAD = 2e-4  # common error of all distances of a calibrated rig: 0.05 mm on a board of 250
+HIDDEN_MM = 1.5  # a nearer surface hides a sample beyond this: a silhouette fit's own error
+CONTOUR_MARGIN_PX = 2.0  # nothing is read nearer to the background
 DEPTH_LEVEL = "p95"  # of the z-buffer: it differs from the full mesh by far less than what may hide a sample
 MIN_FACING = 0.2  # cosine: at a flatter angle than 78 degrees a pixel smears over 5 times its size
 EDGE_PX = 4  # nothing is read nearer to the image's edge
@@ -69,11 +77,11 @@ class SampleVisibility:
 
 
 def sample_visibility(
-    problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"], settings: PhotoSettings
+    problem: ContourProblem, state: State, patches: Patches, speaks: Bool[np.ndarray, " k"]
 ) -> SampleVisibility:
     """Finds which samples each camera sees on the head of ``state``, by drawing the head's depth in every view."""
     head, coarse = head_of(problem, state), head_of(problem, state, DEPTH_LEVEL)
-    return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks, settings=settings)
+    return visibility_of(head, coarse, moved_cameras(problem, state), problem.views, patches, speaks)
 
 
 def head_of(problem: ContourProblem, state: State, level: str = "full") -> Mesh:
@@ -89,8 +97,6 @@ def visibility_of(
     views: Views,
     patches: Patches,
     speaks: Bool[np.ndarray, " k"],
-    *,
-    settings: PhotoSettings,
 ) -> SampleVisibility:
     """Finds which samples of a head each camera sees. A coarser mesh of the same surface decides what hides them.
 
@@ -101,7 +107,6 @@ def visibility_of(
         views: the silhouettes.
         patches: whose samples are looked up.
         speaks: which views have a photograph with texture; the others see nothing.
-        settings: margins.
     """
     normals = head_world.normals()
     points, outward = patches.points(head_world.vertices), patches.normals(normals)
@@ -113,7 +118,7 @@ def visibility_of(
             return facing, ends[0], ends[1]
         pixel, depth = project_points(camera, coarse_world.vertices), camera_depths(camera, coarse_world.vertices)
         depth, _ = rasterise(pixel, depth, coarse_world.faces, *distance.shape)
-        facing = facing_of(points, outward, camera, depth, distance, settings)
+        facing = facing_of(points, outward, camera, depth, distance)
         seen = np.flatnonzero(facing)
         here, further = project_points(camera, points[seen]), project_points(camera, points[seen] + outward[seen])
         ends[:, seen] = here, further - here
@@ -140,7 +145,6 @@ def facing_of(
     camera: Camera,
     depth: Float32[np.ndarray, "h w"],
     distance: Float32[np.ndarray, "h w"],
-    settings: PhotoSettings,
 ) -> Float32[np.ndarray, " s"]:
     """Returns the cosine between normal and line of sight for every sample that the camera sees; 0 for hidden samples.
 
@@ -150,7 +154,6 @@ def facing_of(
         camera: at its current pose.
         depth: z-buffer (mm) of the head in this camera.
         distance: signed distance (px) to the silhouette.
-        settings: margins.
     """
     cosine = facing_cosine(camera.centre_world, points, normals)
     height, width = depth.shape
@@ -163,8 +166,8 @@ def facing_of(
     nearest = cv2.erode(depth, np.ones((2 * WINDOW_PX + 1,) * 2, np.uint8))[row, column]
     z, facing = camera_depths(camera, points[rows]), cosine[rows]
     slope = np.minimum(np.sqrt(np.maximum(1.0 - facing**2, 0.0)) / facing, 4.0)
-    slack = settings.hidden_mm + SLOPE_SLACK * slope * z / camera.intrinsics.fx
-    seen = (distance[row, column] <= -settings.contour_margin_px) & (z <= nearest + slack)
+    slack = HIDDEN_MM + SLOPE_SLACK * slope * z / camera.intrinsics.fx
+    seen = (distance[row, column] <= -CONTOUR_MARGIN_PX) & (z <= nearest + slack)
     out = np.zeros(len(points), np.float32)
     out[rows[seen]] = facing[seen]
     return out
@@ -180,7 +183,6 @@ def observe(
     *,
     basis: Float32[np.ndarray, "m c 3"],
     each: Round,
-    settings: PhotoSettings,
 ) -> tuple[SurfaceObservations, Int[np.ndarray, " u"]]:
     """Measures the surface at the patches' centres. Returns the observations, and the vertices of patches that several
     cameras see but whose views do not match.
@@ -194,14 +196,13 @@ def observe(
         hair: patches under hair, which only bound the head from outside.
         basis: the model's modes at the patches' centres.
         each: lengths of the search.
-        settings: thresholds.
     """
     scale = pixels_per_mm(visibility.cameras, state.world_from_head.translation)
-    found = find_places(photographs, patches, visibility, problem.views, scale, each=each, settings=settings)
+    found = find_places(photographs, patches, visibility, problem.views, scale, each=each)
     several, clear, view, value = found.several, found.clear, found.view, found.value
     kept = np.flatnonzero(several & clear & (~hair | ((found.place < 0.0) & (found.height > BOUND_HEIGHT))))
     # Patches overlap: what they say together is worth their area, not their number.
-    overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / settings.centre_mm**2)
+    overlap = max(1.0, 4.0 * np.pi * each.window_mm**2 / CENTRE_MM**2)
     information = 1.0 / (overlap * found.variance[kept])
     rows, place = patches.centre[kept], found.place[kept]
     grams = gram_matrices(
@@ -212,7 +213,7 @@ def observe(
         view[kept], value[kept], grams, stood + place[:, None] * normal, normal, visibility.cameras
     )
     camera_matrix, camera_gradient = sensitivity.cameras(information)
-    metric = metric_rig(visibility.cameras, state.world_from_head.translation, settings.rig_scale_spread)
+    metric = metric_rig(visibility.cameras, state.world_from_head.translation)
     observations = SurfaceObservations(
         vertex=rows,
         basis=basis.take(kept, axis=1),  # basis[:, kept] is laid out by vertex, and copied whenever it is used
@@ -255,7 +256,6 @@ def find_places(
     scale: Float[np.ndarray, " k"],
     *,
     each: Round,
-    settings: PhotoSettings,
 ) -> Places:
     """Searches every patch along its normal for the depth at which its views correlate best. ``scale`` is the number of
     pixels per mm at the head in each camera."""
@@ -265,12 +265,12 @@ def find_places(
     samples = Samples(visibility.pixel, visibility.along, seen)
     pictures = Pictures(views.size, views.offset, image, noise)
     grey = sweep(samples, pictures, steps)
-    view, value = choose_views(patches, weights, visibility.facing, settings.least_seen, settings.views_most)
+    view, value = choose_views(patches, weights, visibility.facing, MIN_SEEN, MAX_VIEWS)
     peaks = find_peaks(correlate(patches, weights, view, value, seen, grey=grey, noise=noise), steps)
     blur_mm = np.maximum(each.blur_mm, MIN_BLUR_PX / scale).mean()
-    floor_mm = settings.floor_mm * patch_depth_factor(patches, visibility, view, value)
+    floor_mm = FLOOR_MM * patch_depth_factor(patches, visibility, view, value)
     variance = floor_mm**2 + (blur_mm / each.window_mm) ** 2 * (1.0 - peaks.height) / peaks.curvature
-    least = settings.least_correlation if each.with_shading else settings.least_texture_correlation
+    least = MIN_CORRELATION if each.with_shading else MIN_TEXTURE_CORRELATION
     clear = peaks.inside & (peaks.height > least)
     return Places(peaks.place, peaks.height, variance, view[:, 1] >= 0, clear, view, value, weights, samples, pictures)
 
@@ -284,28 +284,24 @@ def patch_depth_factor(
     return depth_factor(parallax(visibility.vertices[at], visibility.normals[at], centres, view, value))
 
 
-def head_depth_factor(
-    head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera], views_most: int
-) -> float:
+def head_depth_factor(head_world: Mesh, face: Int[np.ndarray, " n"], cameras: Sequence[Camera]) -> float:
     """Returns the median of ``depth_factor`` over the vertices ``face`` of a head (mm). Each vertex counts as seen by
-    its ``views_most`` most frontal cameras; what may hide it is ignored. Returns 1 if no vertex faces two cameras."""
+    its ``MAX_VIEWS`` most frontal cameras; what may hide it is ignored. Returns 1 if no vertex faces two cameras."""
     points, normals = head_world.vertices[face], head_world.normals()[face]
     centres = np.array([camera.centre_world for camera in cameras])
     towards = centres[None] - points[:, None]
     cosine = np.einsum("ckx,cx->ck", towards, normals) / np.linalg.norm(towards, axis=2)
     value = np.where(cosine >= MIN_FACING, cosine, 0.0) ** 2
-    view = np.argsort(-value, axis=1, kind="stable")[:, :views_most]
+    view = np.argsort(-value, axis=1, kind="stable")[:, :MAX_VIEWS]
     value = np.take_along_axis(value, view, axis=1)
     several = (value > 0.0).sum(axis=1) > 1
     found = depth_factor(parallax(points[several], normals[several], centres, view[several], value[several]))
     return float(np.median(found)) if several.any() else 1.0
 
 
-def metric_rig(
-    cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"], spread: float
-) -> Float[np.ndarray, "c c"]:
+def metric_rig(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "c c"]:
     """Returns the information (inverse covariance, over all cameras' corrections) that keeps the rig from shrinking or
-    growing: ``spread`` is the relative standard deviation of a common change of all distances to the head.
+    growing: a common change of all distances to the head has the relative deviation ``RIG_SCALE_SPREAD``.
 
     All distances come from one calibration board of known size. Images alone cannot determine them: a contour a tenth
     of a pixel too far out would move every camera closer, and the surface with them.
@@ -313,7 +309,7 @@ def metric_rig(
     depth = np.array([camera.camera_from_world.apply(at_world)[2] for camera in cameras])
     nearer = np.zeros((len(depth), 6))
     nearer[:, 5] = 1.0 / (len(depth) * depth)
-    return np.outer(nearer, nearer) / spread**2
+    return np.outer(nearer, nearer) / RIG_SCALE_SPREAD**2
 
 
 def pixels_per_mm(cameras: tuple[Camera, ...], at_world: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " k"]:

@@ -26,6 +26,7 @@ from pipeline.contour_fit.surface_term import surface_residual
 from pipeline.head_model.gaussian_process import with_fine_kernel
 from pipeline.head_model.model import HeadModel
 from pipeline.photometric_fit.depth_search import (
+    CENTRE_MM,
     Round,
     head_depth_factor,
     head_of,
@@ -37,11 +38,14 @@ from pipeline.photometric_fit.depth_search import (
 from pipeline.photometric_fit.hair_mask import HairProbability, under_hair
 from pipeline.photometric_fit.images import fine_texture, load_photographs
 from pipeline.photometric_fit.patches import Patches, arrays_of, make_patches
-from pipeline.settings import PhotoSettings
 from pipeline.warnings import Detail
 from rig.mesh import vertex_normals
 from rig.messages.message import compose
 
+SAMPLE_MM = 1.0  # distance of samples on the surface: two pixels of the usual rig
+MIN_SHARE = 0.15  # of the patches that must be found again in other views, or photographs are of no use
+FINE_LENGTH_MM = 9.0  # of the kernel that photographs add in the face region ...
+FINE_AMPLITUDE_MM = 0.5  # ... and its standard deviation
 ROUNDS = (Round(3.0, 0.8, 4.0, 17, False), Round(2.5, 0.55, 2.0, 13, False), Round(2.0, 0.45, 1.0, 9))
 RADIUS_WINDOWS = 2.0  # a patch ends at that many standard deviations of its widest window
 LEVEL, STEPS = "p95", 3  # the rim needs no more there, and the surface term is the full level's anyway
@@ -57,7 +61,6 @@ MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's o
 def refine_with_photographs(
     solved: ContourSolution,
     images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
-    settings: PhotoSettings,
     *,
     hair: HairProbability | None = None,
 ) -> tuple[ContourSolution, Detail]:
@@ -66,7 +69,6 @@ def refine_with_photographs(
     Args:
         solved: the solution of the contour solver.
         images: sRGB photographs, by camera.
-        settings: lengths and thresholds.
         hair: for each camera, the probability that a pixel shows hair; None takes everything inside the outline for
             skin.
 
@@ -81,7 +83,7 @@ def refine_with_photographs(
     if speaking < MIN_VIEWS:
         why = compose("level-views-without-texture", speaking=speaking, all=len(problem.views.names), needed=MIN_VIEWS)
         return solved, Detail("kernel", why)
-    model, patches, basis = finer(problem.model, settings)
+    model, patches, basis = finer(problem.model)
     problem = widened(problem, model, (LEVEL,))
     stage = Stage(LEVEL, len(model.modes), True, solved.stage.scales_px[-1:], solved.stage.whole_head, True, STEPS)
     state, evaluations, reason, share = solved.state, solved.evaluations, solved.termination_reason, 0.0
@@ -90,17 +92,15 @@ def refine_with_photographs(
     lost, surface = np.zeros(0, int), None
     start = head_of(problem, state)
     cameras = [camera for camera, speaks in zip(problem.rig, photographs.speaks, strict=True) if speaks]
-    for each in rounds_of_rig(head_depth_factor(start, patches.centre, cameras, settings.views_most)):
-        visibility = sample_visibility(problem, state, patches, photographs.speaks, settings)
+    for each in rounds_of_rig(head_depth_factor(start, patches.centre, cameras)):
+        visibility = sample_visibility(problem, state, patches, photographs.speaks)
         seen = visibility.facing > 0
         hidden = under_hair(patches, hair or {}, problem.views.names, visibility.pixel, seen, centres)
         read = photographs if each.with_shading else texture
-        surface, lost = observe(
-            problem, state, read, patches, visibility, hidden, basis=basis, each=each, settings=settings
-        )
+        surface, lost = observe(problem, state, read, patches, visibility, hidden, basis=basis, each=each)
         share = np.count_nonzero(~surface.bound) / max(len(patches.centre), 1)
-        if share < settings.least_share:
-            why = compose("level-alike-too-little", share=share, needed=settings.least_share)
+        if share < MIN_SHARE:
+            why = compose("level-alike-too-little", share=share, needed=MIN_SHARE)
             return solved, Detail("kernel", why)
         outline = {LEVEL: near_hair(model, patches.centre[hidden])}
         evidence = StageEvidence(solved.evidence.noise, PhotoEvidence(surface, outline))
@@ -129,13 +129,13 @@ def rounds_of_rig(factor: float) -> tuple[Round, ...]:
 
 
 @lru_cache(maxsize=1)  # 150 MB; studios work with one model
-def finer(model: HeadModel, settings: PhotoSettings) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
+def finer(model: HeadModel) -> tuple[HeadModel, Patches, Float32[np.ndarray, "m c 3"]]:
     """Returns the model with the fine kernel's modes added, its patches, and its modes at the patches' centres. All of
-    it depends on model and settings alone, and is kept for the next call."""
-    length, amplitude = settings.fine_length_mm, settings.fine_amplitude_mm
+    it depends on the model alone, and is kept for the next call."""
+    length, amplitude = FINE_LENGTH_MM, FINE_AMPLITUDE_MM
     sizes = {
-        "sample_mm": settings.sample_mm,
-        "centre_mm": settings.centre_mm,
+        "sample_mm": SAMPLE_MM,
+        "centre_mm": CENTRE_MM,
         "radius_mm": RADIUS_WINDOWS * max(each.window_mm for each in ROUNDS),
     }
 

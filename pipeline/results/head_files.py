@@ -100,7 +100,7 @@ def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
     kind = outputs.image
     source, sets = atlas.layout.source, result.texturing.sets
     strength = None if sets is None or sets.specular is None else strength_png(sets.specular)
-    if outputs.skin == "albedo" and result.texturing.albedo is not None:
+    if outputs.albedo == "glb" and result.texturing.albedo is not None:
         atlas = result.texturing.albedo.atlas
     elif sets is not None and sets.diffuse is not None and strength is not None:
         atlas = sets.diffuse  # highlights come from the strength

@@ -13,8 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.settings import SegmentationSettings
-
+COARSE_COLUMNS = 256  # columns of the coarse level: 16 pixels a decision quarter the noise, and edges stay sharp
+FIELD_SHARE = 0.12  # sigma of the gain field by the image's width: the drift of lamps is smoother than that
+TOLERANCE_LEVELS = 0.8  # error of a plate where nothing happened: 8-bit rounding, reflected light ...
+TOLERANCE_SHARE = 0.006  # ... and its part that grows with the level
+ANY_COLOUR_ODDS = 9.0  # log of the plate's density, (2 pi)^-1.5 / 1.2^3 levels^-3, by that of any colour, 64^-3
 CHANNEL_SUM = np.ones(3, np.float32)  # a product with it sums the channels ten times faster than .sum(axis=2)
 LEVEL_BINS = 8  # bins of brightness in the noise curve
 TUKEY = 4.685  # residuals (in standard deviations) beyond which a pixel says nothing of the background
@@ -43,11 +46,15 @@ def coarse_size(shape: tuple[int, ...], width: int) -> tuple[int, int]:
     return max(1, shape[1] // factor), max(1, shape[0] // factor)
 
 
+def plate_tolerance(levels: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 3"]:
+    """Returns by how many levels a plate of these levels may be off where nothing happened."""
+    return TOLERANCE_LEVELS + TOLERANCE_SHARE * levels
+
+
 def estimate_background(
     image: UInt8[np.ndarray, "h w 3"],
     image_coarse: Float32[np.ndarray, "hc wc 3"],
     plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...],
-    settings: SegmentationSettings,
 ) -> Background:
     """Estimates the background of an image with the subject in it, by fitting a smooth gain field to the clean
     plates."""
@@ -59,13 +66,13 @@ def estimate_background(
         [_mode_of_ratio(image_coarse[few][:, :, c], plate_coarse[few][:, :, c]) for c in range(3)], np.float32
     )
     field = np.broadcast_to(gain, plate_coarse.shape)
-    tolerance = settings.tolerance_levels + settings.tolerance_share * plate_coarse
+    tolerance = plate_tolerance(plate_coarse)
     weight = np.zeros(plate_coarse.shape[:2], np.float32)
     for step in range(STEPS):
         # The first steps must let the unknown field pass: 3 % of the level, then less.
         slack = tolerance + plate_coarse * (0.03, 0.015, 0.0, 0.0)[step]
         weight = _tukey(((image_coarse - field * plate_coarse) / slack) ** 2)
-        field = _gain_field(image_coarse, plate_coarse, weight, settings.field_share * size[0])
+        field = _gain_field(image_coarse, plate_coarse, weight, FIELD_SHARE * size[0])
     inliers = weight > 0.3
     stack = np.stack(plates)
     noise = _noise_by_level(image, stack, field, plate_coarse, inliers)

@@ -19,18 +19,29 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from pipeline.imaging.chart_plates import empty_plates
 from pipeline.imaging.masks import dilated, eroded, spread
-from pipeline.segmentation.background import CHANNEL_SUM, Background, coarse_size, estimate_background
+from pipeline.segmentation.background import (
+    ANY_COLOUR_ODDS,
+    CHANNEL_SUM,
+    COARSE_COLUMNS,
+    Background,
+    coarse_size,
+    estimate_background,
+    plate_tolerance,
+)
 from pipeline.segmentation.mean_field_kernels import MAX_ODDS, mean_field_sweeps
-from pipeline.settings import SegmentationSettings
 
+DARKEST_SHADOW = 0.55  # share of the sRGB code that a soft shadow leaves (a quarter of the light)
+SHADOW_CHROMA = 0.05  # how far a shadow's colour may be from the plate's, by the light it takes
 SHADOW_CHI2 = 11.3  # three channels, 99 %: what still counts as a darker piece of the plate
 STEEP = 0.03  # change of a shadow's depth a coarse pixel; blurred by 7 of them, as in the tests, a shadow has 0.016
 BRIGHTEST = 0.12  # share of the sRGB code that reflected light adds; 0.09 on the wall above an oily bald head
 REFLECTED_CHROMA = 0.3  # how far its colour may be from the plate's: it is the subject's
 SOFT_ONSET = 0.15  # depth of a shadow 2 coarse pixels before it is noticed by that 2 behind; at a sharp edge 0 to 0.06
 
+SMOOTHNESS = 1.0  # log odds that a neighbour of the same kind is worth
 SWEEPS = 12  # of the mean field; the masks of the tests do not change after the eighth
 
+MAX_HOLE_SHARE = 0.02  # of the subject: smaller holes that are not quite the plate are filled
 CLOSING = 2  # coarse pixels
 CONCLUSIVE = 10.0  # standard deviations between plate and subject's colour at which a look of the plate is proof
 SHADES = 0.35, 1.15  # by which the subject's colour may be darker (in codes; a tenth of the light) or brighter nearby
@@ -39,7 +50,7 @@ SHADES = 0.35, 1.15  # by which the subject's colour may be darker (in codes; a 
 PAINT_ODDS = 4.4  # log odds that the free choice of the shade costs: 1 % of brightness, the noise, out of 80 %
 ALLOWED, DENIED = 4.0, 3.0  # log odds for a pixel that no other camera denies, and against one that three deny
 PALETTE = 16  # bins a channel of the subject's colours
-ANY_LEVELS = 64  # a channel: the spread of any colour at all, as in settings.evidence
+ANY_LEVELS = 64  # a channel: the spread of any colour at all, as in ANY_COLOUR_ODDS
 REACH = 24  # coarse pixels from the mask in which a doubtful pixel may still be the subject
 MAX_PLATE_CHI2 = 3.0  # chi-squared by its median over the background, up to which a pixel is the plate: 93 % of it are
 HAIR_DEPTH = 6  # coarse pixels (24 px)
@@ -76,33 +87,31 @@ class Decision:
         return self.background.plates.shape[2] / self.mask.shape[1]
 
 
-def decide(
-    image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...], settings: SegmentationSettings
-) -> Decision:
+def decide(image: UInt8[np.ndarray, "_ _ 3"], plates: tuple[UInt8[np.ndarray, "_ _ 3"], ...]) -> Decision:
     """Decides which pixels of one image show the subject, by comparing it with its clean plates at a coarse level."""
-    size = coarse_size(image.shape, settings.coarse_columns)
+    size = coarse_size(image.shape, COARSE_COLUMNS)
     coarse = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    background = estimate_background(image, coarse, empty_plates(plates), settings)
-    chi2, variance = _against_plate(coarse, background, image.shape[1] / size[0], settings)
-    odds = np.clip(0.5 * chi2 - settings.evidence, -MAX_ODDS, MAX_ODDS)
-    chi2, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds, settings)
+    background = estimate_background(image, coarse, empty_plates(plates))
+    chi2, variance = _against_plate(coarse, background, image.shape[1] / size[0])
+    odds = np.clip(0.5 * chi2 - ANY_COLOUR_ODDS, -MAX_ODDS, MAX_ODDS)
+    chi2, shadow = find_shadows(coarse, background.coarse, chi2, variance, odds)
     odds = np.where(shadow, -MAX_ODDS / 2, odds).astype(np.float32)
-    probability = smooth_odds(odds, coarse, background, settings)
+    probability = smooth_odds(odds, coarse, background)
     raw = probability > 0.5
     away, mixture = find_mixtures(image, coarse, background)
     paint = spread(coarse, eroded(raw, 1) * away / (1 + mixture**2), 2.0)
     clear = colours_apart(paint, background.coarse, variance) > CONCLUSIVE
-    other, unexplained = _other_colour(coarse - background.coarse, paint, background.coarse, variance, settings)
+    other, unexplained = _other_colour(coarse - background.coarse, paint, background.coarse, variance)
     clear &= ~dilated(other, 1)
     plain = (
         clear & (chi2 < MAX_PLATE_CHI2 * np.median(chi2[background.inliers]))
         if background.inliers.any()
         else clear & False
     )
-    mask, detached_component_areas = whole_subject(raw, plain, settings)
+    mask, detached_component_areas = whole_subject(raw, plain)
     mixed = (mixture > 1) & (away > (2 * background.noise @ CHANNEL_SUM / 3) ** 2)
-    own_odds = _subject_colour_odds(coarse, raw, paint, chi2, variance, settings)
-    own_odds = np.where(other, np.maximum(own_odds, 0.5 * unexplained - settings.evidence), own_odds)
+    own_odds = _subject_colour_odds(coarse, raw, paint, chi2, variance)
+    own_odds = np.where(other, np.maximum(own_odds, 0.5 * unexplained - ANY_COLOUR_ODDS), own_odds)
     return Decision(
         coarse, background, odds, probability, mask, detached_component_areas, paint, own_odds, clear, plain, mixed
     )
@@ -115,14 +124,14 @@ def doubtful(decision: Decision) -> Bool[np.ndarray, "h w"]:
     return near & ~decision.clear & (decision.own_odds > -ALLOWED)
 
 
-def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"], settings: SegmentationSettings) -> Decision:
+def reconsider(decision: Decision, dissent: Int[np.ndarray, "h w"]) -> Decision:
     """Returns the decision revised by the other cameras. ``dissent`` counts, for each doubtful pixel, the cameras that
     rule the subject out there; it is negative where they were not asked."""
     prior = np.where(dissent == 0, ALLOWED, np.where(dissent >= 3, -DENIED, 0.0))
     revised = np.clip(np.maximum(decision.odds, decision.own_odds) + prior, -MAX_ODDS, MAX_ODDS)
     odds = np.where(dissent >= 0, revised, decision.odds).astype(np.float32)
-    probability = smooth_odds(odds, decision.coarse, decision.background, settings)
-    mask, detached_component_areas = whole_subject(probability > 0.5, decision.plain, settings)
+    probability = smooth_odds(odds, decision.coarse, decision.background)
+    mask, detached_component_areas = whole_subject(probability > 0.5, decision.plain)
     return replace(
         decision, odds=odds, probability=probability, mask=mask, detached_component_areas=detached_component_areas
     )
@@ -134,7 +143,6 @@ def _subject_colour_odds(
     paint: Float32[np.ndarray, "h w 3"],
     chi2: Float32[np.ndarray, "h w"],
     variance: Float32[np.ndarray, "h w 3"],
-    settings: SegmentationSettings,
 ) -> Float32[np.ndarray, "h w"]:
     """Returns the log odds that a pixel has a colour of the subject rather than the plate: the subject's colour nearby,
     in the best shade, or any colour found in the mask."""
@@ -147,7 +155,7 @@ def _subject_colour_odds(
         counts = 0.5 * counts + 0.25 * (low + high)
     share = counts / max(float(counts.sum()), 1.0) * (PALETTE * ANY_LEVELS / 256) ** 3  # density by that of any colour
     gain = np.log(np.maximum(share[tuple(np.moveaxis(bins, 2, 0))], 1.0))
-    return np.maximum(nearby, 0.5 * chi2 - settings.evidence + gain)
+    return np.maximum(nearby, 0.5 * chi2 - ANY_COLOUR_ODDS + gain)
 
 
 def find_mixtures(
@@ -176,14 +184,14 @@ def _quarters(image: UInt8[np.ndarray, "_ _ 3"], size: tuple[int, int]) -> Float
 
 
 def _against_plate(
-    image: Float32[np.ndarray, "h w 3"], background: Background, reduction: float, settings: SegmentationSettings
+    image: Float32[np.ndarray, "h w 3"], background: Background, reduction: float
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w 3"]]:
     """Returns the chi-squared of a coarse image against the plate, and the variance (levels squared) of their
     difference."""
     difference = image - background.coarse
     measured = 1.4826 * np.median(np.abs(difference[background.inliers]), axis=0) if background.inliers.any() else 0.0
     noise = np.maximum(background.noise / reduction, measured)  # JPEG and demosaicing leave noise that does not average
-    tolerance = settings.tolerance_levels + settings.tolerance_share * background.coarse
+    tolerance = plate_tolerance(background.coarse)
     variance = (noise**2 + tolerance**2).astype(np.float32)
     return (difference**2 / variance) @ CHANNEL_SUM, variance
 
@@ -204,7 +212,6 @@ def _other_colour(
     paint: Float32[np.ndarray, "h w 3"],
     plate: Float32[np.ndarray, "h w 3"],
     variance: Float32[np.ndarray, "h w 3"],
-    settings: SegmentationSettings,
 ) -> tuple[Bool[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Finds faint differences to the plate that neither a shadow nor a mixture with the subject's colour nearby
     (``paint``) explains, so that the subject has another colour there. Also returns the chi-squared left unexplained,
@@ -215,7 +222,7 @@ def _other_colour(
     square = (mean**2 * weight) @ CHANNEL_SUM
     left = square
     mixtures = [(shade * paint - plate, 1.0) for shade in STRAND_SHADES]
-    for direction, most in ((-plate, 1 - settings.darkest_shadow), *mixtures):
+    for direction, most in ((-plate, 1 - DARKEST_SHADOW), *mixtures):
         along, whole = (mean * direction * weight) @ CHANNEL_SUM, (direction**2 * weight) @ CHANNEL_SUM
         share = np.clip(along / np.maximum(whole, 1e-6), 0, most)
         left = np.minimum(left, square + share * (share * whole - 2 * along))
@@ -232,7 +239,6 @@ def _closed(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def whole_subject(
     mask: Bool[np.ndarray, "h w"],
     plain: Bool[np.ndarray, "h w"],
-    settings: SegmentationSettings,
 ) -> tuple[Bool[np.ndarray, "h w"], tuple[float, ...]]:
     """Returns the largest component of the mask with its small gaps and holes filled, and the areas of the other
     components as shares of its area."""
@@ -249,7 +255,7 @@ def whole_subject(
     size = stats[:, cv2.CC_STAT_AREA]
     # A gap between hair and shoulder shows the plate where nothing of the subject is like it. Far inside the outline
     # there are few gaps, and something small of the subject may look like the plate by chance.
-    small = size < settings.hole_share * subject.sum()
+    small = size < MAX_HOLE_SHARE * subject.sum()
     inner = np.bincount(holes[eroded(subject | small[holes], HAIR_DEPTH)], minlength=count) > 0.5 * size
     shown = np.bincount(holes[plain], minlength=count) / size
     gap = (shown > 0.5) & ~(inner & (size <= NOISE_HOLE_COARSE_PX))
@@ -262,12 +268,11 @@ def smooth_odds(
     odds: Float32[np.ndarray, "h w"],
     image: Float32[np.ndarray, "h w 3"],
     background: Background,
-    settings: SegmentationSettings,
 ) -> Float[np.ndarray, "h w"]:
     """Returns the probability of the subject at each pixel after mean-field smoothing, in which neighbours with similar
     residuals influence each other."""
     residual = ((image - background.coarse) / np.maximum(background.noise, 1.0)).astype(np.float32)
-    field = mean_field_sweeps(np.asarray(odds, np.float32), residual, settings.smoothness, SWEEPS)
+    field = mean_field_sweeps(np.asarray(odds, np.float32), residual, SMOOTHNESS, SWEEPS)
     return 1 / (1 + np.exp(-2 * field))
 
 
@@ -277,15 +282,14 @@ def find_shadows(
     chi2: Float32[np.ndarray, "h w"],
     variance: Float32[np.ndarray, "h w 3"],
     odds: Float32[np.ndarray, "h w"],
-    settings: SegmentationSettings,
 ) -> tuple[Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Returns the chi-squared of each pixel against the plate in its best shade, and which pixels are soft shadows or
     reflected light: they differ from the plate, a darker or brighter shade explains them, and they begin gradually."""
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
-    strength = np.sqrt(chi2 / (2 * settings.evidence))
+    strength = np.sqrt(chi2 / (2 * ANY_COLOUR_ODDS))
     best, soft = chi2, np.zeros(odds.shape, bool)
     for sign, most, chroma in (
-        (-1.0, 1 - settings.darkest_shadow, settings.shadow_chroma),
+        (-1.0, 1 - DARKEST_SHADOW, SHADOW_CHROMA),
         (1.0, BRIGHTEST, REFLECTED_CHROMA),
     ):
         depth = np.clip(sign * (ratio - 1), 0.0, most).astype(np.float32)

@@ -22,9 +22,11 @@ from pipeline.imaging.masks import box_around, dilated, eroded, spread
 from pipeline.segmentation.background import Background
 from pipeline.segmentation.foreground import Decision
 from pipeline.segmentation.matting_kernels import MAX_ALPHA_INFORMATION, solve_alpha
-from pipeline.settings import SegmentationSettings
 from rig.colour_space import linear_from_srgb
 
+BAND_PX = 6.0  # half width of the band in which alpha is solved, beyond the coarse level's 4 px
+ALPHA_BLUR_PX = 0.7  # blur that optics and pixel give an edge anyway; it halves the noise of the contour
+WEAK_CONTRAST = 4.0  # standard deviations between subject and background below which a contour piece is weak
 FULL_REDUCTION = 3  # pixels to a coarse one, for which the distances in pixels below were chosen
 INSIDE_PX = 3  # the subject's colour is taken this far inside the first contour: beyond the blur of an edge (3 sigma)
 
@@ -57,7 +59,7 @@ class Matte:
     unsure: float  # share of the contour that has little contrast, or lies beside what was not solved
 
 
-def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings: SegmentationSettings) -> Matte:
+def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision) -> Matte:
     """Computes the subject's alpha from a coarse decision.
 
     Where the subject's colour differs clearly from the plate, alpha is solved in a band wide enough for hair, which is
@@ -66,7 +68,7 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     """
     background, mask, clear = decision.background, decision.mask, decision.clear
     probability = np.where(mask, np.maximum(decision.probability, 0.6), np.minimum(decision.probability, 0.4))
-    band = int(np.ceil(settings.band_px / max(decision.reduction, FULL_REDUCTION)))
+    band = int(np.ceil(BAND_PX / max(decision.reduction, FULL_REDUCTION)))
     undecided = dilated(mask, 2) & ~eroded(mask, 2)
     undecided |= dilated(decision.mixed, 1) & dilated(mask, band) & ~eroded(mask, DEPTH * band)
     undecided &= clear | (dilated(mask, 1) & ~eroded(mask, 1))
@@ -80,12 +82,12 @@ def solve_matte(image: UInt8[np.ndarray, "h w 3"], decision: Decision, settings:
     plates, zones, guess = background.plates[:, *box], zone[cells], probability[cells].astype(np.float32)
     widths = (COARSE_ALPHA_SIGMA, SHADE)
     alpha, _, _ = solve_alpha(LINEAR, cropped, plates, light, sigma, zones, guess, paint, widths, True)
-    alpha = cv2.GaussianBlur(alpha, (0, 0), settings.alpha_blur_px)
+    alpha = cv2.GaussianBlur(alpha, (0, 0), ALPHA_BLUR_PX)
     better = _subject_inside(cropped, alpha, paint, decision.reduction)
     alpha, contrast, trust = solve_alpha(LINEAR, cropped, plates, light, sigma, zones, guess, better, widths, False)
-    alpha = _smooth(alpha, trust, settings.alpha_blur_px)
+    alpha = _smooth(alpha, trust, ALPHA_BLUR_PX)
     unsolved = dilated(contrast < 0, 1) if decision.reduction >= FULL_REDUCTION else contrast < 0
-    little = (contrast < settings.weak_contrast) | unsolved
+    little = (contrast < WEAK_CONTRAST) | unsolved
     return Matte(alpha, box, _along_contour(contrast, alpha), _share_of_edge(little, alpha))
 
 

@@ -21,10 +21,9 @@ from pipeline.imaging.silhouette import Silhouette, ViewQuality, silhouette_from
 from pipeline.segmentation.background import Background
 from pipeline.segmentation.cross_view import count_rejecting_cameras
 from pipeline.segmentation.foreground import Decision, decide, doubtful, reconsider
-from pipeline.segmentation.matting import Matte, solve_matte
+from pipeline.segmentation.matting import ALPHA_BLUR_PX, WEAK_CONTRAST, Matte, solve_matte
 from pipeline.segmentation.view_consistency import judge_agreement
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, above_chin, find_head_seed
-from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.image import ImageRgb, plates_for
@@ -32,6 +31,11 @@ from rig.messages.message import Message, compose
 from rig.progress import Progress
 from rig.rig import Rig
 
+MIN_SUBJECT_SHARE = 0.01  # of the image; a smaller subject is none
+MAX_PIECES_SHARE = 0.01  # of the subject: foreground that is not connected to it, from which a view is warned of ...
+MAX_PIECES_SHARE_USABLE = 0.15  # ... and from which it is unusable
+MAX_WEAK_SHARE = 0.015  # of the contour; 0.003 in 95 % of 66 good views
+MAX_WEAK_SHARE_USABLE = 0.25  # of the contour
 STRANGER_SHARE = 3e-4  # of the subject: smaller pieces are noise, and smaller holes: whites of eyes before a grey wall
 SOLID_HOLE = 0.995  # mean coarse probability: 1.000 in false holes of noisy captures, at most 0.99 in gaps of hair
 UNDECIDED = 0.3  # from one half: share of a cut's windows that is neither yes nor no
@@ -45,22 +49,22 @@ BODY_FILLS = 0.75  # of the subject's width is on the border where shoulders lea
 MIN_GAIN, MAX_GAIN = 0.5, 2.0  # one stop of exposure between plate and shot; beyond that it is another scene
 
 
-def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress) -> dict[str, Silhouette]:
+def segment(capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
     """Returns the silhouette of every camera of the rig. A capture without any plate or mask is segmented from the
     photographs alone. Raises InputError if only some cameras have neither."""
     if not capture.backgrounds and not capture.masks:
-        return _without_plates(capture, rig, settings, report)
+        return _without_plates(capture, rig, report)
     blind = [name for name in rig.names if name not in capture.masks and not capture.backgrounds.get(name)]
     if blind:
         raise InputError("capture", [compose("neither-plate-nor-mask", camera=name) for name in blind])
     silhouettes: dict[str, Silhouette] = {}
     with task_pool() as pool:  # cv2 and the compiled kernels release the interpreter lock
         from_masks = {
-            name: pool.submit(_operators, capture.masks[name], capture.soft_masks.get(name), settings)
+            name: pool.submit(_operators, capture.masks[name], capture.soft_masks.get(name))
             for name in rig.names & capture.masks.keys()
         }
         jobs = {
-            name: pool.submit(_decided, capture.images[name], capture.backgrounds[name], settings)
+            name: pool.submit(_decided, capture.images[name], capture.backgrounds[name])
             for name in rig.names
             if name not in from_masks
         }
@@ -72,28 +76,26 @@ def segment(capture: Capture, rig: Rig, settings: SegmentationSettings, *, repor
             decision = decisions[name]
             doubt = doubtful(decision)
             if doubt.any():
-                decision = reconsider(decision, count_rejecting_cameras(doubt, name, masks, rig), settings)
-            return _refined(capture.images[name], decision, settings)
+                decision = reconsider(decision, count_rejecting_cameras(doubt, name, masks, rig))
+            return _refined(capture.images[name], decision)
 
         finished = {name: pool.submit(finish, name) for name in decisions}
         for count, name in enumerate(rig.names, 1):
             silhouettes[name] = (from_masks | finished)[name].result()
             report("segmentation", 0.4 + 0.5 * count / len(rig))
-    agreed = judge_agreement(silhouettes, rig, settings, ready=capture.masks.keys())
+    agreed = judge_agreement(silhouettes, rig, ready=capture.masks.keys())
     report("segmentation", 1.0)
     return agreed
 
 
-def _without_plates(
-    capture: Capture, rig: Rig, settings: SegmentationSettings, report: Progress
-) -> dict[str, Silhouette]:
+def _without_plates(capture: Capture, rig: Rig, report: Progress) -> dict[str, Silhouette]:
     """Finds the silhouettes without plates or masks. With few views the search starts at the face; with more, only if
     too few silhouettes are usable otherwise."""
     few = len(rig) < SEEDED_VIEWS
-    found = _searched(capture, rig, settings, find_head_seed(capture.images, rig) if few else None, report)
+    found = _searched(capture, rig, find_head_seed(capture.images, rig) if few else None, report)
     if not few and _usable_count(found) < ENOUGH_USABLE * len(rig):
         head = find_head_seed(capture.images, rig)
-        seeded = found if head is None else _searched(capture, rig, settings, head, report)
+        seeded = found if head is None else _searched(capture, rig, head, report)
         found = max(found, seeded, key=_usable_count)
     report("segmentation", 1.0)
     return found
@@ -103,36 +105,32 @@ def _usable_count(silhouettes: Mapping[str, Silhouette]) -> int:
     return sum(silhouette.quality.usable for silhouette in silhouettes.values())
 
 
-def _searched(
-    capture: Capture, rig: Rig, settings: SegmentationSettings, head: HeadSeed | None, report: Progress
-) -> dict[str, Silhouette]:
+def _searched(capture: Capture, rig: Rig, head: HeadSeed | None, report: Progress) -> dict[str, Silhouette]:
     """Returns the silhouettes of a search that starts at ``head`` or, if None, where all cameras look."""
     from pipeline.segmentation.without_plates.decide import decide_without_plates  # packages that few captures need
 
     found = decide_without_plates(
-        capture.images, rig, settings, head=head, report=lambda share: report("segmentation", 0.8 * share)
+        capture.images, rig, head=head, report=lambda share: report("segmentation", 0.8 * share)
     )
     with task_pool() as pool:
         counted = {
             n: None if head is None else above_chin(head, rig[n], capture.images[n].shape[:2]) for n in rig.names
         }  # what is guessed on clothes does not count against the head
-        jobs = {
-            n: pool.submit(_refined, capture.images[n], one, settings, counted[n]) for n, one in found.decisions.items()
-        }
-        jobs |= {n: pool.submit(_as_cut, share, settings, counted[n]) for n, share in found.shares.items()}
-        silhouettes = {name: _doubted(jobs[name].result(), settings) for name in rig.names}
-    return judge_agreement(silhouettes, rig, settings)
+        jobs = {n: pool.submit(_refined, capture.images[n], one, counted[n]) for n, one in found.decisions.items()}
+        jobs |= {n: pool.submit(_as_cut, share, counted[n]) for n, share in found.shares.items()}
+        silhouettes = {name: _doubted(jobs[name].result()) for name in rig.names}
+    return judge_agreement(silhouettes, rig)
 
 
-def _doubted(silhouette: Silhouette, settings: SegmentationSettings) -> Silhouette:
+def _doubted(silhouette: Silhouette) -> Silhouette:
     """Returns the silhouette with its warning of a weak outline reworded for captures without plates, where a change of
     the backdrop is no remedy."""
     quality, weak = silhouette.quality, float(np.asarray(silhouette.quality.figures.get("weak_share", 1.0)))
-    if weak <= settings.weak_share_warned:
+    if weak <= MAX_WEAK_SHARE:
         return silhouette
     text = compose("outline-guessed", share=weak)
     kept = tuple(warning for warning in quality.warnings if not _concerns(warning, "outline-weak"))
-    if weak > settings.weak_share_unusable:
+    if weak > MAX_WEAK_SHARE_USABLE:
         return replace(silhouette, quality=replace(quality, warnings=(*kept, compose("view-unused", remark=text))))
     return replace(silhouette, quality=replace(quality, warnings=kept, doubts=(text,)))
 
@@ -143,9 +141,7 @@ def _concerns(message: Message, code: str) -> bool:
     return message.code == code or (isinstance(remark, Message) and remark.code == code)
 
 
-def _as_cut(
-    share: Float32[np.ndarray, "h w"], settings: SegmentationSettings, counted: Bool[np.ndarray, "h w"] | None = None
-) -> Silhouette:
+def _as_cut(share: Float32[np.ndarray, "h w"], counted: Bool[np.ndarray, "h w"] | None = None) -> Silhouette:
     """Returns the silhouette of a view that was cut along its edges; its outline is weak where the windows of the cut
     disagree. ``counted`` are the pixels whose outline is judged; None for all."""
     alpha, holes = _without_specks(share, np.zeros_like(share))
@@ -156,58 +152,53 @@ def _as_cut(
     broad = cv2.blur(undecided.astype(np.float32), (UNDECIDED_PX, UNDECIDED_PX)) > UNDECIDED_FILLED
     weak = float(broad[rim].mean()) if rim.any() else 1.0
     figures = {"cut": 1.0, "weak_share": round(weak, 4)}
-    return Silhouette(mask, distance_to_level(alpha), _quality(mask, (1, holes), float("inf"), weak, figures, settings))
+    return Silhouette(mask, distance_to_level(alpha), _quality(mask, (1, holes), float("inf"), weak, figures))
 
 
-def _operators(
-    mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | None, settings: SegmentationSettings
-) -> Silhouette:
+def _operators(mask: Bool[np.ndarray, "h w"], share: UInt8[np.ndarray, "h w"] | None) -> Silhouette:
     """Returns the silhouette of a ready mask. If the mask has soft edges (``share``), its outline is where the share is
     one half."""
     if share is None:
-        return replace(silhouette_from_mask(mask), quality=_mask_quality(mask, settings))
-    smooth = cv2.GaussianBlur(share * np.float32(1 / 255), (0, 0), settings.alpha_blur_px)
-    return Silhouette(mask, distance_to_level(smooth), _mask_quality(mask, settings))
+        return replace(silhouette_from_mask(mask), quality=_mask_quality(mask))
+    smooth = cv2.GaussianBlur(share * np.float32(1 / 255), (0, 0), ALPHA_BLUR_PX)
+    return Silhouette(mask, distance_to_level(smooth), _mask_quality(mask))
 
 
-def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Silhouette:
+def segment_view(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Silhouette:
     """Returns the silhouette of one image from its clean plates alone, without other cameras."""
-    return _refined(image, _decided(image, plates, settings), settings)
+    return _refined(image, _decided(image, plates))
 
 
-def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...], settings: SegmentationSettings) -> Decision:
-    return decide(image, plates_for(image, plates), settings)
+def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Decision:
+    return decide(image, plates_for(image, plates))
 
 
 def _refined(
     image: ImageRgb,
     decision: Decision,
-    settings: SegmentationSettings,
     counted: Bool[np.ndarray, "h w"] | None = None,
 ) -> Silhouette:
     """Returns the sub-pixel silhouette of a coarse decision, or an unusable one if the mask is too small. ``counted``
     are the pixels whose outline is judged; None for all."""
-    if decision.mask.mean() < settings.least_area:
+    if decision.mask.mean() < MIN_SUBJECT_SHARE:
         return _nothing(image.shape[:2], decision.background)
-    matte = solve_matte(image, decision, settings)
-    return _silhouette(matte, decision, settings, counted)
+    matte = solve_matte(image, decision)
+    return _silhouette(matte, decision, counted)
 
 
-def _silhouette(
-    matte: Matte, decision: Decision, settings: SegmentationSettings, counted: Bool[np.ndarray, "h w"] | None
-) -> Silhouette:
+def _silhouette(matte: Matte, decision: Decision, counted: Bool[np.ndarray, "h w"] | None) -> Silhouette:
     alpha = np.zeros(decision.background.plates.shape[1:3], np.float32)
     coarse = cv2.resize(decision.probability.astype(np.float32), alpha.shape[::-1], interpolation=cv2.INTER_LINEAR)
     alpha[matte.box], holes = _without_specks(matte.alpha, coarse[matte.box])
     distance = distance_to_level(alpha)
-    little = matte.contrast < settings.weak_contrast
+    little = matte.contrast < WEAK_CONTRAST
     if counted is not None:
         rim = matte.alpha > 0.5
         little = little[counted[matte.box][rim & ~eroded(rim, 1)]]
     weak = float(little.mean()) if len(little) else 1.0
     if counted is None:
         # What lies beside the unsolved is right in four of five places: reason to warn, not to leave the view out.
-        weak = max(weak, min(matte.unsure, settings.weak_share_unusable))
+        weak = max(weak, min(matte.unsure, MAX_WEAK_SHARE_USABLE))
     contrast = float(np.median(matte.contrast)) if len(matte.contrast) else 0.0
     others = sum(a for a in decision.detached_component_areas if a > STRANGER_SHARE)
     background = decision.background
@@ -219,7 +210,7 @@ def _silhouette(
         "other_pieces": round(others, 4),
     }
     mask = alpha > 0.5
-    return Silhouette(mask, distance, _quality(mask, (1, holes), contrast, weak, figures, settings))
+    return Silhouette(mask, distance, _quality(mask, (1, holes), contrast, weak, figures))
 
 
 def _without_specks(
@@ -255,11 +246,11 @@ def _labelled(mask: Bool[np.ndarray, "h w"], connectivity: int) -> tuple[np.ndar
     return labels, stats[:, cv2.CC_STAT_AREA].copy()
 
 
-def _mask_quality(mask: Bool[np.ndarray, "h w"], settings: SegmentationSettings) -> ViewQuality:
+def _mask_quality(mask: Bool[np.ndarray, "h w"]) -> ViewQuality:
     """Returns the quality of a mask that the operator supplied."""
     components = len(_labelled(mask, 8)[1]) - 1
     holes = len(_labelled(np.pad(~mask, 1, constant_values=True), 4)[1]) - 2
-    return _quality(mask, (components, holes), float("inf"), 0.0, {}, settings)
+    return _quality(mask, (components, holes), float("inf"), 0.0, {})
 
 
 def _quality(
@@ -268,7 +259,6 @@ def _quality(
     contrast: float,
     weak: float,
     figures: dict,
-    settings: SegmentationSettings,
 ) -> ViewQuality:
     """Judges a mask by itself: what cuts it off, its contrast and area, and the warnings that follow."""
     borders = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
@@ -279,14 +269,14 @@ def _quality(
         code = "head-cut-off-at-top" if crown == "top" else "head-cut-off-at-side"
         warnings.append(compose(code, side=crown))
     apart = figures.get("other_pieces", 0.0)
-    if apart > settings.other_pieces_warned:
+    if apart > MAX_PIECES_SHARE:
         text = compose("pieces-apart", share=apart)
-        (fatal if apart > settings.other_pieces_unusable else warnings).append(text)
-    if weak > settings.weak_share_warned:
+        (fatal if apart > MAX_PIECES_SHARE_USABLE else warnings).append(text)
+    if weak > MAX_WEAK_SHARE:
         text = compose("outline-weak", share=weak)
-        (fatal if weak > settings.weak_share_unusable else warnings).append(text)
+        (fatal if weak > MAX_WEAK_SHARE_USABLE else warnings).append(text)
     share = np.count_nonzero(mask) / mask.size
-    if share < settings.least_area or share > 0.95:
+    if share < MIN_SUBJECT_SHARE or share > 0.95:
         fatal.append(compose("subject-area-absurd", share=share))
     gains = figures.get("gain", [1.0])
     if not all(MIN_GAIN < g < MAX_GAIN for g in gains):

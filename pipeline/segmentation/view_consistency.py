@@ -23,11 +23,14 @@ from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import depth_of, hull_extent
-from pipeline.settings import SegmentationSettings
 from rig.camera import Camera
 from rig.messages.message import compose
 from rig.rig import Rig
 
+MAX_STRANGE_SHARE = 0.003  # of the mask: area that the other cameras call empty; 0 in 22 good views
+MAX_STRANGE_SHARE_USABLE = 0.01  # of the mask
+MAX_MISSING_SHARE = 0.005  # of the mask: area deep inside all the others; 0 in 22 good views
+MAX_MISSING_SHARE_USABLE = 0.02  # of the mask
 GRID = 32  # voxels a side: 12 mm on a subject of 400 mm
 REDUCTION = 16  # of the image in which areas are counted
 MIN_CAMERAS = 4  # with fewer, one camera's word stands against another's
@@ -77,7 +80,6 @@ def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRI
 def judge_agreement(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
-    settings: SegmentationSettings,
     *,
     ready: Collection[str] = (),
 ) -> dict[str, Silhouette]:
@@ -87,7 +89,6 @@ def judge_agreement(
     Args:
         silhouettes: by camera; those that are not usable are ignored.
         rig: the cameras as calibrated.
-        settings: the shares of area that give a warning, and those that make a view unusable.
         ready: cameras whose mask was given by the operator; they get warnings, but stay usable.
     """
     trusted = [name for name in rig.names if silhouettes[name].quality.usable]
@@ -98,18 +99,18 @@ def judge_agreement(
     judged = dict(silhouettes)
     masks = [silhouettes[name].mask for name in trusted]
     shares = map_in_threads(lambda k: _shares(votes, k, masks[k]), len(trusted))
-    suspects = [k for k, (_, missing) in enumerate(shares) if missing > settings.missing_share_warned]
+    suspects = [k for k, (_, missing) in enumerate(shares) if missing > MAX_MISSING_SHARE]
     found = map_in_threads(lambda i: _contradicted(votes, suspects[i], masks), len(suspects))
     contradicted = dict(zip(suspects, found, strict=True))
     limit = max(MIN_CONTRADICTED, MAX_CONTRADICTED * max(contradicted.values(), default=0.0))
     culprits = [k for k, share in contradicted.items() if share >= limit]
     for k, (name, (strange, missing)) in enumerate(zip(trusted, shares, strict=True)):
-        if strange > settings.strange_share_warned and culprits:
+        if strange > MAX_STRANGE_SHARE and culprits:
             # What a view that lacks something calls empty speaks against nobody.
             heard = replace(votes, empty=votes.empty & ~np.isin(np.arange(len(trusted)), culprits)[:, None])
             strange, _ = _shares(heard, k, masks[k])
         missing = missing if k in culprits else 0.0
-        judged[name] = _judged(silhouettes[name], strange, missing, settings, ready=name in ready)
+        judged[name] = _judged(silhouettes[name], strange, missing, ready=name in ready)
     return judged
 
 
@@ -169,18 +170,16 @@ def _splat(
     return cv2.dilate(drawn, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).view(bool)
 
 
-def _judged(
-    silhouette: Silhouette, strange: float, missing: float, settings: SegmentationSettings, *, ready: bool
-) -> Silhouette:
+def _judged(silhouette: Silhouette, strange: float, missing: float, *, ready: bool) -> Silhouette:
     quality = silhouette.quality
     warnings, usable = list(quality.warnings), quality.usable
-    if strange > settings.strange_share_warned:
-        bad = strange > settings.strange_share_unusable and not ready
+    if strange > MAX_STRANGE_SHARE:
+        bad = strange > MAX_STRANGE_SHARE_USABLE and not ready
         usable &= not bad
         text = compose("mask-alone-ready" if ready else "mask-alone", share=strange)
         warnings.append(compose("view-unused", remark=text) if bad else text)
-    if missing > settings.missing_share_warned:
-        bad = missing > settings.missing_share_unusable and not ready
+    if missing > MAX_MISSING_SHARE:
+        bad = missing > MAX_MISSING_SHARE_USABLE and not ready
         usable &= not bad
         text = compose("mask-incomplete-ready" if ready else "mask-incomplete", share=missing)
         warnings.append(compose("view-unused", remark=text) if bad else text)

@@ -101,7 +101,7 @@ def align_to_views(
         if not stated:
             front = frontmost_camera(pose.rotation[:, 2], pose.translation, rig)
         return Staged(Alignment(pose, front, "silhouettes", rival=found.rival))
-    found = feature_alignment(model, views.capture.features, rig, settings.alignment)
+    found = feature_alignment(model, views.capture.features, rig)
     names = [*views.capture.features, *rig.names]
     warnings = [compose("features", remark=remark) for remark in say_once(found.remarks, names)]
     return Staged(Alignment(found.world_from_head, front, "features"), warnings)

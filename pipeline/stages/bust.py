@@ -81,7 +81,7 @@ def fuse_depth(
             context.rig,
             head_world,
             bias=depth.window_bias,
-            settings=settings.bust,
+            spacing_mm=settings.bust.spacing_mm,
             report=context.progress,
             hair=hair,
         )

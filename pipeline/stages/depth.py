@@ -50,10 +50,10 @@ def measure_depth(context: ReconstructionContext, views: Views, head: HeadFit, l
     if is_refined(head, settings) or settings.outputs.surface != "head":
         images = without_highlights(images, views.silhouettes, context.rig, mesh)
         maps = estimate_depth(
-            images, views.silhouettes, context.rig, mesh, settings.dense, report=context.progress, device=context.device
+            images, views.silhouettes, context.rig, mesh, report=context.progress, device=context.device
         )
     votes = vote_parts(maps, labels.maps, context.rig)
-    points = dense_points(maps, votes, mesh, settings.fine)
+    points = dense_points(maps, votes, mesh)
     if labels.cap is not None:
         points = skin_under_cap(points, maps, labels.cap, context.rig)
     on_face = points_on_face(points, mesh, head.model.levels["full"].face_region)

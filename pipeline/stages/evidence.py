@@ -114,7 +114,7 @@ def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced:
     The expression is read only if that of the fit is not neutral. The lids are always taken over if points around the
     eye determined them, as ``told_lids`` tells them.
     """
-    fit, model, settings = head.fit, head.model, context.settings.fitting
+    fit, model = head.fit, head.model
     rows = blinks_of(model)
     lids = told_lids(
         {side: share for side, share in displaced.lids.items() if share != float(fit.coefficients[rows[side]])}
@@ -127,8 +127,7 @@ def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced:
         context.model,
         displaced.vertices,
         displaced.observed,
-        eigenheads=min(settings.modes, len(context.model.modes)),
-        median=settings.expression_median,
+        eigenheads=min(context.settings.fitting.modes, len(context.model.modes)),
     )
     return with_lids(read, model, lids), MIN_SIGMA if read is fit else READ_SIGMA
 

@@ -17,7 +17,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.head_model.model_basis import basis_of, model_basis
 from pipeline.imaging.highlights import without_highlights
 from pipeline.part_labels.cap import Cap
-from pipeline.photometric_fit.refine import refine_with_photographs
+from pipeline.photometric_fit.refine import FINE_AMPLITUDE_MM, refine_with_photographs
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.simplex.hierarchy import fit_simplex
 from pipeline.stages.alignment import Alignment
@@ -119,9 +119,9 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
             solved = with_bare_outline(solved, labels.skin_probability())
             cranium = "hair" if solved.evidence.noise.bare is None else "bald"
         images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
-        solved, detail = refine_with_photographs(solved, images, settings.photo, hair=hair)
+        solved, detail = refine_with_photographs(solved, images, hair=hair)
     eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
-    relief_mm = settings.photo.fine_amplitude_mm
+    relief_mm = FINE_AMPLITUDE_MM
     if detail.level == "photo":
         solved = with_expression_evidence(solved, eigenheads)
     if detail.level == "span":

@@ -100,7 +100,6 @@ def label_parts(
         head_world,
         model.levels["full"].face_region,
         landmarks_world,
-        settings=settings.parts,
         report=context.progress,
     )
     return Staged(PartLabels({name: _with_cap(part, cap) for name, part in maps.items()}, cap))

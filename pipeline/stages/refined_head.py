@@ -10,7 +10,7 @@ from pipeline.detail.depth_bias import without_window_bias
 from pipeline.detail.eyelids import measure_eye_appearance
 from pipeline.detail.outline_points import outline_search
 from pipeline.detail.patch_points import patch_search
-from pipeline.detail.refine import DeformedSurface, refine_to_surface
+from pipeline.detail.refine import MIN_OBSERVED_SHARE, DeformedSurface, refine_to_surface
 from pipeline.detail.surface_points import with_scaled_deviation
 from pipeline.fusion.untangling import untangled_head
 from pipeline.photometric_fit.depth_search import head_depth_factor
@@ -52,21 +52,20 @@ def refine_head(
         return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), head.detail))
     distances = {name: views.silhouettes[name].distance for name, used in fit.used.items() if used}
     cameras, face = [context.rig[name] for name in distances], np.flatnonzero(model.levels["full"].face_region)
-    factor = head_depth_factor(mesh, face, cameras, settings.photo.views_most)
+    factor = head_depth_factor(mesh, face, cameras)
     hair = labels.hiding_probability()
     displaced = refine_to_surface(
         fit,
         model,
         with_scaled_deviation(without_window_bias(depth.points, depth.on_face, depth.window_bias), factor),
-        settings.fine,
         eigenheads=min(settings.fitting.modes, len(fit.coefficients)),
         deviation_mm=deviation_mm,
         eyes=measure_eye_appearance(model, mesh.vertices, views.capture.images, context.rig, faces.eye_openings),
-        patches=patch_search(model, fit, depth.images, distances, hair, context.rig, settings=settings.photo),
+        patches=patch_search(model, fit, depth.images, distances, hair, context.rig),
         outlines=outline_search(model, fit, distances, hair, context.rig),
         report=context.progress,
     )
-    share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), settings.fine.least_share
+    share, needed = float(displaced.observed[model.levels["full"].face_region].mean()), MIN_OBSERVED_SHARE
     if share < needed:
         reason = compose("level-surface-too-small", share=share, needed=needed)
         return Staged(RefinedHead(*untangled_head(model, mesh.vertices, deviation_mm), Detail("photo", reason)))

@@ -63,7 +63,7 @@ def texture_head(
         depths,
         settings=settings.texture,
         around=around,
-        dim_share=DIM_SHARE if settings.outputs.delit else None,
+        dim_share=DIM_SHARE if settings.outputs.albedo != "none" else None,
     )
     close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
     atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.for_texels())
@@ -82,7 +82,7 @@ def texture_head(
         )
     reduced = reduced_layout(model, layout.layout) if layout is not None and settings.outputs.normal_map else None
     albedo, albedo_warnings = None, []
-    if settings.outputs.delit:
+    if settings.outputs.albedo != "none":
         albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)
     sets, set_warnings = colour_by_sets(
         capture.texture_sets,
@@ -115,7 +115,6 @@ def _read_pores(
         mesh,
         coloured,
         face,
-        footprint_px=context.settings.texture.footprint_px,
         sources=views.assignment,
         chart=chart,
     )

@@ -31,10 +31,10 @@ def find_views(context: ReconstructionContext) -> Staged[Views]:
     settings, rig = context.settings, context.rig
 
     def segmented(capture: Capture) -> dict[str, Silhouette]:
-        return context.segment(capture, rig, settings.segmentation, report=context.progress)
+        return context.segment(capture, rig, report=context.progress)
 
     found = usable_views(context.capture, rig, segmented, exchanged=settings.exchanged_pictures, guards=context.guards)
-    return Staged(Views(found.capture, found.silhouettes, found.pictures), found.warnings)
+    return Staged(Views(found.capture, found.silhouettes, found.pictures), [*settings.warnings, *found.warnings])
 
 
 def check_lenses(context: ReconstructionContext, views: Views) -> Staged[None]:

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.settings import DenseSettings
 from pipeline.stereo.agreement_kernels import count_agreeing
 from pipeline.stereo.crops import Crop
 from pipeline.stereo.depth_map import DepthMap, placing
@@ -14,6 +13,12 @@ from pipeline.stereo.depth_map_kernels import normals_of_known
 from pipeline.stereo.field import Field
 from pipeline.stereo.stack import Stack
 from rig.camera import Camera
+
+MAX_DEVIATION_MM = 2.0  # a depth with a larger standard deviation is discarded
+OUTLINE_PX = 1.0  # no depth nearer to the background: the edge is blurred over it
+AGREE_MM = 1.5  # two views agree where their surfaces are nearer than that ...
+AGREE_DEVIATIONS = 3.0  # ... and than this many of their joint standard deviation
+
 
 # Views that see past a place, for each that has it too: they may err as well. At 1 a tenth of the hair is lost, without
 # a bound a percent of what is told lies more than 2 mm off.
@@ -28,9 +33,7 @@ APART_SHARE = 0.9  # of the mean square distance to the other views' surfaces, b
 PIXEL_SHARE = 0.56  # of a pixel's square on the surface, brought onto the ray, by the square of the views that agree
 
 
-def depth_maps(
-    crops: Sequence[Crop], stack: Stack, fields: Sequence[Field], settings: DenseSettings
-) -> tuple[DepthMap, ...]:
+def depth_maps(crops: Sequence[Crop], stack: Stack, fields: Sequence[Field]) -> tuple[DepthMap, ...]:
     """Compares the full-size fields of all views with each other. Returns a depth map for each view with only those
     pixels whose surface point other views confirm."""
     matched = np.concatenate([(1.0 / np.sqrt(field.information + 1e-6)).ravel() for field in fields])
@@ -44,11 +47,11 @@ def depth_maps(
         apart = np.empty(shape, np.float32)
         count_agreeing(
             int(stack.offset[view]), stack.homographies(view, others), stack.lens[others, :2].copy(), matched, depth,
-            slopes, (settings.agree_mm, settings.agree_deviations), agreeing, before, apart,
+            slopes, (AGREE_MM, AGREE_DEVIATIONS), agreeing, before, apart,
         )  # fmt: skip
         deviation = stated_deviation(crops[view].camera, fields[view], agreeing, apart)
-        clear = (deviation < settings.worst_mm) & (stack.image(matched, view) < settings.worst_mm)
-        inside = stack.image(stack.distance_px, view) < -settings.outline_px
+        clear = (deviation < MAX_DEVIATION_MM) & (stack.image(matched, view) < MAX_DEVIATION_MM)
+        inside = stack.image(stack.distance_px, view) < -OUTLINE_PX
         known = inside & clear & (agreeing >= 1) & (MAX_CONTRADICTING_VIEWS * agreeing >= before)
         return _depth_map(crops[view], fields[view], known, deviation, agreeing)
 

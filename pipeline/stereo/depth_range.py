@@ -15,12 +15,14 @@ from jaxtyping import Bool, Float, Float32
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.geometry.raster import depth_map
-from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import MAX_UNSEEN_PX, Crop
 from pipeline.stereo.depth_range_kernels import find_depth_range
 from pipeline.stereo.stack import Stack
 from rig.mesh import Mesh
 
+REACH_MM = 90.0  # behind the hull's front where the fitted head bounds nothing: hair is 60 mm thick at most
+BEHIND_HEAD_MM = 6.0  # how far the surface may lie behind the fitted head: its error beside the face
+BEFORE_HEAD_MM = 60.0  # depth of what stands before the fitted head: hair, a beard, a cap's brim
 STEPS = 128  # along a ray through the subject
 SLACK_PX = 1.0  # of the least size: a mask may be that narrow
 MIN_ROOM_MM = 4.0
@@ -47,7 +49,6 @@ def find_depth_ranges(
     stack: Stack,
     head_world: Mesh | None,
     extent: tuple[Float[np.ndarray, " 3"], float],
-    settings: DenseSettings,
 ) -> list[DepthRange]:
     """Finds the range of depths to search in every view, at the size of ``stack``.
 
@@ -57,11 +58,10 @@ def find_depth_ranges(
         stack: the crops at the size of the search.
         head_world: the fitted head, world frame, mm; without it the range ends ``reach_mm`` behind the hull's front.
         extent: middle (world) and edge length (mm) of a cube that contains the subject.
-        settings: lengths.
     """
 
     def work(view: int) -> DepthRange:
-        near, far = _bounds(crops[view], least, view, head_world, extent, settings)
+        near, far = _bounds(crops[view], least, view, head_world, extent)
         return _enlarged(near, far, stack, view)
 
     return map_in_threads(work, len(crops))
@@ -73,7 +73,6 @@ def _bounds(
     view: int,
     head_world: Mesh | None,
     extent: tuple[Float[np.ndarray, " 3"], float],
-    settings: DenseSettings,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Returns the nearest and farthest depth (mm) of each pixel at the least size; 0 where no depth is possible."""
     camera = crop.levels[-1].camera
@@ -90,10 +89,10 @@ def _bounds(
     room = near > 0.0
     near[room] -= step
     if head_world is None:
-        far[room] = np.minimum(far[room], near[room] + settings.reach_mm)
+        far[room] = np.minimum(far[room], near[room] + REACH_MM)
     else:
         head, _ = depth_map(camera, head_world.vertices, head_world.faces)
-        _bound_by_head(near, far, room, head, settings)
+        _bound_by_head(near, far, room, head)
     far[room] = np.maximum(far[room], near[room] + MIN_ROOM_MM + step)
     return near, far
 
@@ -103,7 +102,6 @@ def _bound_by_head(
     far: Float32[np.ndarray, "h w"],
     room: Bool[np.ndarray, "h w"],
     head: Float[np.ndarray, "h w"],
-    settings: DenseSettings,
 ) -> None:
     """Narrows the bounds in place to depths near the fitted head, whose depths are ``head`` (mm, infinite beside it).
 
@@ -112,13 +110,13 @@ def _bound_by_head(
     """
     seen = room & np.isfinite(head)
     if not seen.any() or np.median((head - near)[seen]) < LOOSE_HULL_MM:
-        far[room] = np.minimum(far[room], near[room] + settings.reach_mm)
+        far[room] = np.minimum(far[room], near[room] + REACH_MM)
     else:
         beside = room & ~seen
-        near[beside] = np.maximum(near[beside], float(head[seen].min()) - settings.before_head_mm)
-        far[beside] = np.minimum(far[beside], float(head[seen].max()) + settings.before_head_mm)
-        near[seen] = np.maximum(near[seen], head[seen] - settings.before_head_mm)
-    far[seen] = np.minimum(far[seen], head[seen] + settings.behind_head_mm)
+        near[beside] = np.maximum(near[beside], float(head[seen].min()) - BEFORE_HEAD_MM)
+        far[beside] = np.minimum(far[beside], float(head[seen].max()) + BEFORE_HEAD_MM)
+        near[seen] = np.maximum(near[seen], head[seen] - BEFORE_HEAD_MM)
+    far[seen] = np.minimum(far[seen], head[seen] + BEHIND_HEAD_MM)
 
 
 def _enlarged(near: Float32[np.ndarray, "h w"], far: Float32[np.ndarray, "h w"], stack: Stack, view: int) -> DepthRange:

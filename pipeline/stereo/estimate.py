@@ -19,7 +19,6 @@ from jaxtyping import Float, Float32, Int, UInt8
 from pipeline.compute.trace import traced
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.visual_hull import hull_extent
-from pipeline.settings import DenseSettings
 from pipeline.stereo.agreement import depth_maps
 from pipeline.stereo.crops import make_crops
 from pipeline.stereo.depth_map import DepthMap
@@ -35,31 +34,35 @@ from rig.progress import Progress
 from rig.render.compute import ComputeDevice
 from rig.rig import Rig
 
+PIXEL_MM = 0.4  # on the subject; finer photographs are reduced to it, for their noise is below 0.1 mm there
+CONTRAST_LEVELS = 30.0  # a pixel that differs by this from its window's middle weighs half
+MIN_ANGLE_DEG = 8.0  # between the views of a pair: nearer ones determine depth badly
+MAX_ANGLE_DEG = 45.0  # farther ones match hair and ears wrongly ...
+WIDEST_ANGLE_DEG = 65.0  # ... and are used only where a view has fewer than ``MIN_NEIGHBOURS``
+MIN_NEIGHBOURS = 3
+MAX_NEIGHBOURS = 5
 
-def choose_neighbours(
-    cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"], settings: DenseSettings
-) -> list[Int[np.ndarray, " _"]]:
+
+def choose_neighbours(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3"]) -> list[Int[np.ndarray, " _"]]:
     """Returns, for each camera, the indices of the cameras to match it with, by increasing angle between their lines of
     sight; empty if there are none.
 
     Args:
         cameras: of all views.
         at_world: about the middle of the subject (mm), where the lines of sight meet.
-        settings: limits of the angle and of the number.
     """
     towards = np.stack([camera.centre_world - at_world for camera in cameras])
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
     angle = np.degrees(np.arccos(np.clip(towards @ towards.T, -1.0, 1.0)))
     chosen = []
     for row in angle:
-        order = [k for k in np.argsort(row, kind="stable") if settings.angle_least_deg < row[k]]
+        order = [k for k in np.argsort(row, kind="stable") if row[k] > MIN_ANGLE_DEG]
         kept = [
             k
             for place, k in enumerate(order)
-            if row[k] < settings.angle_most_deg
-            or (place < settings.neighbours_least and row[k] < settings.angle_widest_deg)
+            if row[k] < MAX_ANGLE_DEG or (place < MIN_NEIGHBOURS and row[k] < WIDEST_ANGLE_DEG)
         ]
-        chosen.append(np.array(kept[: settings.neighbours_most], dtype=np.int64))
+        chosen.append(np.array(kept[:MAX_NEIGHBOURS], dtype=np.int64))
     return chosen
 
 
@@ -84,7 +87,6 @@ def estimate_depth(
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
     head_world: Mesh | None,
-    settings: DenseSettings,
     *,
     report: Progress,
     device: ComputeDevice | None = None,
@@ -96,7 +98,6 @@ def estimate_depth(
         silhouettes: by camera name; a view whose silhouette is not usable is left out.
         rig: the cameras.
         head_world: the head fitted so far (world, mm), which limits the depths to search; None if there is none.
-        settings: of the dense stage.
         report: called with ``"dense"`` and the share that is done; an exception that it raises stops the work.
         device: GPU that compares the windows; None uses compiled loops.
 
@@ -106,27 +107,27 @@ def estimate_depth(
     """
     extent = hull_extent(silhouettes, rig)
     report("dense", 0.0)
-    crops = make_crops(images, silhouettes, rig, pixel_mm=settings.pixel_mm, at_world=extent[0])
+    crops = make_crops(images, silhouettes, rig, pixel_mm=PIXEL_MM, at_world=extent[0])
     if not crops:
         return ()
-    neighbours = choose_neighbours([crop.camera for crop in crops], extent[0], settings)
+    neighbours = choose_neighbours([crop.camera for crop in crops], extent[0])
     pattern = square_pattern(2)
     first = find_search_level([crop.camera for crop in crops], extent[0])
     stack = stack_crops(crops, first)
-    depth_ranges = find_depth_ranges(crops, stack_crops(crops, COARSEST_LEVEL), stack, head_world, extent, settings)
+    depth_ranges = find_depth_ranges(crops, stack_crops(crops, COARSEST_LEVEL), stack, head_world, extent)
     report("dense", 0.1)
     fields: list[Field] = []
     for doublings in range(first + 1):
         level = first - doublings
         if doublings:
             stack = stack_crops(crops, level)
-            fields = doubled(fields, stack, settings)
-        with matching_on(device, stack, neighbours, pattern, settings.contrast_levels) as matching:
+            fields = doubled(fields, stack)
+        with matching_on(device, stack, neighbours, pattern, CONTRAST_LEVELS) as matching:
             if not doublings:
-                fields = first_fields(matching, depth_ranges, settings)
+                fields = first_fields(matching, depth_ranges)
                 report("dense", 0.3)
-            fields = refined(fields, matching, settings, PASSES[doublings])
+            fields = refined(fields, matching, PASSES[doublings])
         report("dense", DONE[level])
-    found = depth_maps(crops, stack, fields, settings)
+    found = depth_maps(crops, stack, fields)
     report("dense", 1.0)
     return found

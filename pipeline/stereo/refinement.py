@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import MAX_UNSEEN_PX
 from pipeline.stereo.field import Field
 from pipeline.stereo.field_kernels import double, fit_planes
@@ -21,6 +20,10 @@ from pipeline.stereo.matcher import Matching, Planes
 from pipeline.stereo.speck_kernels import fill_specks, mark_specks
 from pipeline.stereo.stack import Stack
 
+MATCH_FACTOR = 1.6  # of a match's own standard deviation: samples of a window are not independent
+MATCH_FLOOR_MM = 0.1  # error of a match that its window does not show
+CARRIED = 0.5  # share of the information that goes on to the next size, as far as ...
+RELIEF_FACTOR = 3.0  # ... this many times the relief about a pixel allows: without it hair and lids blur
 GAP_PX = 1.0  # between the planes of two pixels of one piece
 SWEEPS = 30  # a speck of 60 pixels is 8 wide
 
@@ -56,7 +59,7 @@ PLANE_ROUNDS = 2  # what takes a speck's place is tried against its neighbours, 
 MAX_SLIDE_PX = 1.0  # of a step: linear models of an image reach no farther
 
 
-def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> list[Field]:
+def doubled(fields: Sequence[Field], stack: Stack) -> list[Field]:
     """Returns the fields enlarged to twice their width and height, the size of ``stack``. They keep a part of their
     information."""
 
@@ -65,8 +68,8 @@ def doubled(fields: Sequence[Field], stack: Stack, settings: DenseSettings) -> l
         live = (distance < 0.5) & (distance > MAX_UNSEEN_PX)
         depth, slopes = np.empty(live.shape, np.float32), np.empty((*live.shape, 2), np.float32)
         double(field.depth, field.slopes, live, depth, slopes)
-        relief = (settings.relief_factor * field.relief_mm) ** 2
-        known = settings.carried * field.information / (1.0 + field.information * relief)
+        relief = (RELIEF_FACTOR * field.relief_mm) ** 2
+        known = CARRIED * field.information / (1.0 + field.information * relief)
         information = cv2.resize(known, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
         zero = np.zeros_like(depth)
         return Field(depth, slopes, information, zero, zero)
@@ -83,17 +86,17 @@ class Pass:
     rounds: int  # of least squares
 
 
-def refined(fields: Sequence[Field], matching: Matching, settings: DenseSettings, once: Pass) -> list[Field]:
+def refined(fields: Sequence[Field], matching: Matching, once: Pass) -> list[Field]:
     """Improves the field of every view: pixels take over their neighbours' planes, small wrong pieces of surface are
     replaced, and least squares then moves the planes."""
 
     def work(view: int) -> Field:
-        return _refined(fields[view], matching, view, settings, once)
+        return _refined(fields[view], matching, view, once)
 
     return map_in_threads(work, len(fields))
 
 
-def _refined(field: Field, matching: Matching, view: int, settings: DenseSettings, once: Pass) -> Field:
+def _refined(field: Field, matching: Matching, view: int, once: Pass) -> Field:
     matcher = matching.matcher(view)
     depth, slopes, live = field.depth.copy(), field.slopes.copy(), field.depth > 0.0
     pixel_mm = float(depth[live].mean() / matching.stack.lens[view, 0]) if live.any() else 1.0
@@ -111,7 +114,7 @@ def _refined(field: Field, matching: Matching, view: int, settings: DenseSetting
     information, relief, likeness = known, np.zeros_like(depth), np.zeros_like(depth)
     for _ in range(once.rounds):
         place, seen, likeness = matcher.slide(MAX_SLIDE_PX, depth, slopes)
-        seen = seen / (settings.match_factor**2 + settings.match_floor_mm**2 * seen)
+        seen = seen / (MATCH_FACTOR**2 + MATCH_FLOOR_MM**2 * seen)
         information = seen + known
         joined = np.where(live, (seen * place + known * before) / information, 0.0).astype(np.float32)
         depth, flatter, relief = np.empty_like(joined), np.empty_like(slopes), np.empty_like(joined)

@@ -13,12 +13,14 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.settings import DenseSettings
-from pipeline.stereo.depth_range import STEEPEST, DepthRange
+from pipeline.stereo.depth_range import REACH_MM, STEEPEST, DepthRange
 from pipeline.stereo.field import Field
 from pipeline.stereo.matcher import Matching
 from pipeline.stereo.sweep_kernels import aggregate
 from rig.camera import Camera
+
+LABELS = 21  # depths along a ray in each of two sweeps: 4.5 mm apart at the deepest; 41 are no better
+
 
 # On the subject, of images that are searched: windows of 5 pixels then span 10 mm. At 512 x 384 a quarter of the size,
 # 4.2 mm a pixel, left 21 % of the face 2 mm off, half of it leaves 14 % (an oily head, noise of 6 levels).
@@ -46,16 +48,16 @@ def find_search_level(cameras: Sequence[Camera], at_world: Float[np.ndarray, " 3
     return min(max(halvings, FIRST_LEVELS[0]), FIRST_LEVELS[-1])
 
 
-def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange], settings: DenseSettings) -> list[Field]:
+def first_fields(matching: Matching, depth_ranges: Sequence[DepthRange]) -> list[Field]:
     """Finds a first depth in every view by trying depths at even steps through the range of each pixel, twice. The
     fields have no information yet (0)."""
 
     def work(view: int) -> Field:
         room, matcher = depth_ranges[view], matching.matcher(view)
-        strides = label_strides(room, settings)
-        field = _cheapest(matcher.sweep(room, strides, settings.labels), room, strides)
+        strides = label_strides(room)
+        field = _cheapest(matcher.sweep(room, strides, LABELS), room, strides)
         room = slanted(room, field, float(matching.stack.lens[view, 0]))
-        return _cheapest(matcher.sweep(room, strides, settings.labels), room, strides)
+        return _cheapest(matcher.sweep(room, strides, LABELS), room, strides)
 
     return map_in_threads(work, len(matching.stack))
 
@@ -90,11 +92,11 @@ def slopes_around(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w
     return slopes.astype(np.float32)
 
 
-def label_strides(room: DepthRange, settings: DenseSettings) -> Int32[np.ndarray, "h w"]:
+def label_strides(room: DepthRange) -> Int32[np.ndarray, "h w"]:
     """Returns how many depths each pixel advances from one matched depth to the next: 1, 2, 4 and so on. A narrow range
     needs fewer of them for the same spacing in mm."""
-    depth = np.clip(room.far - room.near, settings.reach_mm / settings.labels, settings.reach_mm)
-    return (2 ** np.floor(np.log2(settings.reach_mm / depth))).astype(np.int32)
+    depth = np.clip(room.far - room.near, REACH_MM / LABELS, REACH_MM)
+    return (2 ** np.floor(np.log2(REACH_MM / depth))).astype(np.int32)
 
 
 def _cheapest(cost: Float32[np.ndarray, "h w d"], room: DepthRange, strides: Int32[np.ndarray, "h w"]) -> Field:

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from pipeline.geometry.projection import project_points
 from pipeline.imaging.masks import box_around
 from pipeline.texturing.paint_kernels import PHASES, TAPS, Choice, Pictures
+from pipeline.texturing.visibility import FOOTPRINT_PX
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 from rig.mesh import Mesh
 from rig.rig import Rig
@@ -61,7 +62,6 @@ def pack_pictures(
     offsets: Float[np.ndarray, "k 3"],
     *,
     mesh_world: Mesh,
-    footprint_px: float,
 ) -> Pictures:
     """Packs the part of each photograph around its silhouette into one array, with the camera's gain and offset
     applied."""
@@ -80,4 +80,4 @@ def pack_pictures(
         places[k] = np.nan_to_num(project_points(camera, mesh_world.vertices) - corner)
     width = np.array([part.shape[1] for part in parts], np.int64)
     height = np.array([part.shape[0] for part in parts], np.int64)
-    return Pictures(codes, first[:-1].astype(np.int64), width, height, places, window_table(footprint_px))
+    return Pictures(codes, first[:-1].astype(np.int64), width, height, places, window_table(FOOTPRINT_PX))

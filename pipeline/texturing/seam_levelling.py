@@ -16,6 +16,7 @@ from pipeline.compute.threads import in_threads
 from pipeline.texturing.neighbourhood import Neighbourhood
 from pipeline.texturing.view_selection_kernels import level_view
 
+LEVELLING = 10.0  # weight of a correction's step along an edge, by one of a departure from the views' mean
 SWEEPS, FACTOR = 25, 1.7  # over-relaxed: corrections are right to 0.1 code after them
 
 
@@ -24,7 +25,6 @@ def level_views(
     codes: Float32[np.ndarray, "k v 3"],
     agreed: Float32[np.ndarray, "v 3"],
     around: Neighbourhood,
-    smoothness: float,
 ) -> Float32[np.ndarray, "k v 4"]:
     """Computes what is added to each view at each vertex (sRGB codes; the fourth channel is 0) so that neighbouring
     views meet without a visible step.
@@ -34,15 +34,13 @@ def level_views(
         codes: sRGB codes of every view at every vertex.
         agreed: codes on which the views of each vertex agree.
         around: the mesh's edges.
-        smoothness: weight of a difference between corrections along an edge, relative to that of a difference to
-            ``agreed``.
     """
     fields = np.zeros((*weights.shape, 4), np.float32)
     fields[:, :, :3] = (agreed - codes) * (weights > 0)[:, :, None]
 
     def work(first: int, last: int) -> None:
         for k in range(first, last):
-            level_view(fields[k], weights[k] > 0, around.starts, around.indices, smoothness, SWEEPS, FACTOR)
+            level_view(fields[k], weights[k] > 0, around.starts, around.indices, LEVELLING, SWEEPS, FACTOR)
 
     in_threads(len(weights), work)
     return fields

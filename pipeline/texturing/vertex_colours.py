@@ -36,7 +36,7 @@ from pipeline.texturing.inpaint import fill_unknown
 from pipeline.texturing.neighbourhood import Neighbourhood
 from pipeline.texturing.paint_kernels import Pictures
 from pipeline.texturing.seam_levelling import level_views
-from pipeline.texturing.vertex_colours_kernels import blend_views
+from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
 from pipeline.texturing.view_selection import add_similar_views, select_views
 from pipeline.texturing.visibility import Sight, see_points, see_weights, sharpened
 from pipeline.warnings import ReportWarning
@@ -108,9 +108,9 @@ def texture(
 
     def read_view(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
         name = camera.name
-        image = sharpened(capture.images[name], silhouettes[name].mask, settings)
+        image = sharpened(capture.images[name], silhouettes[name].mask, settings.sharpening)
         points, silhouette = mesh_world.vertices, silhouettes[name]
-        sight = see_points(camera, image, silhouette, depths[name], points, normals, settings=settings)
+        sight = see_points(camera, image, silhouette, depths[name], points, normals)
         return sight, image
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
@@ -120,18 +120,16 @@ def texture(
         gains, offsets = balance(weights, colours)
     weights *= gain_confidence(gains)[:, None]
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
-    agreed, seen = blend_views(weights, balanced, settings.outlier)
+    agreed, seen = blend_views(weights, balanced, OUTLIER)
     if not seen.any():
         return _untextured(len(seen))
     decision = None
     if around is not None:
         images = [image for _, image in found]
         masks = {name: silhouettes[name].mask for name in views.names}
-        pictures = pack_pictures(
-            views, images, masks, gains, offsets, mesh_world=mesh_world, footprint_px=settings.footprint_px
-        )
-        decision = decide(views, weights, balanced, agreed, gains, pictures, around=around, settings=settings)
-        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, settings)
+        pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world=mesh_world)
+        decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
+        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths)
     shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
@@ -168,16 +166,14 @@ def decide(
     pictures: Pictures,
     *,
     around: Neighbourhood,
-    settings: TextureSettings,
 ) -> Decision:
     """Chooses a view for each vertex, and computes the corrections that level the seams between views."""
-    chosen = settings.selection
     codes = (255 * srgb_from_linear(np.clip(balanced, 0, 1))).astype(np.float32)
     level_to = (255 * srgb_from_linear(np.clip(agreed, 0, 1))).astype(np.float32)
-    fields = level_views(weights, codes, level_to, around, chosen.levelling)
+    fields = level_views(weights, codes, level_to, around)
     detail = codes + fields[:, :, :3]
-    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around=around, settings=chosen)
-    slots, shares = add_similar_views(labels, options, quality, detail, weights, around=around, settings=chosen)
+    labels, options, quality = select_views(weights, codes, detail, level_to, gains, around=around)
+    slots, shares = add_similar_views(labels, options, quality, detail, weights, around=around)
     corrections = fields[np.maximum(slots, 0), np.arange(len(slots))[:, None]]
     return Decision(views, slots, shares, corrections, weights, pictures)
 
@@ -285,7 +281,6 @@ def fill_unobserved_patches(
     mesh_world: Mesh,
     silhouettes: Mapping[str, Silhouette],
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
-    settings: TextureSettings,
 ) -> Decision:
     """Returns the decision with a view added at the corners of every wide patch that a camera sees although it sees
     none of the corners, such as a strip that closes an eye."""
@@ -297,10 +292,7 @@ def fill_unobserved_patches(
     faces, normals, area = _parts(mesh_world, rows)
     points = np.einsum("pk,fkx->fpx", INNER, mesh_world.vertices[faces]).reshape(-1, 3)
     facing = np.repeat(normals, len(INNER), axis=0)
-    found = [
-        see_weights(view, silhouettes[view.name], depths[view.name], points, facing, settings)
-        for view in decision.views
-    ]
+    found = [see_weights(view, silhouettes[view.name], depths[view.name], points, facing) for view in decision.views]
     seen = np.stack(found).reshape(len(found), len(rows), len(INNER))
     shown = (seen > 0).mean(axis=2).max(axis=0) >= MIN_SHOWN  # the hidden side of a lid is blind as the eye is
     faces, area, seen = faces[shown], area[shown], seen[:, shown]

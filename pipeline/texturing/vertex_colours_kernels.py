@@ -4,6 +4,7 @@ import numpy as np
 
 from rig.jit import njit
 
+OUTLIER = 0.12  # difference from the median of the views, by its level, at which a brighter view counts half
 DARKER = 0.5  # of a difference, where a view is darker: most are shading that turns with the surface, few are shadows
 MAX_VOTE = 0.7  # of a view about the median, by the mean weight: a close-up that a shadow lies in is one of many
 MIN_SHARE = 0.005  # of a vertex's weight: a view with less has not coloured it

@@ -12,7 +12,6 @@ Huttenlocher, *Efficient Belief Propagation for Early Vision*, IJCV 2006), in sw
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from pipeline.settings import SelectionSettings
 from pipeline.texturing.neighbourhood import Neighbourhood
 from pipeline.texturing.view_selection_kernels import (
     NEVER,
@@ -23,6 +22,12 @@ from pipeline.texturing.view_selection_kernels import (
     ring_quality,
 )
 
+DISAGREEMENT = 0.06  # of the colour's code: a view that differs so much from the others ...
+OUTLIER_COST = 2.0  # ... has half of this cost, by that of a view that sees nothing
+SEAM_COST = 0.15  # of an edge where views differ by ``DISAGREEMENT``
+MAX_VIEWS = 4  # views whose mean is a position's detail ...
+NOISE_FACTOR = 4.0  # ... where they differ from the chosen one by no more than this, by the median over the head
+SWEEPS = 8  # of belief propagation
 CANDIDATES = 6  # views of a vertex that come into question; a seventh is hardly ever the best
 GAIN_COST = 1.0  # of a camera whose light was doubled or halved
 NOISE_CODES = 2.0  # disagreement that noise makes in the dark
@@ -36,7 +41,7 @@ def select_views(
     gains: Float[np.ndarray, "k 3"],
     *,
     around: Neighbourhood,
-    settings: SelectionSettings,
+    seam_cost: float = SEAM_COST,
 ) -> tuple[Int32[np.ndarray, " v"], Int32[np.ndarray, "v c"], Float32[np.ndarray, "v c"]]:
     """Chooses a view for each vertex, -1 where none sees it. Also returns the candidate views of each vertex and their
     quality.
@@ -48,23 +53,23 @@ def select_views(
         agreed: codes on which the views agree.
         gains: of the cameras; their product is 1.
         around: the mesh's edges.
-        settings: of the selection.
+        seam_cost: of an edge where views differ.
     """
     quality = ring_quality(weights, around.starts, around.indices)
     best = quality.max(axis=1, keepdims=True)
     costs = 1.0 - quality / np.maximum(best, 1e-12)
-    off = np.maximum(_disagreement(codes, agreed, settings), _disagreement(levelled, agreed, settings))
-    costs += settings.outlier * off**2 / (1.0 + off**2)
+    off = np.maximum(_disagreement(codes, agreed), _disagreement(levelled, agreed))
+    costs += OUTLIER_COST * off**2 / (1.0 + off**2)
     costs += GAIN_COST * np.abs(np.log2(gains.mean(axis=1)))
     costs = np.where(weights.T > 0, costs, NEVER).astype(np.float32)
     views, candidates = best_candidates(costs, min(CANDIDATES, len(weights)))
     share = np.where(weights.T > 0, quality, 0.0)
     spread = (share * off).sum(axis=1) / np.maximum(share.sum(axis=1), 1e-12)
     unlike = np.minimum(spread, 3.0)
-    penalty = settings.smoothness * (0.3 + 0.5 * (unlike[around.rows] + unlike[around.indices]))
+    penalty = seam_cost * (0.3 + 0.5 * (unlike[around.rows] + unlike[around.indices]))
     chosen = propagate(
         views, candidates, around.starts, around.indices, around.opposite, penalty.astype(np.float32), len(weights),
-        settings.sweeps,
+        SWEEPS,
     )  # fmt: skip
     found = np.take_along_axis(views, np.maximum(chosen, 0)[:, None], axis=1)[:, 0]
     labels = np.where(chosen >= 0, found, -1).astype(np.int32)
@@ -72,10 +77,10 @@ def select_views(
 
 
 def _disagreement(
-    codes: Float32[np.ndarray, "k v 3"], agreed: Float32[np.ndarray, "v 3"], settings: SelectionSettings
+    codes: Float32[np.ndarray, "k v 3"], agreed: Float32[np.ndarray, "v 3"]
 ) -> Float32[np.ndarray, "v k"]:
     """How far each view is from the others, by what is ordinary."""
-    off = (codes - agreed) / (settings.disagreement * agreed + NOISE_CODES)
+    off = (codes - agreed) / (DISAGREEMENT * agreed + NOISE_CODES)
     return np.sqrt(np.einsum("kvc,kvc->vk", off, off) / 3.0)
 
 
@@ -87,7 +92,6 @@ def add_similar_views(
     weights: Float32[np.ndarray, "k v"],
     *,
     around: Neighbourhood,
-    settings: SelectionSettings,
 ) -> tuple[Int32[np.ndarray, "v s"], Float32[np.ndarray, "v s"]]:
     """Adds to the chosen view of each vertex other views that differ from it by noise alone, so that their mean has
     less noise. Views that differ by more, as in eyes, brows and lips, are left out, since blending them would blur.
@@ -99,7 +103,6 @@ def add_similar_views(
         detail: sRGB codes of the levelled views.
         weights: how well each view sees each vertex; 0 = not seen.
         around: the mesh's edges.
-        settings: of the selection.
 
     Returns:
         Views (-1: none) and their shares in the mean, the chosen one first.
@@ -108,6 +111,6 @@ def add_similar_views(
     informative = off[(off >= 0) & (views != labels[:, None])]
     noise = max(float(np.median(informative)), 0.25) if len(informative) else 1.0
     best = np.maximum(quality.max(axis=1, keepdims=True), 1e-12)
-    shares = (quality / best) * np.exp(-np.maximum(off / (settings.noise_factor * noise) - 1.0, 0.0))
+    shares = (quality / best) * np.exp(-np.maximum(off / (NOISE_FACTOR * noise) - 1.0, 0.0))
     shares = np.where((off >= 0) & (labels[:, None] >= 0), shares, 0.0).astype(np.float32)
-    return fill_slots(labels, views, shares, settings.views_most)
+    return fill_slots(labels, views, shares, MAX_VIEWS)

@@ -17,11 +17,15 @@ from pipeline.geometry.projection import project_points
 from pipeline.geometry.raster import camera_depths
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.settings import TextureSettings
 from pipeline.texturing.visibility_kernels import POOR, sample_colours, visibility_weights
 from rig.camera import Camera
 from rig.colour_space import linear_from_srgb
 
+CONTOUR_MARGIN_PX = 2.0  # nothing is sampled nearer to the background: 3 sigma of a 0.7 px defocus
+FOOTPRINT_PX = 0.45  # sigma of the sampling window; 0.7 loses 0.3 dB of detail, 0.4 lets 1.5 dB more noise
+HIDDEN_MM = 1.5  # a nearer surface hides a vertex beyond this: a fit's own error, and no nose is thinner
+MIN_FACING = 0.15  # cosine: at a flatter angle than 81 degrees a pixel smears over 6 mm
+FACING_POWER = 1.0  # of normal . viewing direction, as the paper's weight; 2 is 1 dB worse in a view that was kept back
 LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
 CLIPS = tuple(LINEAR[[242, 254]])  # linear; noise and sharpening reach a little below the end of the scale
 UNSHARP_PX = 1.0  # sigma; 1.5 is 0.6 dB worse on a head of another renderer
@@ -44,14 +48,12 @@ def see_points(
     depth: Float32[np.ndarray, "h w"],
     points: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
-    *,
-    settings: TextureSettings,
 ) -> Sight:
     """Returns the weight and linear colour that ``camera`` gives each point of a surface (world frame, mm). ``depth``
     is the surface's depth map in that camera."""
-    weights = see_weights(camera, silhouette, depth, points, normals, settings)
+    weights = see_weights(camera, silhouette, depth, points, normals)
     pixels = project_points(camera, points)
-    colours = sample_colours(image, pixels, weights, LINEAR, settings.footprint_px)
+    colours = sample_colours(image, pixels, weights, LINEAR, FOOTPRINT_PX)
     return Sight(weights * unclipped(colours), colours)
 
 
@@ -72,7 +74,6 @@ def see_weights(
     depth: Float32[np.ndarray, "h w"],
     points: Float[np.ndarray, "v 3"],
     normals: Float[np.ndarray, "v 3"],
-    settings: TextureSettings,
 ) -> Float32[np.ndarray, " v"]:
     """Returns how well ``camera`` sees each point of a surface (world frame, mm); 0 where it does not. ``depth`` is the
     surface's depth map in that camera."""
@@ -84,26 +85,27 @@ def see_weights(
         depth,
         silhouette.distance,
         1.0 / camera.intrinsics.fx,
-        (settings.contour_margin_px, settings.hidden_mm, settings.least_facing, settings.sharpness),
+        (CONTOUR_MARGIN_PX, HIDDEN_MM, MIN_FACING, FACING_POWER),
     )
 
 
 def sharpened(
-    image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], settings: TextureSettings
+    image: UInt8[np.ndarray, "h w 3"], inside: Bool[np.ndarray, "h w"], amount: float
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Sharpens a photograph where it has detail, which removes part of the blur of the lens and of the sampling window.
+    ``amount`` is that of an unsharp mask.
 
     Plain sharpening would amplify noise as well. It is therefore scaled as in a Wiener filter: by the share of the
     local power that is more than noise. Most of a head is smooth, so the median power over the head is taken for noise.
     """
     box = box_around(inside, 0)
-    if not settings.sharpening or not inside[box].size:
+    if not amount or not inside[box].size:
         return image
     crop = image[box].astype(np.float32)
     detail = crop - cv2.GaussianBlur(crop, (0, 0), UNSHARP_PX)
     power = cv2.GaussianBlur((detail * detail) @ np.full(3, 1 / 3, np.float32), (0, 0), POWER_PX)
     noise = NOISE_MARGIN * float(np.median(power[::4, ::4][inside[box][::4, ::4]]))
-    gain = settings.sharpening * np.clip(1 - noise / np.maximum(power, 1e-3), 0, 1)
+    gain = amount * np.clip(1 - noise / np.maximum(power, 1e-3), 0, 1)
     out = image.copy()
     out[box] = np.clip(crop + gain[:, :, None] * detail + 0.5, 0, 255)
     return out

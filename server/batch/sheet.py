@@ -28,7 +28,10 @@ SEVERE = frozenset(
     }
 )  # fmt: skip
 """Codes of warnings after which the head may be wrong as a whole; docs/operator.md says of each what to do."""
-REMARKS = frozenset({"cameras-scaled", "file-unread", "masks-of-alpha", "picture-levels", "unknown-key", "views-many"})
+REMARKS = frozenset(
+    {"cameras-scaled", "file-unread", "masks-of-alpha", "old-setting", "picture-levels", "setting-renamed"}
+    | {"unknown-key", "views-many"}
+)
 """Codes of what was only told."""
 PANEL_PX = (112, 144)  # of a view on the sheet
 JPEG_QUALITY = 82

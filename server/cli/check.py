@@ -146,7 +146,7 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
 
     def segmented(capture: Capture) -> dict[str, "Silhouette"]:
-        return segment(capture, rig, chosen.segmentation, report=report)
+        return segment(capture, rig, report=report)
 
     views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
     lenses = judge_distortion(views.capture.images, views.silhouettes, rig)

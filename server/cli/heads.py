@@ -149,10 +149,10 @@ def reconstruct(
     from server.cli.reconstruct_local import flame_lines, reconstruct_locally
     from server.tasks.settings_file import settings_document
 
-    switches = {"delight": albedo, "normal_map": normal_map}
-    switches |= {"neutral": neutral, "morphs": morphs, "slicer": slicer}
+    switches = {"normal_map": normal_map, "neutral": neutral, "morphs": morphs, "slicer": slicer}
     outputs: dict[str, object] = {name: True for name, is_requested in switches.items() if is_requested}
     words = {"surface": surface, "template": template, "formats": formats.split(",") if formats else None}
+    words["albedo"] = "file" if albedo else None
     outputs |= {name: word for name, word in words.items() if word}
     options: dict[str, bool | dict[str, object] | None] = {"outputs": outputs or None, "anyway": anyway or None}
     options["texture"] = {"chart": True} if chart else None

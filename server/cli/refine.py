@@ -52,7 +52,7 @@ def refine_locally(
         faults = _differences(recorded, rig, same_poses=calibration is None)
         if faults:
             raise InputError(path.name, [*faults, compose("captures-of-one-rig")])
-        segmented = segment(capture, rig, settings.segmentation, report=discard_progress)
+        segmented = segment(capture, rig, report=discard_progress)
         retained, warnings = without_moved_cameras(segmented, rig)
         silhouettes.append(retained)
         if head is not None:

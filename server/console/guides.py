@@ -14,8 +14,7 @@ from jaxtyping import Float
 
 from pipeline.alignment.feature_points import locate_features
 from pipeline.geometry.procrustes import procrustes
-from pipeline.multiview.triangulation import NoPoint, triangulate
-from pipeline.settings import CLICK_NOISE_PX
+from pipeline.multiview.triangulation import CLICK_NOISE_PX, NoPoint, triangulate
 from rig.camera import Camera
 from rig.messages.message import Message, MessageDocument, compose
 from rig.progress import Progress

@@ -345,12 +345,11 @@ def _floats(values: np.ndarray) -> Response:
 def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, target: str) -> None:
     """Draws the subject's outline in each picture of a capture as ``target``/<camera>.png, transparent outside.
     Silhouettes come from the folder ``cache`` or are stored there. Raises InputError."""
-    from pipeline.settings import SegmentationSettings
     from server.storage.silhouette_cache import segment_once
     from server.tasks.photographs import read_scaled_capture
 
     shot, rig = read_scaled_capture(Path(capture))
-    silhouettes = segment_once(Path(cache), shot, rig, SegmentationSettings(), report=report)
+    silhouettes = segment_once(Path(cache), shot, rig, report=report)
     for name, silhouette in silhouettes.items():
         done, data = cv2.imencode(".png", outline(silhouette.mask)[:, :, [2, 1, 0, 3]])
         assert done

@@ -62,6 +62,7 @@ def _name_settings(document: JsonObject) -> None:
     """Adds the pipeline's settings as named schemas: every key is optional, unknown keys are refused."""
     described = TypeAdapter(Settings).json_schema(ref_template=REFERENCE)
     named = described.pop("$defs") | {"Settings": described}
+    del described["properties"]["warnings"]  # of the reader
     for schema in named.values():
         schema["additionalProperties"] = False
     named["Settings"]["properties"]["fail_on"]["items"] = {"type": "string", "enum": list(WARNING_CODES)}

@@ -1,9 +1,8 @@
 """Caches the silhouettes of a capture on disk, for restarts with other settings and for the operator's pages.
 
-A file's name is the SHA-256 of everything that its content depends on: the capture's files, the settings of the
-segmentation, and the code. What is read from it equals what ``segment`` returned, bit for bit. It shows a face, so it
-lies where ``Store.remove_capture`` erases it with its capture. A file that cannot be read is made anew. One that cannot
-be written is not kept.
+A file's name is the SHA-256 of everything that its content depends on: the capture's files and the code. What is read
+from it equals what ``segment`` returned, bit for bit. It shows a face, so it lies where ``Store.remove_capture`` erases
+it with its capture. A file that cannot be read is made anew. One that cannot be written is not kept.
 """
 
 import dataclasses
@@ -23,7 +22,6 @@ from jaxtyping import Float32
 
 from pipeline.imaging.silhouette import Silhouette, ViewQuality
 from pipeline.segmentation.segment import segment
-from pipeline.settings import SegmentationSettings
 from rig.atomic_write import write_atomically
 from rig.capture import Capture
 from rig.messages.message import documents_of, read_message
@@ -44,27 +42,25 @@ ROOMS = (
 QUICK = 1  # zlib's fastest level: 35 MB become 4.7 MB in 0.2 s, and no level gets below 4
 
 
-def segment_once(
-    folder: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress
-) -> dict[str, Silhouette]:
+def segment_once(folder: Path, capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
     """Returns the silhouettes of a capture. If ``folder`` has them from an earlier call, they are read; otherwise
     ``segment`` computes them and they are stored there. The capture must have been read from files."""
-    path = folder / (_key(capture, settings) + SUFFIX)
+    path = folder / (_key(capture) + SUFFIX)
     with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile, zlib.error):
         found = _decoded(path.read_bytes())
         os.utime(path)  # what was used last is dropped last
         report("segmentation", 1.0)
         return found
-    found = segment(capture, rig, settings, report=report)
+    found = segment(capture, rig, report=report)
     with suppress(OSError):
         write_atomically(path, _encoded(found))
     return found
 
 
-def _key(capture: Capture, settings: SegmentationSettings) -> str:
+def _key(capture: Capture) -> str:
     inputs = {name: digest for name, digest in capture.digests.items() if name != "features.json"}
     sizes = {name: image.shape for name, image in capture.images.items()}  # large pictures are read smaller
-    document = [inputs, sizes, dataclasses.asdict(settings), version("eigenhead"), cv2.__version__, code_digest(ROOMS)]
+    document = [inputs, sizes, version("eigenhead"), cv2.__version__, code_digest(ROOMS)]
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 

@@ -71,7 +71,7 @@ def export_folder(
     if result is not None and (faults := _differences(inputs, capture.digests)):
         raise InputError(str(result), say_once(faults, rig.names))
     prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
-    segmented = partial(keep_masks, kept, rig=rig, settings=chosen.segmentation, report=report)
+    segmented = partial(keep_masks, kept, rig=rig, report=report)
     views = usable_views(capture, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
     dataset = ViewDataset(views.capture, rig, views.silhouettes, head, flame)
     report("write", 0.0)

@@ -17,7 +17,6 @@ from jaxtyping import Bool, UInt8
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.spread_views import spread_views
-from pipeline.settings import SegmentationSettings
 from pipeline.warnings import ReportWarning
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
@@ -169,21 +168,19 @@ def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
         raise InputError("capture", [f"{fault}; at most {image_pixels:,} pixels are accepted" for fault in huge])
 
 
-def keep_masks(
-    kept: Path, capture: Capture, rig: Rig, settings: SegmentationSettings, *, report: Progress
-) -> dict[str, Silhouette]:
+def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
     """Returns the silhouettes of a capture. If they had to be estimated from the photographs alone, they are also
     written to masks/ in ``kept``, where a second run finds them."""
     from pipeline.segmentation.segment import segment
     from server.storage.silhouette_cache import SUFFIX, segment_once
 
     if capture.masks or capture.backgrounds:
-        return segment(capture, rig, settings, report=report)
+        return segment(capture, rig, report=report)
     masks = kept / "masks"
     masks.mkdir(parents=True, exist_ok=True)
     full = read_rig(kept / CAMERAS) if (kept / CAMERAS).is_file() else rig
     before = set(masks.glob(f"*{SUFFIX}"))
-    found = segment_once(masks, capture, rig, settings, report=report)
+    found = segment_once(masks, capture, rig, report=report)
     made = set(masks.glob(f"*{SUFFIX}")) - before
     for path in before if made else ():
         path.unlink(missing_ok=True)

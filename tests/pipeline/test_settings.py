@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.settings import settings_from_document
+from pipeline.settings import OutputSettings, Settings, document_from_settings, settings_from_document
 from rig.errors import InputError
 
 
@@ -43,3 +43,38 @@ def test_what_cannot_be_is_named_in_text_that_can_be_sent(document: dict[str, An
 
 def test_a_whole_number_is_a_length() -> None:
     assert settings_from_document({"bust": {"spacing_mm": 1}}).bust.spacing_mm == 1.0
+
+
+def test_numbers_of_earlier_versions_are_passed_over_with_one_warning() -> None:
+    old = {"segmentation": {"evidence": 8.0}, "fitting": {"modes": 40, "bare_px": 3}, "texture": {"selection": {}}}
+    settings = settings_from_document(old)
+    (warning,) = settings.warnings
+    assert warning.code == "old-setting"
+    assert warning.parameters["setting"] == "segmentation, fitting.bare_px, texture.selection"
+    assert settings.fitting.modes == 40
+    assert document_from_settings(settings).keys() == document_from_settings(Settings()).keys()
+    assert not settings_from_document(document_from_settings(settings)).warnings
+
+
+@pytest.mark.parametrize(
+    ("outputs", "albedo"),
+    [
+        ({"delight": True}, "file"),
+        ({"delight": False}, "none"),
+        ({"skin": "albedo"}, "glb"),
+        ({"delight": True, "skin": "albedo"}, "glb"),
+        ({"delight": True, "skin": "photograph"}, "file"),
+        ({"delight": True, "albedo": "none"}, "none"),
+    ],
+)
+def test_the_old_names_of_the_albedo_are_read(outputs: dict[str, Any], albedo: str) -> None:
+    settings = settings_from_document({"outputs": outputs})
+    assert settings.outputs == OutputSettings(albedo=albedo)
+    old = [key for key in ("skin", "delight") if key in outputs]
+    assert [warning.parameters["setting"] for warning in settings.warnings] == [f"outputs.{key}" for key in old]
+    assert {warning.code for warning in settings.warnings} == {"setting-renamed"}
+
+
+def test_warnings_are_no_setting() -> None:
+    with pytest.raises(InputError, match="unknown key 'warnings'"):
+        settings_from_document({"warnings": []})

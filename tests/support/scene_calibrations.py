@@ -11,7 +11,6 @@ from calibration.scene.result import SceneCalibration
 from calibration.scene.scene import calibrate_scene
 from pipeline.head_model.model import load_model
 from pipeline.segmentation.segment import segment
-from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.pictures.images import read_image, write_image
@@ -57,7 +56,7 @@ def studio(seed: int, views: int, *, masks: bool = False) -> tuple[SceneCalibrat
         taken = simulate(subject, rig_from_directions(directions_deg(views)), PRESET, rng, renderer=renderer)
         photographs = Capture(taken.capture.images)
         if masks:
-            found = segment(taken.capture, taken.rig, SegmentationSettings(), report=lambda stage, share: None)
+            found = segment(taken.capture, taken.rig, report=lambda stage, share: None)
             photographs = replace(photographs, masks={name: one.mask for name, one in found.items()})
         write_capture(Path(folder), photographs, taken.rig)
         return calibrate_scene(Path(folder)), taken.scene.true_rig

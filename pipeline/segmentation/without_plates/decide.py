@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.multiview.scene_points import ScenePoints, find_scene_points
-from pipeline.segmentation.background import coarse_size
+from pipeline.segmentation.background import COARSE_COLUMNS, coarse_size
 from pipeline.segmentation.foreground import Decision
 from pipeline.segmentation.without_plates.estimated_plate import decision_without_plate, plate_noise
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, head_core
@@ -22,7 +22,6 @@ from pipeline.segmentation.without_plates.local_cut import COLUMNS, cut_views
 from pipeline.segmentation.without_plates.mask_search import search_masks
 from pipeline.segmentation.without_plates.standing_plane import NEAR, ball_above, standing_plane
 from pipeline.segmentation.without_plates.viewing_volume import ViewingVolume, viewing_ball, viewing_volume
-from pipeline.settings import SegmentationSettings
 from rig.rig import Rig
 
 POINTS_SHARE, MASKS_SHARE = 0.3, 0.6  # of the time, when they are there
@@ -44,14 +43,13 @@ class WithoutPlates:
 def decide_without_plates(
     images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]],
     rig: Rig,
-    settings: SegmentationSettings,
     *,
     head: HeadSeed | None = None,
     report: Callable[[float], None] = lambda share: None,
 ) -> WithoutPlates:
     """Decides which pixels of every photograph show the subject, without plates. ``head`` is the head's position; None
     if no face was found."""
-    small = {name: _reduced(images[name], settings.coarse_columns).astype(np.float32) for name in rig.names}
+    small = {name: _reduced(images[name], COARSE_COLUMNS).astype(np.float32) for name in rig.names}
     sizes = {name: image.shape[:2] for name, image in small.items()}
     points = find_scene_points(images, rig, report=partial(_between, report, 0.0, POINTS_SHARE))
     ball = viewing_ball(rig, None if head is None else head.centre_world)
@@ -68,7 +66,7 @@ def decide_without_plates(
     report_masks = partial(_between, report, POINTS_SHARE, MASKS_SHARE)
     found = search_masks(small, rig, volume, background, bounded=plane is not None, head=head, report=report_masks)
     decisions = {
-        name: decision_without_plate(images[name], small[name], found[name], settings, solid=head is not None)
+        name: decision_without_plate(images[name], small[name], found[name], solid=head is not None)
         for name in rig.names
     }
     cluttered = {n for n, one in decisions.items() if plane is not None or plate_noise(one) > MAX_PLATE_NOISE}

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from pipeline.imaging.masks import dilated, eroded, spread, without_holes
-from pipeline.segmentation.background import Background
+from pipeline.segmentation.background import Background, plate_tolerance
 from pipeline.segmentation.foreground import CONCLUSIVE, Decision, colours_apart, find_mixtures, whole_subject
 from pipeline.segmentation.without_plates.mask_search import CoarseMask
-from pipeline.settings import SegmentationSettings
 
 MARGIN = 2  # coarse pixels beyond the mask in which the subject may still be
 NEARBY_PX = 2.5  # coarse pixels: sigma of the window that the plate is taken from
@@ -26,20 +25,19 @@ def decision_without_plate(
     image: UInt8[np.ndarray, "_ _ 3"],
     coarse: Float32[np.ndarray, "h w 3"],
     found: CoarseMask,
-    settings: SegmentationSettings,
     *,
     solid: bool = False,
 ) -> Decision:
     """Returns a decision for the matting, with a background estimated from the pixels around the mask. If ``solid``,
     the subject is a head, and holes in the mask are filled as skin or hair of the wall's colour."""
-    mask, others = whole_subject(found.mask, found.odds < -1, settings)
+    mask, others = whole_subject(found.mask, found.odds < -1)
     odds = found.odds
     if solid:
         holes = without_holes(mask) & ~mask
         mask, odds = mask | holes, np.where(holes, np.maximum(odds, SOLID_ODDS), odds)
     outside = ~dilated(mask, MARGIN)
     background = estimated_background(image, coarse, outside)
-    tolerance = settings.tolerance_levels + settings.tolerance_share * background.coarse
+    tolerance = plate_tolerance(background.coarse)
     variance = (background.noise**2 / 4 + tolerance**2).astype(np.float32)
     away, mixture = find_mixtures(image, coarse, background)
     paint = spread(coarse, eroded(mask, 1) * away / (1 + mixture**2), 2.0)

@@ -54,7 +54,6 @@ def read_close_views(
     coloured: Texture,
     face: Bool[np.ndarray, " v"],
     *,
-    footprint_px: float,
     sources: Mapping[str, str],
     chart: ChartColours | None = None,
 ) -> CloseViews:
@@ -65,7 +64,6 @@ def read_close_views(
         mesh_world: the head.
         coloured: with the gains and offsets of the cameras, and a decision.
         face: vertices of the face.
-        footprint_px: of the sampling window.
         sources: the name under which a camera's picture is filed, where that is another's.
         chart: by which the colours of the pictures of work size were corrected.
     """
@@ -85,7 +83,7 @@ def read_close_views(
         for values, neutral in ((coloured.gains, (1.0,) * 3), (coloured.offsets, (0.0,) * 3))
     )
     masks = {camera.name: np.ones(crop.shape[:2], bool) for camera, crop in zip(views, crops, strict=True)}
-    pictures = pack_pictures(views, crops, masks, gains, offsets, mesh_world=mesh_world, footprint_px=footprint_px)
+    pictures = pack_pictures(views, crops, masks, gains, offsets, mesh_world=mesh_world)
     return CloseViews(views, rows, pictures, decision)
 
 

@@ -24,8 +24,8 @@ from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.seam_levelling import level_views
 from pipeline.texturing.sets.specular import Specular, specular_light
-from pipeline.texturing.vertex_colours_kernels import blend_views
-from pipeline.texturing.visibility import LINEAR, sharpened
+from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
+from pipeline.texturing.visibility import FOOTPRINT_PX, LINEAR, sharpened
 from pipeline.texturing.visibility_kernels import sample_colours
 from pipeline.warnings import ReportWarning
 from rig.colour_space import srgb_from_linear
@@ -119,9 +119,9 @@ def set_texture(
 
     def read(k: int) -> tuple[UInt8[np.ndarray, "_ _ 3"], Float32[np.ndarray, "v 3"]]:
         name = views.names[k]
-        image = sharpened(images[name], silhouettes[name].mask, settings)
+        image = sharpened(images[name], silhouettes[name].mask, settings.sharpening)
         pixels = project_points(views.cameras[k], mesh_world.vertices)
-        return image, sample_colours(image, pixels, weights[k], LINEAR, settings.footprint_px)
+        return image, sample_colours(image, pixels, weights[k], LINEAR, FOOTPRINT_PX)
 
     found = map_in_threads(read, len(views))
     colours = np.stack([seen for _, seen in found])
@@ -129,15 +129,14 @@ def set_texture(
     if settings.balance:
         gains, offsets = balance(weights, colours)
     balanced = np.ascontiguousarray(colours * gains[:, None] + offsets[:, None], np.float32)
-    agreed, seen = blend_views(weights, balanced, settings.outlier)
+    agreed, seen = blend_views(weights, balanced, OUTLIER)
     codes, level_to = (
         np.float32(255) * srgb_from_linear(np.clip(of, 0, 1)).astype(np.float32) for of in (balanced, agreed)
     )
-    fields = level_views(weights, codes, level_to, layout.around, settings.selection.levelling)
+    fields = level_views(weights, codes, level_to, layout.around)
     masks = {name: silhouettes[name].mask for name in views.names}
     pictures = pack_pictures(
         views, [image for image, _ in found], masks, gains, offsets, mesh_world=mesh_world,
-        footprint_px=settings.footprint_px,
     )  # fmt: skip
     corrections = fields[np.maximum(decision.slots, 0), np.arange(len(decision.slots))[:, None]]
     chosen = replace(decision, corrections=corrections, pictures=pictures)

@@ -10,6 +10,8 @@ TEMPLATES = {
     "view-left-out": "{remark}",
     "mask-doubtful": "{camera}: {remark}",
     "no-texture-layout": "{reason}",
+    "old-setting": "{setting}: the numbers are fixed since 0.4.0, and those in the settings were ignored; remove them",
+    "setting-renamed": "{setting} is read as {new} until 0.5.0; write {new} in its place",
     "texture-sets-exchanged": "texture_sets/cross shows the highlights and texture_sets/parallel does not: exchange the folders' names",
     "texture-sets-unused": "the texture sets {sets} colour nothing: the head has no texture",
     "no-pores": "there are no maps of the pores: they need a texture, and the pictures' files",

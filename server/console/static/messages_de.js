@@ -375,6 +375,8 @@ export default {
   "view-left-out": "{remark}",
   "mask-doubtful": "{camera}: {remark}",
   "no-texture-layout": "{reason}",
+  "old-setting": "{setting}: Die Zahlen stehen seit 0.4.0 fest, und die in den Einstellungen wurden übergangen; dort entfernen",
+  "setting-renamed": "{setting} wird bis 0.5.0 als {new} gelesen; an seiner Stelle {new} schreiben",
   "view-unused": "{remark}; die Ansicht wird weggelassen",
   "eyes-closed": "{eyes} geschlossen: kein Weiß und keine Iris in den Fotos, oder Lider, die sich berühren",
   "both-eyes-are": "beide Augen sind",

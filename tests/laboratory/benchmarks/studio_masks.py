@@ -20,7 +20,6 @@ from typing import Annotated, Any
 import numpy as np
 
 from pipeline.segmentation.segment import segment
-from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
 from rig.progress import Progress, discard_progress
@@ -53,7 +52,7 @@ def run(
         silhouettes = segmented(taken)
         if bare:
             shot = Capture(taken.capture.images)
-            silhouettes = segment(shot, taken.rig, SegmentationSettings(), report=discard_progress)
+            silhouettes = segment(shot, taken.rig, report=discard_progress)
         kind = "".join(f" {each.kind}" for each in planted)
         for name, silhouette in silhouettes.items():
             off = rms(silhouette, coverage(taken, name, RESOLUTION_PX))
@@ -88,6 +87,6 @@ def rendered(folder: str, *, bare: bool) -> str:
     """Overlap with the true masks of a capture that another program rendered."""
     capture, rig = read_capture(shared(f"data/captures/{folder}"))
     shot = Capture(capture.images) if bare else capture
-    silhouettes = segment(shot, rig, SegmentationSettings(), report=lambda *_: None)
+    silhouettes = segment(shot, rig, report=lambda *_: None)
     overlap = [iou(silhouette, true_mask(name, folder)) for name, silhouette in silhouettes.items()]
     return f"IoU: median {np.median(overlap):.4f}, worst {min(overlap):.4f} of {len(overlap)} views"

@@ -5,16 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.detail.dense_points import count_views_needed, dense_points
+from pipeline.detail.dense_points import HAIR_OFF_MM, count_views_needed, dense_points
 from pipeline.fusion.view_stack import ALONE_FACTOR
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.votes import PartVotes
-from pipeline.settings import FineSettings
 from rig.mesh import Mesh
 from tests.pipeline.part_labels.test_votes import seen_wall, wall_camera
 from tests.pipeline.stereo.ray_scene import fan
-
-SETTINGS = FineSettings(views_least=2)
 
 
 def wall_head() -> Mesh:
@@ -30,12 +27,12 @@ def test_a_point_that_may_be_hair_is_less_sure_by_what_hair_stands_off() -> None
     for skin in (1.0, 0.7, 0.4):
         votes = PartVotes(np.full(3, -100.0), np.ones(3, int), np.zeros(1, int), np.zeros((1, 3)),
                           np.array([[skin, 1.0 - skin, 0.0]]))  # fmt: skip
-        found.append(dense_points([seen_wall(camera)], votes, wall_head(), SETTINGS))
+        found.append(dense_points([seen_wall(camera)], votes, wall_head()))
     sure, doubtful, hair = found
     assert len(sure.points) > 0
     for surface, part in ((sure, Part.SKIN), (doubtful, Part.SKIN), (hair, Part.HAIR)):
         assert (surface.part == part).all()
-    expected = np.sqrt(sure.deviation_mm**2 + 0.3 * SETTINGS.hair_off_mm**2)
+    expected = np.sqrt(sure.deviation_mm**2 + 0.3 * HAIR_OFF_MM**2)
     np.testing.assert_allclose(doubtful.deviation_mm, expected, rtol=1e-6)
     np.testing.assert_allclose(hair.deviation_mm, sure.deviation_mm)
 
@@ -46,15 +43,14 @@ def test_a_point_that_may_be_hair_is_less_sure_by_what_hair_stands_off() -> None
 )
 def test_fewer_views_must_agree_where_fewer_can(count: int, step_deg: float, needed: int) -> None:
     # Within 65 degrees of a camera lie, itself counted, 3 of a ring of eight, 11 of a fan 12 degrees apart, 9 of 24.
-    assert count_views_needed(list(fan(count, step_deg)), np.zeros(3), FineSettings()) == needed
+    assert count_views_needed(list(fan(count, step_deg)), np.zeros(3)) == needed
 
 
 def test_what_two_views_agree_on_is_less_sure() -> None:
     seen, skin = seen_wall(wall_camera("a", 0.0)), np.array([[1.0, 0.0, 0.0]])
     votes = PartVotes(np.full(3, -100.0), np.ones(3, int), np.zeros(1, int), np.zeros((1, 3)), skin)
     of_two, of_three = (
-        dense_points([replace(seen, views=np.full_like(seen.views, views))], votes, wall_head(), SETTINGS)
-        for views in (2, 3)
+        dense_points([replace(seen, views=np.full_like(seen.views, views))], votes, wall_head()) for views in (2, 3)
     )
     np.testing.assert_allclose(of_two.deviation_mm, ALONE_FACTOR * of_three.deviation_mm)
     np.testing.assert_allclose(of_two.points, of_three.points, atol=1e-9)

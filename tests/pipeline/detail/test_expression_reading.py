@@ -33,7 +33,7 @@ def read(
     unit = np.eye(len(model.modes) + 7) if covariance else None
     fit = Fit("contour", np.zeros(len(model.modes)), PLACE, 1, "planted", unit)
     observed, all_of_it = np.ones(len(head), bool), with_modes(population, known or len(population.modes))
-    return with_read_expression(fit, model, all_of_it, seen, observed, eigenheads=EIGENHEADS, median=0.1)
+    return with_read_expression(fit, model, all_of_it, seen, observed, eigenheads=EIGENHEADS)
 
 
 def weights_of(population: HeadModel, fit: Fit) -> dict[str, float]:
@@ -75,7 +75,7 @@ def test_a_model_without_expressions_is_left_alone(population: HeadModel) -> Non
     fit = Fit("contour", np.zeros(EIGENHEADS), PLACE, 1, "planted")
     head = PLACE.apply(population.vertices(np.zeros(0)))
     model, seen = replace(bare, posed=range(0)), np.ones(len(head), bool)
-    assert with_read_expression(fit, model, population, head, seen, eigenheads=EIGENHEADS, median=0.1) is fit
+    assert with_read_expression(fit, model, population, head, seen, eigenheads=EIGENHEADS) is fit
 
 
 def test_a_head_of_another_population_keeps_what_the_fit_says(population: HeadModel) -> None:
@@ -88,5 +88,5 @@ def test_a_head_of_another_population_keeps_what_the_fit_says(population: HeadMo
         z[model.posed.start + model.expressions.names.index("cheekPuff")] = 0.5
         head = PLACE.apply(model.vertices(z))
         seen = np.ones(len(head), bool)
-        result = with_read_expression(fit, model, population, head, seen, eigenheads=EIGENHEADS, median=0.1)
+        result = with_read_expression(fit, model, population, head, seen, eigenheads=EIGENHEADS)
         assert (result is fit) == left_alone

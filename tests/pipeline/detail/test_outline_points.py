@@ -10,7 +10,6 @@ from pipeline.detail.outline_points import HELD_MM, OutlineSearch
 from pipeline.detail.refine import deform_to_points
 from pipeline.detail.surface_points import SurfacePoints
 from pipeline.part_labels.codes import Part
-from pipeline.settings import FineSettings
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import look_at
 from rig.rig import Rig
@@ -55,7 +54,6 @@ def off_tip_mm(outlines: OutlineSearch | None) -> float:
         faces,
         nodes,
         points(),
-        FineSettings(),
         loose=np.zeros(len(vertices), bool),
         outlines=outlines and outlines.observed,
     )

@@ -7,13 +7,12 @@ from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.detail.eyelids import EyeEvidence, bridge_eyelids
 from pipeline.detail.folds import folded
-from pipeline.detail.refine import DeformedSurface, deform_to_points, refine_to_surface
+from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, refine_to_surface
 from pipeline.detail.surface_points import SurfacePoints, thinned, with_scaled_deviation
 from pipeline.fusion.untangling import head_topology, spoilt_faces
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
-from pipeline.settings import FineSettings
 from rig.geometry import Similarity
 from rig.mesh import vertex_normals
 from tests.support.subdivided_spheres import ellipsoid_distance, ellipsoid_points, subdivided_sphere
@@ -23,13 +22,13 @@ NOISE_MM = 0.2
 
 
 def drawn(
-    surface: SurfacePoints, deviation_mm: float = 1.5, settings: FineSettings | None = None
+    surface: SurfacePoints, deviation_mm: float = 1.5, shared_error: float = SHARED_ERROR
 ) -> tuple[np.ndarray, np.ndarray, DeformedSurface]:
     """The sphere, its faces, and what the points make of it."""
     vertices, faces, nodes = subdivided_sphere()
     loose = np.zeros(len(vertices), bool)
     found = deform_to_points(
-        vertices, np.full(len(vertices), deviation_mm), faces, nodes, surface, settings or FineSettings(), loose=loose
+        vertices, np.full(len(vertices), deviation_mm), faces, nodes, surface, loose=loose, shared_error=shared_error
     )
     return vertices, faces, found
 
@@ -52,7 +51,7 @@ def test_a_share_of_the_points_deviation_stays_however_many_they_are() -> None:
     surface = ellipsoid_points(np.random.default_rng(0), AXES_MM, NOISE_MM)
     unsure = with_scaled_deviation(surface, np.where(surface.points[:, 0] > 0.0, 2.0, 6.0))
     vertices, _, stated = drawn(unsure)
-    alone = drawn(unsure, settings=FineSettings(shared_error=0.0))[2]
+    alone = drawn(unsure, shared_error=0.0)[2]
     added = np.sqrt(stated.deviation_mm**2 - alone.deviation_mm**2)
     for side, factor in ((vertices[:, 0] > 20.0, 2.0), (vertices[:, 0] < -20.0, 6.0)):
         np.testing.assert_allclose(added[side], 0.25 * factor * NOISE_MM, rtol=0.02)
@@ -144,7 +143,6 @@ def test_a_planted_head_is_found_within_its_intervals(model: HeadModel) -> None:
         fit,
         model,
         head_points(truth, faces, rng),
-        FineSettings(),
         eigenheads=count,
         deviation_mm=vertex_deviation_mm(model, fit),
     )
@@ -166,9 +164,7 @@ def test_closed_lids_bridge_the_opening(model: HeadModel) -> None:
     fit = Fit("contour", np.zeros(0), Similarity(1.0, np.eye(3), np.zeros(3)), 1, "planted", np.diag([1e-8] * 7))
     surface = head_points(truth, faces, np.random.default_rng(12))
     shown = {"right": EyeEvidence(0.0, 0.01, 5), "left": EyeEvidence(0.0, 0.01, 5)}
-    found = refine_to_surface(
-        fit, model, surface, FineSettings(), eigenheads=0, deviation_mm=np.zeros(len(truth)), eyes=shown
-    )
+    found = refine_to_surface(fit, model, surface, eigenheads=0, deviation_mm=np.zeros(len(truth)), eyes=shown)
     assert found.closed_eyes == {"right", "left"}
     eyes = head_regions(model)["eyes"]
     off = np.abs(((found.vertices - truth) * vertex_normals(truth, faces)).sum(axis=1))[eyes]

@@ -8,7 +8,6 @@ import trimesh
 
 from pipeline.fusion.fusion import BustSurface, NoSurface, finished, fuse, mask_warnings
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.settings import BustSettings
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.window_bias import WindowBias
 from rig.mesh import Mesh, face_normals
@@ -19,12 +18,12 @@ from tests.support.ellipsoid_depths import Ellipsoid, Scene, pinhole_fan, scene
 from tests.support.scenes import fan
 
 BALL = Ellipsoid((0, 0, 0), (60, 60, 60))
-SPACING = BustSettings(spacing_mm=3.0)
+SPACING_MM = 3.0
 
 
-def fused(made: Scene, head: Mesh | None = None, settings: BustSettings = SPACING) -> BustSurface:
+def fused(made: Scene, head: Mesh | None = None, spacing_mm: float = SPACING_MM) -> BustSurface:
     surface = fuse(
-        made.maps, made.silhouettes, made.rig, head, bias=WindowBias(), settings=settings, report=discard_progress
+        made.maps, made.silhouettes, made.rig, head, bias=WindowBias(), spacing_mm=spacing_mm, report=discard_progress
     )
     return finished(surface, None, None, made.silhouettes, made.rig)
 
@@ -64,7 +63,7 @@ def test_same_bytes_every_time(ball: Scene) -> None:
 
 
 def test_spacing_sets_how_many_vertices(ball: Scene) -> None:
-    fine = fused(ball, settings=BustSettings(spacing_mm=1.5))
+    fine = fused(ball, spacing_mm=1.5)
     assert len(fine.mesh_world.vertices) == pytest.approx(4 * len(fused(ball).mesh_world.vertices), rel=0.1)
     assert np.sqrt((seen_errors(fine, ball) ** 2).mean()) < 0.14
 
@@ -104,7 +103,7 @@ def test_two_balls_that_touch_are_one_manifold() -> None:
 def test_thin_ear_stands() -> None:
     """A shell 5 mm thick that leaves the ball by 24 mm, seen from its edge and from both of its sides."""
     ear = Ellipsoid((64, 0, 0), (22, 24, 2.5))
-    surface = fused(scene([BALL, ear]), settings=BustSettings(spacing_mm=1.5))
+    surface = fused(scene([BALL, ear]), spacing_mm=1.5)
     check_closed(surface.mesh_world)
     assert surface.mesh_world.vertices[:, 0].max() == pytest.approx(86.0, abs=1.5)
 

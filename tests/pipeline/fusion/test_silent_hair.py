@@ -13,7 +13,6 @@ from pipeline.fusion.view_stack import stack_views
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
 from pipeline.part_labels.votes import PartVotes, vote_parts
-from pipeline.settings import BustSettings
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.window_bias import WindowBias
 from rig.camera import Camera
@@ -92,9 +91,9 @@ def split(made: Scene, above: Part) -> tuple[SilentHair | None, Sequence[DepthMa
 def test_specks_become_a_smooth_shell_that_counts_as_unseen(strands: Scene) -> None:
     hair, maps, votes = split(strands, Part.HAIR)
     assert hair is not None
-    settings, bias = BustSettings(spacing_mm=3.0), WindowBias()
+    bias = WindowBias()
     made = fuse(
-        maps, strands.silhouettes, strands.rig, head(), bias=bias, settings=settings, report=discard_progress, hair=hair
+        maps, strands.silhouettes, strands.rig, head(), bias=bias, spacing_mm=3.0, report=discard_progress, hair=hair
     )
     surface = finished(made, votes, None, strands.silhouettes, strands.rig)
     check_closed(surface.mesh_world)

@@ -5,7 +5,6 @@ from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.multiview.visual_hull import NoHull, hull_extent, visual_hull
 from pipeline.segmentation.view_consistency import judge_agreement
-from pipeline.settings import SegmentationSettings
 from rig.formats.captures.capture_folder import read_capture
 from rig.formats.pictures.images import read_image
 from rig.mesh import boundary_edges
@@ -80,16 +79,15 @@ def test_the_hull_of_a_real_head_is_near_it() -> None:
 
 
 def test_good_views_agree_and_planted_faults_are_told(rig: Rig, traced: dict[str, Silhouette]) -> None:
-    settings = SegmentationSettings()
     silhouettes = traced
-    for name, silhouette in judge_agreement(silhouettes, rig, settings).items():
+    for name, silhouette in judge_agreement(silhouettes, rig).items():
         assert silhouette.quality.usable, name
         assert silhouette.quality.warnings == ()
     more, less = silhouettes["cam02"].mask.copy(), silhouettes["cam06"].mask.copy()
     more[100:300, 500:600] = True
     less[:200] = False
     judged = judge_agreement(
-        silhouettes | {"cam02": silhouette_from_mask(more), "cam06": silhouette_from_mask(less)}, rig, settings
+        silhouettes | {"cam02": silhouette_from_mask(more), "cam06": silhouette_from_mask(less)}, rig
     )
     assert "other cameras see nothing" in judged["cam02"].quality.warnings[0].text
     assert "lacks" in judged["cam06"].quality.warnings[0].text

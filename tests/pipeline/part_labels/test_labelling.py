@@ -14,6 +14,7 @@ from pipeline.part_labels.appearance_cells import head_guide, make_cells
 from pipeline.part_labels.codes import CHANNELS, Part
 from pipeline.part_labels.label_kernels import spread_parts
 from pipeline.part_labels.labelling import (
+    CELL_MM,
     classify_parts,
     colour_histogram,
     detail_histogram,
@@ -21,7 +22,6 @@ from pipeline.part_labels.labelling import (
     posterior,
     starts,
 )
-from pipeline.settings import PartSettings
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.scene.anatomy import anatomy
@@ -31,7 +31,6 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import Subject
 from tests.rig.studio.test_images import egg_head
 
-SETTINGS = PartSettings()
 TONES = {
     "skin": (200.0, 150.0, 125.0),
     "dark": (70.0, 50.0, 38.0),
@@ -125,7 +124,7 @@ def shares(rig: Rig, made: Planted, fitted: Subject | None = None) -> dict[int, 
     subject = fitted or egg_head()
     assert subject.face_region is not None
     found = classify_parts(
-        made.images, made.silhouettes, rig, subject.mesh, subject.face_region, subject.landmarks, settings=SETTINGS,
+        made.images, made.silhouettes, rig, subject.mesh, subject.face_region, subject.landmarks,
         report=lambda stage, share: None,
     )  # fmt: skip
     right: dict[int, list[np.ndarray]] = {1: [], 2: [], 3: []}
@@ -171,7 +170,7 @@ def test_nothing_is_said_outside_the_subject_and_of_views_that_do_not_count(rig)
     assert subject.face_region is not None
     found = classify_parts(
         made.images, {**made.silhouettes, "cam03": unusable}, rig, subject.mesh, subject.face_region,
-        subject.landmarks, settings=SETTINGS, report=lambda stage, share: None,
+        subject.landmarks, report=lambda stage, share: None,
     )  # fmt: skip
     assert set(found) == {"cam00", "cam04", "cam07"}
     for name, each in found.items():
@@ -185,8 +184,7 @@ def test_the_same_photographs_give_the_same_bytes(rig):
     assert subject.face_region is not None
     head = rig, subject.mesh, subject.face_region, subject.landmarks
     one, two = (
-        classify_parts(made.images, made.silhouettes, *head, settings=SETTINGS, report=lambda stage, share: None)
-        for _ in range(2)
+        classify_parts(made.images, made.silhouettes, *head, report=lambda stage, share: None) for _ in range(2)
     )
     assert all(np.array_equal(one[name].probability, two[name].probability) for name in one)
 
@@ -201,7 +199,6 @@ def test_no_photograph_no_map(rig):
         subject.mesh,
         subject.face_region,
         subject.landmarks,
-        settings=SETTINGS,
         report=lambda stage, share: None,
     )
 
@@ -211,7 +208,7 @@ def test_starts_lie_on_the_cheeks_over_the_crown_and_below_the_neck(rig):
     assert subject.face_region is not None
     guide = head_guide(subject.mesh, subject.face_region, subject.landmarks)
     masks = {name: part > 0 for name, part in made.truth.items()}
-    for view in make_cells(made.images, masks, rig, guide, SETTINGS.cell_mm):
+    for view in make_cells(made.images, masks, rig, guide, CELL_MM):
         half = view.size_px // 2
         truth = made.truth[view.camera.name][half :: view.size_px, half :: view.size_px]
         start = starts(view)

@@ -22,15 +22,12 @@ from pipeline.photometric_fit.refine import (
     refine_with_photographs,
     rounds_of_rig,
 )
-from pipeline.settings import PhotoSettings
 from pipeline.warnings import Detail
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import rig_from_directions
 from tests.support.photo_scene import Scene, bumped, ellipsoid_model, glossy, photograph, shading, texture
 from tests.support.scenes import ellipsoid
-
-SETTINGS = PhotoSettings()
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +42,7 @@ def bump(model: HeadModel) -> Scene:
 
 @pytest.fixture(scope="module")
 def refined(bump: Scene) -> tuple[ContourSolution, Detail]:
-    return refine_with_photographs(bump.start(), bump.images, SETTINGS)
+    return refine_with_photographs(bump.start(), bump.images)
 
 
 def test_a_bump_inside_the_outline_is_found(bump: Scene, refined: tuple[ContourSolution, Detail]) -> None:
@@ -67,7 +64,7 @@ def test_gloss_before_three_narrow_cameras_is_no_relief(model: HeadModel) -> Non
     truth = model.vertices(np.zeros(0))
     scenes = [photograph(model, truth, glossy(camera.centre_world), noise=0.004, rig=rig) for camera in rig]
     seen = {camera.name: scene.images[camera.name] for camera, scene in zip(rig, scenes, strict=True)}
-    solved, detail = refine_with_photographs(scenes[0].start(), seen, SETTINGS)
+    solved, detail = refine_with_photographs(scenes[0].start(), seen)
     off = np.abs(scenes[0].error(solved))
     assert detail.level == "photo"
     assert np.quantile(off, 0.95) < 0.35
@@ -91,14 +88,14 @@ def test_gains_and_offsets_of_cameras_do_not_matter(
     """The same noise at another gain moves an observation by a part of its own noise, no more."""
     gains = np.random.default_rng(0).uniform(0.7, 1.3, len(bump.rig))
     other = photograph(model, bump.truth, texture, gains=gains)
-    two, _ = refine_with_photographs(other.start(), other.images, SETTINGS)
+    two, _ = refine_with_photographs(other.start(), other.images)
     assert np.sqrt(((bump.error(refined[0]) - other.error(two)) ** 2).mean()) < 0.05
 
 
 def test_a_smooth_shaded_surface_stays_smooth(model: HeadModel) -> None:
     """No texture, only shading and noise: what is left of it in the surface is under 0.05 mm RMS."""
     scene = photograph(model, model.vertices(np.zeros(0)), shading)
-    solved, _ = refine_with_photographs(scene.start(), scene.images, SETTINGS)
+    solved, _ = refine_with_photographs(scene.start(), scene.images)
     error = scene.error(solved)
     assert np.sqrt(((error - error.mean()) ** 2).mean()) < 0.05
 
@@ -112,7 +109,7 @@ def test_pictures_that_show_nothing_leave_the_fit_as_it_was(model: HeadModel, ki
         "missing": {},
     }[kind]
     start = scene.start()
-    solved, detail = refine_with_photographs(start, images, SETTINGS)
+    solved, detail = refine_with_photographs(start, images)
     assert solved is start
     assert detail.level == "kernel"
     assert "needed" in detail.reason.text
@@ -137,7 +134,7 @@ def test_a_camera_that_was_moved_does_not_move_the_surface(
         )
     )
     scene = photograph(model, bumped(model, 2.0), texture, true_rig=moved)
-    solved, _ = refine_with_photographs(scene.start(), scene.images, SETTINGS)
+    solved, _ = refine_with_photographs(scene.start(), scene.images)
     rms = [np.sqrt((s.error(f) ** 2).mean()) for s, f in ((bump, refined[0]), (scene, solved))]
     assert rms[1] < 1.3 * rms[0] + 0.02
     points = scene.truth[model.levels["full"].face_region]
@@ -153,8 +150,8 @@ def test_a_camera_that_was_moved_does_not_move_the_surface(
 def test_what_is_hidden_is_not_seen(bump: Scene) -> None:
     """Samples behind a plate that covers the left half of the picture, or on the far side, do not face the camera."""
     start = bump.start()
-    _, patches, _ = finer(start.problem.model, SETTINGS)
-    visibility = sample_visibility(start.problem, start.state, patches, np.ones(len(bump.rig), bool), SETTINGS)
+    _, patches, _ = finer(start.problem.model)
+    visibility = sample_visibility(start.problem, start.state, patches, np.ones(len(bump.rig), bool))
     k, camera = 3, bump.rig["cam03"]
     towards = camera.centre_world - visibility.points
     outward = patches.normals(visibility.normals)
@@ -165,7 +162,7 @@ def test_what_is_hidden_is_not_seen(bump: Scene) -> None:
     assert not visibility.facing[k][cosine <= 0].any()
     assert (visibility.facing[k][cosine > 0.4] > 0).all()
     plate = np.where(np.arange(640) < 320, 900.0, np.inf)[None].repeat(480, axis=0).astype(np.float32)
-    seen = facing_of(visibility.points, outward, camera, plate, np.full((480, 640), -50.0, np.float32), SETTINGS)
+    seen = facing_of(visibility.points, outward, camera, plate, np.full((480, 640), -50.0, np.float32))
     left = camera.project(visibility.points)[:, 0] < 315
     assert not seen[left].any()
     assert seen[~left].any()

@@ -128,9 +128,9 @@ def test_the_albedo_is_written_and_the_glb_shows_it_where_that_is_asked_for(
     albedo = Albedo(Atlas(result.texturing.atlas.layout, image), Light(coefficients, 0.05))
     delit = replace(result, texturing=replace(result.texturing, albedo=albedo))
     pictures = {}
-    for name, skin in (("photograph", "photograph"), ("albedo", "albedo")):
+    for name, shown in (("photograph", "file"), ("albedo", "glb")):
         (tmp_path / name).mkdir()
-        assert "texture" in written(delit, tmp_path / name, delight=True, skin=skin)
+        assert "texture" in written(delit, tmp_path / name, albedo=shown)
         stored = cv2.imread(str(tmp_path / name / "texture" / "albedo.png"))
         np.testing.assert_array_equal(np.asarray(stored)[:, :, ::-1], image)
         loaded = trimesh.load(tmp_path / name / "head.glb", force="mesh", process=False)
@@ -191,9 +191,8 @@ def test_texture_sets_are_written_and_the_glb_mirrors_what_polarised_light_shows
 
 
 def test_the_albedo_alone_asks_for_a_layout() -> None:
-    assert OutputSettings(formats=("ply",), delight=True).textured
-    assert OutputSettings(formats=("ply",), skin="albedo").delit
-    assert not OutputSettings(surface="bust", delight=True).textured
+    assert OutputSettings(formats=("ply",), albedo="file").textured
+    assert not OutputSettings(surface="bust", albedo="glb").textured
 
 
 def test_wrong_outputs_are_named() -> None:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from pipeline.segmentation.background import ANY_COLOUR_ODDS
 from pipeline.segmentation.foreground import find_shadows
 from pipeline.segmentation.matting import COARSE_ALPHA_SIGMA, LINEAR, SHADE
 from pipeline.segmentation.matting_kernels import solve_alpha
-from pipeline.settings import SegmentationSettings
 
 WALL, SKIN = (103, 103, 105), (221, 180, 165)
 NOISE = 1.5  # levels
@@ -39,26 +39,24 @@ def test_skin_that_darkens_towards_its_rim_and_its_mixtures_keep_their_alpha() -
 
 
 def test_faint_light_on_the_wall_that_begins_softly_is_wall() -> None:
-    settings = SegmentationSettings()
     plate = np.full((60, 80, 3), 120.0, np.float32)
     row = np.arange(60.0)[:, None]
     light = 0.06 * np.exp(-0.5 * ((row - 30.0) / 7.0) ** 2)  # as soft as a shadow
     image = (plate * (1.0 + light[:, :, None])).astype(np.float32)
     variance = np.full((60, 80, 3), 1.0, np.float32)
     chi2 = ((image - plate) ** 2 / variance).sum(axis=2)
-    odds = 0.5 * chi2 - settings.evidence
+    odds = 0.5 * chi2 - ANY_COLOUR_ODDS
     assert (odds > 0).any()
-    left, backdrop = find_shadows(image, plate, chi2, variance, odds, settings)
+    left, backdrop = find_shadows(image, plate, chi2, variance, odds)
     assert backdrop[odds > 0].all()
     assert left[30, 40] < 1.0
 
 
 def test_a_lighter_coat_with_a_sharp_edge_is_no_light_on_the_wall() -> None:
-    settings = SegmentationSettings()
     plate = np.full((60, 80, 3), 120.0, np.float32)
     image = plate.copy()
     image[20:, 20:60] *= 1.06
     variance = np.full((60, 80, 3), 1.0, np.float32)
     chi2 = ((image - plate) ** 2 / variance).sum(axis=2)
-    _, backdrop = find_shadows(image, plate, chi2, variance, 0.5 * chi2 - settings.evidence, settings)
+    _, backdrop = find_shadows(image, plate, chi2, variance, 0.5 * chi2 - ANY_COLOUR_ODDS)
     assert not backdrop.any()

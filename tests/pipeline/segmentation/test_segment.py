@@ -15,7 +15,6 @@ import pytest
 
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import _without_specks, segment, segment_view
-from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.captures.capture_folder import read_capture
@@ -26,7 +25,6 @@ from tests.support.composites import Scene, compose
 from tests.support.noisy_captures import noisier
 from tests.support.shared_data import shared
 
-SETTINGS = SegmentationSettings()
 BACKDROP = (0.20, 0.30, 0.35)
 
 
@@ -62,7 +60,7 @@ def errors(silhouette: Silhouette, truth: np.ndarray) -> tuple[float, np.ndarray
 )
 def test_the_contour_is_where_the_formula_says(scene: Scene) -> None:
     image, plates, truth = compose(scene)
-    silhouette = segment_view(image, plates, SETTINGS)
+    silhouette = segment_view(image, plates)
     iou, off = errors(silhouette, truth)
     assert silhouette.quality.usable
     assert iou > 0.997
@@ -74,7 +72,7 @@ def test_the_contour_is_where_the_formula_says(scene: Scene) -> None:
 
 def test_mask_and_distance_agree_and_the_quality_names_the_cut() -> None:
     image, plates, _ = compose(Scene())
-    silhouette = segment_view(image, plates, SETTINGS)
+    silhouette = segment_view(image, plates)
     np.testing.assert_array_equal(silhouette.mask, silhouette.distance < 0)
     assert silhouette.distance.dtype == np.float32
     assert silhouette.quality.cut_off == ("bottom",)
@@ -86,7 +84,7 @@ def test_mask_and_distance_agree_and_the_quality_names_the_cut() -> None:
 @pytest.mark.parametrize("gain", [0.8, 1.0, 1.25])
 def test_an_exposure_change_is_measured(gain: float) -> None:
     image, plates, _ = compose(Scene(gain=gain, drift=0.0))
-    found = segment_view(image, plates, SETTINGS).quality.figures["gain"]
+    found = segment_view(image, plates).quality.figures["gain"]
     # In sRGB codes a gain g of light is near g^(1/2.4); the curve's toe bends it by a few parts in a thousand.
     assert np.allclose(found, gain ** (1 / 2.3), atol=0.01)
 
@@ -94,14 +92,14 @@ def test_an_exposure_change_is_measured(gain: float) -> None:
 def test_noise_is_measured() -> None:
     for noise in (0.01, 0.02):
         image, plates, _ = compose(Scene(noise=noise))
-        figures = segment_view(image, plates, SETTINGS).quality.figures
+        figures = segment_view(image, plates).quality.figures
         assert figures["noise_levels"] == pytest.approx(255 * noise * np.sqrt(2), rel=0.08)
 
 
 def test_a_grey_picture_is_compared_with_plates_in_colour() -> None:
     image, plates, truth = compose(Scene(backdrop=(0.9, 0.6, 0.05), pattern=0.1))
     grey = np.repeat(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
-    iou, off = errors(segment_view(grey, plates, SETTINGS), truth)
+    iou, off = errors(segment_view(grey, plates), truth)
     assert iou > 0.99
     assert abs(np.median(off)) < 0.2
 
@@ -118,14 +116,14 @@ FAULTS = [
 @pytest.mark.parametrize("scene", FAULTS)
 def test_one_view_is_right_or_says_that_it_is_not(scene: Scene) -> None:
     image, plates, truth = compose(scene)
-    silhouette = segment_view(image, plates, SETTINGS)
+    silhouette = segment_view(image, plates)
     iou, _ = errors(silhouette, truth)
     assert iou > 0.99 or silhouette.quality.warnings
 
 
 def test_nobody_there_is_reported() -> None:
     plates, later = (compose(Scene(seed=seed))[1] for seed in (0, 5))
-    silhouette = segment_view(later[0], plates, SETTINGS)
+    silhouette = segment_view(later[0], plates)
     assert not silhouette.quality.usable
     assert "no subject" in silhouette.quality.warnings[0].text
     assert np.isfinite(silhouette.distance).all()
@@ -150,7 +148,7 @@ def contour_offsets(silhouette: Silhouette, mask: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("folder", ["scan-a", "draw-b"])
 def test_masks_of_another_renderer_are_met(folder: str) -> None:
     capture, rig = read_capture(shared(f"data/captures/{folder}"))
-    silhouettes = segment(capture, rig, SETTINGS, report=quiet)
+    silhouettes = segment(capture, rig, report=quiet)
     rms, bias = [], []
     for name in rig.names:
         mask = true_mask(name, folder)
@@ -195,7 +193,7 @@ def test_a_fault_in_one_view_is_named_by_the_others(
 ) -> None:
     capture, rig = scan
     edited = edit(capture.images[name], capture.backgrounds[name][0], true_mask(name))
-    silhouettes = segment(replace(capture, images={**capture.images, name: edited}), rig, SETTINGS, report=quiet)
+    silhouettes = segment(replace(capture, images={**capture.images, name: edited}), rig, report=quiet)
     said = " ".join(texts_of(silhouettes[name].quality.warnings))
     assert any(part in said for part in word.split("|")), said
     mask = true_mask(name)
@@ -210,9 +208,7 @@ def test_operator_masks_override_and_need_no_plate(scan: tuple[Capture, Rig]) ->
     capture, rig = scan
     operator_mask = true_mask("cam02")
     backgrounds = {name: plates for name, plates in capture.backgrounds.items() if name != "cam02"}
-    silhouettes = segment(
-        replace(capture, backgrounds=backgrounds, masks={"cam02": operator_mask}), rig, SETTINGS, report=quiet
-    )
+    silhouettes = segment(replace(capture, backgrounds=backgrounds, masks={"cam02": operator_mask}), rig, report=quiet)
     np.testing.assert_array_equal(silhouettes["cam02"].mask, operator_mask)
     assert silhouettes["cam02"].quality.usable
 
@@ -221,7 +217,7 @@ def test_a_camera_with_neither_plate_nor_mask_is_refused(scan: tuple[Capture, Ri
     capture, rig = scan
     backgrounds = {name: plates for name, plates in capture.backgrounds.items() if name not in ("cam02", "cam04")}
     with pytest.raises(InputError) as caught:
-        segment(replace(capture, backgrounds=backgrounds), rig, SETTINGS, report=quiet)
+        segment(replace(capture, backgrounds=backgrounds), rig, report=quiet)
     assert len(caught.value.faults) == 2
 
 
@@ -250,7 +246,7 @@ def test_noise_of_six_levels_makes_no_holes(scan: tuple[Capture, Rig]) -> None:
     """Shaded skin and a backdrop of its colour: there were holes of 137 to 349 px in cam01 and cam02."""
     noisy = noisier(scan[0], 6.0)
     for name in ("cam01", "cam02"):
-        found = segment_view(noisy.images[name], noisy.backgrounds[name], SETTINGS)
+        found = segment_view(noisy.images[name], noisy.backgrounds[name])
         missing = (true_mask(name) & ~found.mask).astype(np.uint8)
         areas = cv2.connectedComponentsWithStats(missing)[2][1:, cv2.CC_STAT_AREA]
         assert areas.max() < 100, name  # what is left are bays of the outline
@@ -259,7 +255,7 @@ def test_noise_of_six_levels_makes_no_holes(scan: tuple[Capture, Rig]) -> None:
 def test_progress_is_reported_and_may_cancel(scan: tuple[Capture, Rig]) -> None:
     capture, rig = scan
     heard: list[float] = []
-    segment(capture, rig, SETTINGS, report=lambda stage, fraction: heard.append(fraction))
+    segment(capture, rig, report=lambda stage, fraction: heard.append(fraction))
     assert heard == sorted(heard)
     assert heard[-1] == 1.0
     assert len(heard) == len(rig) + 1

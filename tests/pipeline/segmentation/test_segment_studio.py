@@ -14,7 +14,6 @@ from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import segment
 from pipeline.segmentation.view_consistency import judge_agreement
-from pipeline.settings import SegmentationSettings
 from pipeline.view_checks.usable_views import view_warnings
 from rig.capture import Capture
 from rig.mesh import Mesh
@@ -43,7 +42,7 @@ def photograph(
 
 
 def segmented(taken: SimulatedCapture) -> dict[str, Silhouette]:
-    return segment(taken.capture, taken.rig, SegmentationSettings(), report=lambda *_: None)
+    return segment(taken.capture, taken.rig, report=lambda *_: None)
 
 
 def coverage(taken: SimulatedCapture, name: str, blur_px: float) -> np.ndarray:
@@ -92,7 +91,7 @@ def measured(request: pytest.FixtureRequest, renderer: Renderer) -> tuple[Measur
             plates.add(taken, name, silhouette)
         if seed >= CAPTURES[0]:
             continue
-        stripped = segment(Capture(taken.capture.images), taken.rig, SegmentationSettings(), report=lambda *_: None)
+        stripped = segment(Capture(taken.capture.images), taken.rig, report=lambda *_: None)
         warned = " ".join(warning.text for warning in view_warnings(stripped))
         for name, silhouette in stripped.items():
             bare.add(taken, name, silhouette)
@@ -105,7 +104,7 @@ def test_a_smile_is_no_reason_to_doubt_a_view(seed: int, renderer: Renderer) -> 
     """Somebody who laughs once had a view left out: of its mask "1.5 % is where the others see nothing"."""
     laugh = {"mouthSmileLeft": 0.9, "mouthSmileRight": 0.9, "jawOpen": 0.3, "cheekSquintLeft": 0.6, "cheekPuff": 0.3}
     taken = photograph(seed, renderer, weights=laugh)
-    agreed = judge_agreement(segmented(taken), taken.rig, SegmentationSettings())
+    agreed = judge_agreement(segmented(taken), taken.rig)
     for name, silhouette in agreed.items():
         assert silhouette.quality.usable, (name, silhouette.quality)
         assert silhouette.quality.figures["strange_share"] == 0.0

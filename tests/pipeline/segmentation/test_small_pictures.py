@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from pipeline.segmentation.segment import segment_view
-from pipeline.settings import SegmentationSettings
 from rig.formats.captures.capture_folder import read_capture
 from tests.pipeline.segmentation.test_segment import true_mask
 from tests.support.shared_data import shared
@@ -30,7 +29,7 @@ def row(folder: str, view: str, size: float) -> Row:
         cv2.resize(picture, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
         for picture in (capture.images[view], *capture.backgrounds[view])
     ]
-    silhouette = segment_view(pictures[0], tuple(pictures[1:]), SegmentationSettings())
+    silhouette = segment_view(pictures[0], tuple(pictures[1:]))
     truth = true_mask(view, folder)
     at = (contour_points(truth) + 0.5) * size - 0.5
     x, y = (np.ascontiguousarray(at[:, k], np.float32)[None] for k in (0, 1))

@@ -8,7 +8,6 @@ import pytest
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.segmentation.view_consistency import judge_agreement
-from pipeline.settings import SegmentationSettings
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.rig import Rig
@@ -16,7 +15,6 @@ from rig.studio.scene.hair import HairStyle
 from tests.support.subjects import random_subjects, worn_silhouettes
 
 pytestmark = pytest.mark.gl
-SETTINGS = SegmentationSettings()
 DIRECTIONS_DEG = {
     "four": [(-45, 5), (-15, 5), (15, 5), (45, 5)],
     "four staggered": [(-60, 0), (-20, 10), (20, -10), (60, 0)],
@@ -51,7 +49,7 @@ def views(renderer):
 @pytest.mark.parametrize("name", DIRECTIONS_DEG)
 def test_true_masks_are_believed(views, name):
     rig, silhouettes = views[name]
-    for silhouette in judge_agreement(silhouettes, rig, SETTINGS).values():
+    for silhouette in judge_agreement(silhouettes, rig).values():
         assert silhouette.quality.usable
         assert silhouette.quality.warnings == ()
 
@@ -63,10 +61,10 @@ def test_a_missing_crown_is_named_and_a_ready_mask_kept(views, name):
     rows = np.flatnonzero(mask.any(axis=1))
     mask[: rows[0] + (rows[-1] - rows[0]) // 4] = False
     spoilt = silhouettes | {"cam01": replace(silhouette_from_mask(mask), quality=silhouettes["cam01"].quality)}
-    judged = judge_agreement(spoilt, rig, SETTINGS)
+    judged = judge_agreement(spoilt, rig)
     assert any("the mask lacks" in warning.text for warning in judged["cam01"].quality.warnings)
     assert all(not judged[other].quality.warnings for other in rig.names if other != "cam01")
     assert not judged["cam01"].quality.usable or name == "six"
-    ready = judge_agreement(spoilt, rig, SETTINGS, ready=rig.names)
+    ready = judge_agreement(spoilt, rig, ready=rig.names)
     assert ready["cam01"].quality.usable
     assert any("correct the mask" in warning.text for warning in ready["cam01"].quality.warnings)

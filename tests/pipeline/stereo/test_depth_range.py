@@ -6,9 +6,9 @@ import trimesh
 
 from pipeline.geometry.raster import depth_map
 from pipeline.multiview.visual_hull import hull_extent
-from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import make_crops
-from pipeline.stereo.depth_range import DepthRange, find_depth_ranges
+from pipeline.stereo.depth_range import BEFORE_HEAD_MM, DepthRange, find_depth_ranges
+from pipeline.stereo.estimate import PIXEL_MM
 from pipeline.stereo.stack import stack_crops
 from rig.camera import Camera
 from rig.geometry import RigidTransform
@@ -16,7 +16,6 @@ from rig.mesh import Mesh
 from rig.rig import Rig
 from tests.pipeline.stereo.ray_scene import Ball, fan, shoot
 
-SETTINGS = DenseSettings()
 BORDER_PX = 10  # of the lower edge: the hull of what it cuts off has a crease there
 NARROW_DEG = 8.0  # between cameras: their hull of a ball reaches several radii before it
 
@@ -25,9 +24,9 @@ def rooms_of(rig: Rig, balls: tuple[Ball, ...], head: Mesh | None) -> list[tuple
     """Of each view its room, the camera of that size, and the signed distance (px) to the outline."""
     images, silhouettes = shoot(rig, balls)
     extent = hull_extent(silhouettes, rig)
-    crops = make_crops(images, silhouettes, rig, pixel_mm=SETTINGS.pixel_mm, at_world=extent[0])
+    crops = make_crops(images, silhouettes, rig, pixel_mm=PIXEL_MM, at_world=extent[0])
     stack = stack_crops(crops, 2)
-    rooms = find_depth_ranges(crops, stack_crops(crops, 3), stack, head, extent, SETTINGS)
+    rooms = find_depth_ranges(crops, stack_crops(crops, 3), stack, head, extent)
     return [
         (room, crop.levels[2].camera, stack.image(stack.distance_px, view))
         for view, (room, crop) in enumerate(zip(rooms, crops, strict=True))
@@ -50,7 +49,7 @@ def test_the_surface_lies_in_the_room(apart_deg: float) -> None:
         assert seen.sum() > 100
         assert np.mean((room.near < true)[seen] & (true < room.far)[seen]) > 0.95
         if apart_deg == NARROW_DEG:
-            assert (true - room.near)[seen].max() < 1.5 * SETTINGS.before_head_mm
+            assert (true - room.near)[seen].max() < 1.5 * BEFORE_HEAD_MM
 
 
 def test_beside_the_head_its_nearest_and_farthest_places_bound_the_room() -> None:

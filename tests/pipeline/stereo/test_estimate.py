@@ -5,7 +5,6 @@ import os
 import numpy as np
 import pytest
 
-from pipeline.settings import DenseSettings
 from pipeline.stereo.depth_map import DepthMap, points_world
 from pipeline.stereo.estimate import estimate_depth
 from rig.camera import Distortion
@@ -22,7 +21,7 @@ def quiet(stage: str, fraction: float) -> None:
 
 def estimate(rig: Rig, balls: tuple[Ball, ...]) -> tuple[DepthMap, ...]:
     images, silhouettes = shoot(rig, balls)
-    return estimate_depth(images, silhouettes, rig, None, DenseSettings(), report=quiet)
+    return estimate_depth(images, silhouettes, rig, None, report=quiet)
 
 
 def depth_errors(depth_map: DepthMap, balls: tuple[Ball, ...]) -> np.ndarray:

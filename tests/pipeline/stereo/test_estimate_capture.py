@@ -6,7 +6,6 @@ import pytest
 from scipy.spatial import KDTree
 
 from pipeline.imaging.silhouette import silhouette_from_mask
-from pipeline.settings import DenseSettings
 from pipeline.stereo.depth_map import DepthMap, points_world
 from pipeline.stereo.estimate import estimate_depth
 from rig.capture import Capture
@@ -24,7 +23,7 @@ def test_depth_of_a_scan_is_precise_and_states_its_deviation() -> None:
     capture, rig = read_capture(folder)
     masks = {name: cv2.imread(str(truth / "silhouettes" / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for name in rig.names}
     silhouettes = {name: silhouette_from_mask(mask > 127) for name, mask in masks.items() if mask is not None}
-    maps = estimate_depth(capture.images, silhouettes, rig, None, DenseSettings(), report=lambda stage, share: None)
+    maps = estimate_depth(capture.images, silhouettes, rig, None, report=lambda stage, share: None)
     visible = np.load(truth / "visible.npz")
     distance, deviations, part = errors(maps, visible)
     for which, precise, within_two in ((HEAD, 0.98, 0.9), (HAIR, 0.95, 0.8)):
@@ -66,8 +65,8 @@ def smooth_skin(factor: float, noise_levels: float) -> tuple[float, float]:
     shot = noisier(Capture({name: reduced(image) for name, image in capture.images.items()}), noise_levels)
     masks = {name: cv2.imread(str(truth / "silhouettes" / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for name in rig.names}
     silhouettes = {name: silhouette_from_mask(reduced(mask) > 127) for name, mask in masks.items() if mask is not None}
-    small, settings = rig.scaled(factor), DenseSettings()
-    maps = estimate_depth(shot.images, silhouettes, small, None, settings, report=lambda stage, share: None)
+    small = rig.scaled(factor)
+    maps = estimate_depth(shot.images, silhouettes, small, None, report=lambda stage, share: None)
     distance, _, part = errors(maps, np.load(truth / "visible.npz"))
     names = [each.camera.name for each in maps]
     scales = [each.camera.intrinsics.fx / small[each.camera.name].intrinsics.fx for each in maps]

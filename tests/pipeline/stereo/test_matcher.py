@@ -5,13 +5,19 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import Crop, make_crops
 from pipeline.stereo.depth_map import DepthMap
 from pipeline.stereo.depth_range import DepthRange, find_depth_ranges
-from pipeline.stereo.estimate import COARSEST_LEVEL, choose_neighbours, estimate_depth, square_pattern
+from pipeline.stereo.estimate import (
+    COARSEST_LEVEL,
+    CONTRAST_LEVELS,
+    PIXEL_MM,
+    choose_neighbours,
+    estimate_depth,
+    square_pattern,
+)
 from pipeline.stereo.matcher import GROUP, SHADERS, Matcher, Planes, matching_on
-from pipeline.stereo.search import label_strides
+from pipeline.stereo.search import LABELS, label_strides
 from pipeline.stereo.stack import Stack, stack_crops
 from rig.camera import Distortion
 from rig.progress import discard_progress
@@ -21,7 +27,6 @@ from tests.pipeline.stereo.ray_scene import Ball, fan, shoot
 pytestmark = pytest.mark.gl
 
 MEDIAN_MM = 0.02  # that depth by shaders may differ from that by loops
-SETTINGS = DenseSettings()
 BALLS = (Ball(), Ball(centre=(15.0, 5.0, 95.0), radius=22.0))
 
 
@@ -35,7 +40,7 @@ def device() -> Iterator[ComputeDevice]:
 def crops() -> list[Crop]:
     rig = fan(4, 18.0, Distortion(k1=-0.05, p1=0.001))
     images, silhouettes = shoot(rig, BALLS)
-    return make_crops(images, silhouettes, rig, pixel_mm=SETTINGS.pixel_mm, at_world=np.zeros(3))
+    return make_crops(images, silhouettes, rig, pixel_mm=PIXEL_MM, at_world=np.zeros(3))
 
 
 @pytest.fixture(scope="module")
@@ -46,11 +51,11 @@ def stack(crops: list[Crop]) -> Stack:
 @pytest.fixture
 def matchers(device: ComputeDevice, crops: list[Crop], stack: Stack) -> Iterator[tuple[Matcher, Matcher]]:
     """By loops, and by shaders, of the second view."""
-    neighbours = choose_neighbours([crop.camera for crop in crops], np.zeros(3), SETTINGS)
+    neighbours = choose_neighbours([crop.camera for crop in crops], np.zeros(3))
     pattern = square_pattern(2)
     with (
-        matching_on(None, stack, neighbours, pattern, SETTINGS.contrast_levels) as by_loops,
-        matching_on(device, stack, neighbours, pattern, SETTINGS.contrast_levels) as by_shaders,
+        matching_on(None, stack, neighbours, pattern, CONTRAST_LEVELS) as by_loops,
+        matching_on(device, stack, neighbours, pattern, CONTRAST_LEVELS) as by_shaders,
     ):
         yield by_loops.matcher(1), by_shaders.matcher(1)
 
@@ -58,7 +63,7 @@ def matchers(device: ComputeDevice, crops: list[Crop], stack: Stack) -> Iterator
 @pytest.fixture
 def room(crops: list[Crop], stack: Stack) -> DepthRange:
     extent = (np.zeros(3), 220.0)
-    return find_depth_ranges(crops, stack_crops(crops, COARSEST_LEVEL), stack, None, extent, SETTINGS)[1]
+    return find_depth_ranges(crops, stack_crops(crops, COARSEST_LEVEL), stack, None, extent)[1]
 
 
 def planes(room: DepthRange) -> Planes:
@@ -70,9 +75,9 @@ def planes(room: DepthRange) -> Planes:
 
 
 def test_costs_of_a_sweep_are_those_of_the_loops(matchers: tuple[Matcher, Matcher], room: DepthRange) -> None:
-    strides = label_strides(room, SETTINGS)
+    strides = label_strides(room)
     assert strides.max() > 1, "places between are interpolated"
-    by_loops, by_shaders = (matcher.sweep(room, strides, SETTINGS.labels) for matcher in matchers)
+    by_loops, by_shaders = (matcher.sweep(room, strides, LABELS) for matcher in matchers)
     compared = by_loops[room.far > 0.0]
     assert np.ptp(compared) > 0.5
     # A window at the edge of what another view shows falls on either side of it by rounding: seldom, then wholly.
@@ -125,8 +130,7 @@ def test_depth_by_shaders_is_that_of_the_loops(device: ComputeDevice) -> None:
     rig = fan(5, 18.0)
     images, silhouettes = shoot(rig, BALLS)
     by_loops, by_shaders = (
-        estimate_depth(images, silhouettes, rig, None, SETTINGS, report=discard_progress, device=each)
-        for each in (None, device)
+        estimate_depth(images, silhouettes, rig, None, report=discard_progress, device=each) for each in (None, device)
     )
     apart_mm, share = known_in_both(by_loops, by_shaders)
     assert len(apart_mm) > 10_000

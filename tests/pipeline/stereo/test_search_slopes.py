@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.settings import DenseSettings
 from pipeline.stereo.crops import make_crops
 from pipeline.stereo.depth_range import DepthRange
-from pipeline.stereo.estimate import choose_neighbours, square_pattern
+from pipeline.stereo.estimate import CONTRAST_LEVELS, PIXEL_MM, choose_neighbours, square_pattern
 from pipeline.stereo.matcher import Matching
 from pipeline.stereo.search import first_fields, slopes_around
 from pipeline.stereo.stack import stack_crops
@@ -15,7 +14,6 @@ from tests.pipeline.stereo import ray_scene
 from tests.pipeline.stereo.ray_scene import Ball, fan, first_hit, shoot
 
 BALL = Ball(wave_mm=18.0)
-SETTINGS = DenseSettings()
 
 
 def test_slopes_are_those_of_the_depths_around() -> None:
@@ -40,19 +38,19 @@ def test_places_are_found_where_the_bounds_slope_otherwise_than_the_surface(monk
         monkeypatch.setattr(ray_scene, name, getattr(ray_scene, name) // 2)
     rig = fan(3, 20.0)
     images, silhouettes = shoot(rig, (BALL,))
-    crops = make_crops(images, silhouettes, rig, pixel_mm=SETTINGS.pixel_mm, at_world=np.zeros(3))
+    crops = make_crops(images, silhouettes, rig, pixel_mm=PIXEL_MM, at_world=np.zeros(3))
     cameras = [crop.levels[0].camera for crop in crops]
     matching = Matching(
         stack_crops(crops, 0),
-        choose_neighbours(cameras, np.zeros(3), SETTINGS),
+        choose_neighbours(cameras, np.zeros(3)),
         square_pattern(2),
-        SETTINGS.contrast_levels,
+        CONTRAST_LEVELS,
     )
     true = [true_depth(camera) for camera in cameras]
     ranges = []
     for z in true:
         near, far = (np.where(np.isfinite(z), z + off, 0.0).astype(np.float32) for off in (-40.0, 35.0))
         ranges.append(DepthRange(near, far, np.full((*z.shape, 4), 3.0, np.float32)))
-    fields = first_fields(matching, ranges, SETTINGS)
+    fields = first_fields(matching, ranges)
     right = np.concatenate([(np.abs(f.depth - z) < 3.0)[np.isfinite(z)] for f, z in zip(fields, true, strict=True)])
     assert right.mean() > 0.75  # 0.86; below 0.5 with the bounds' slopes

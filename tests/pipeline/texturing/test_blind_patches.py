@@ -53,7 +53,7 @@ def test_a_strip_across_an_opening_takes_one_photograph() -> None:
     skin = found.colours.copy()
     skin[rim] = (150, 110, 90)
     layout = unwrap(mesh.vertices, mesh.faces)
-    seen = fill_unobserved_patches(hidden, mesh, shot.silhouettes, depths, settings)
+    seen = fill_unobserved_patches(hidden, mesh, shot.silhouettes, depths)
     assert len(np.unique(seen.slots[rim, 0])) == 1  # no seams in it
     others = np.setdiff1d(np.arange(len(mesh.vertices)), rim)
     np.testing.assert_array_equal(seen.slots[others], hidden.slots[others])
@@ -84,5 +84,5 @@ def test_what_views_see_by_its_vertices_stays() -> None:
     )
     decision = coloured.decision
     assert decision is not None
-    again = fill_unobserved_patches(decision, shot.mesh, shot.silhouettes, depths, settings)
+    again = fill_unobserved_patches(decision, shot.mesh, shot.silhouettes, depths)
     np.testing.assert_array_equal(again.slots, decision.slots)

@@ -7,15 +7,12 @@ import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 
-from pipeline.settings import SelectionSettings
 from pipeline.texturing.inpaint import neighbours
 from pipeline.texturing.neighbourhood import Neighbourhood
-from pipeline.texturing.seam_levelling import level_views
+from pipeline.texturing.seam_levelling import LEVELLING, level_views
 from pipeline.texturing.view_selection import add_similar_views, select_views
 from pipeline.texturing.view_selection_kernels import RING_SHARE, differences, fill_slots, propagate
 from tests.support.scenes import ellipsoid
-
-SETTINGS = SelectionSettings()
 
 
 def chain(count: int) -> Neighbourhood:
@@ -61,7 +58,7 @@ def test_a_seam_keeps_out_of_where_views_differ() -> None:
     codes[0, middle] += 12
     codes[1, middle] -= 12
     agreed = np.full((rows * columns, 3), 120.0, np.float32)
-    labels, _, _ = select_views(weights, codes, codes, agreed, np.ones((2, 3)), around=around, settings=SETTINGS)
+    labels, _, _ = select_views(weights, codes, codes, agreed, np.ones((2, 3)), around=around)
     seam = labels[around.rows] != labels[around.indices]
     assert {*labels.tolist()} == {0, 1}
     assert not (middle[around.rows] & middle[around.indices] & seam).any()
@@ -73,16 +70,12 @@ def test_a_view_that_the_others_contradict_or_whose_camera_was_raised_much_is_no
     weights[0] = 1.0  # would be the best
     codes = np.full((3, 24, 3), 100.0, np.float32)
     agreed = codes[0].copy()
-    assert (
-        select_views(weights, codes, codes, agreed, np.ones((3, 3)), around=around, settings=SETTINGS)[0] == 0
-    ).all()
+    assert (select_views(weights, codes, codes, agreed, np.ones((3, 3)), around=around)[0] == 0).all()
     raised = np.array([[2.0] * 3, [0.7] * 3, [0.7] * 3])
-    assert (select_views(weights, codes, codes, agreed, raised, around=around, settings=SETTINGS)[0] != 0).all()
+    assert (select_views(weights, codes, codes, agreed, raised, around=around)[0] != 0).all()
     for off in (-25.0, 25.0):  # a shadow, a highlight
         codes[0] = 100.0 + off
-        assert (
-            select_views(weights, codes, codes, agreed, np.ones((3, 3)), around=around, settings=SETTINGS)[0] != 0
-        ).all()
+        assert (select_views(weights, codes, codes, agreed, np.ones((3, 3)), around=around)[0] != 0).all()
 
 
 Scene = tuple[Neighbourhood, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -124,10 +117,7 @@ def test_without_a_cost_of_seams_the_cheapest_view_is_chosen(seed: int) -> None:
     scene = random_scene(seed)
     around, weights, codes, agreed, gains = scene
     levelled = (0.5 * (codes + agreed)).astype(np.float32)
-    settings = SelectionSettings(smoothness=0.0)
-    labels, views, view_quality = select_views(
-        weights, codes, levelled, agreed, gains, around=around, settings=settings
-    )
+    labels, views, view_quality = select_views(weights, codes, levelled, agreed, gains, around=around, seam_cost=0.0)
     cost, quality, _ = written_out(scene, levelled)
     for v in range(40):
         order = np.argsort(cost[v])
@@ -145,9 +135,7 @@ def test_seams_cost_more_where_views_differ(seed: int, noise: float) -> None:
     """The best of all labels of a short chain, seams included."""
     scene = random_scene(seed, 6, 3, noise)
     around, weights, codes, agreed, gains = scene
-    labels, _, _ = select_views(
-        weights, codes, codes, agreed, gains, around=around, settings=SelectionSettings(smoothness=0.3)
-    )
+    labels, _, _ = select_views(weights, codes, codes, agreed, gains, around=around, seam_cost=0.3)
     cost, quality, off = written_out(scene, codes)
     unlike = np.minimum((quality * off).sum(axis=1) / quality.sum(axis=1), 3.0)
     seams = 0.3 * (0.3 + 0.5 * (unlike[:-1] + unlike[1:]))
@@ -163,7 +151,7 @@ def test_seams_cost_more_where_views_differ(seed: int, noise: float) -> None:
 def test_shares_fall_with_quality_and_with_what_is_more_than_noise(seed: int) -> None:
     around, weights, codes, agreed, gains = random_scene(seed)
     detail = (codes - agreed).astype(np.float32)
-    labels, views, quality = select_views(weights, codes, codes, agreed, gains, around=around, settings=SETTINGS)
+    labels, views, quality = select_views(weights, codes, codes, agreed, gains, around=around)
     labels[5] = -1
     off = differences(labels, views, detail, weights, around.starts, around.indices)
     others = [off[v, c] for v, c in np.ndindex(off.shape) if off[v, c] >= 0 and views[v, c] != labels[v]]
@@ -174,7 +162,7 @@ def test_shares_fall_with_quality_and_with_what_is_more_than_noise(seed: int) ->
             past = max(off[v, c] / (4.0 * noise) - 1.0, 0.0)
             shares[v, c] = quality[v, c] / quality[v].max() * np.exp(-past)
     wanted = fill_slots(labels, views, shares, 4)
-    found = add_similar_views(labels, views, quality, detail, weights, around=around, settings=SETTINGS)
+    found = add_similar_views(labels, views, quality, detail, weights, around=around)
     np.testing.assert_array_equal(found[0], wanted[0])
     np.testing.assert_allclose(found[1], wanted[1], rtol=1e-4)
 
@@ -185,7 +173,7 @@ def test_a_vertex_that_no_view_sees_has_no_label() -> None:
     weights[:, 5] = 0
     weights[0, :4] = 0
     codes = np.full((2, 12, 3), 90.0, np.float32)
-    labels, views, _ = select_views(weights, codes, codes, codes[0], np.ones((2, 3)), around=around, settings=SETTINGS)
+    labels, views, _ = select_views(weights, codes, codes, codes[0], np.ones((2, 3)), around=around)
     assert (labels[5], views[5].tolist()) == (-1, [-1, -1])
     assert (labels[:4] == 1).all()
 
@@ -201,7 +189,7 @@ def test_views_are_averaged_where_they_differ_by_noise_alone() -> None:
     views = np.tile(np.array([0, 1, 2], np.int32), (count, 1))
     quality = np.ones((count, 3), np.float32)
     weights = np.ones((3, count), np.float32)
-    slots, shares = add_similar_views(labels, views, quality, detail, weights, around=around, settings=SETTINGS)
+    slots, shares = add_similar_views(labels, views, quality, detail, weights, around=around)
     np.testing.assert_allclose(shares.sum(axis=1), 1, rtol=1e-5)
     assert (slots[:, 0] == 0).all()
     assert (shares[eye, 0] > 0.99).all()
@@ -216,11 +204,11 @@ def test_levelling_solves_the_screened_poisson_equation() -> None:
     weights = (rng.uniform(size=(2, count)) < 0.8).astype(np.float32)
     codes = rng.uniform(100, 160, (2, count, 3)).astype(np.float32)
     agreed = rng.uniform(100, 160, (count, 3)).astype(np.float32)
-    found = level_views(weights, codes, agreed, around, SETTINGS.levelling)
+    found = level_views(weights, codes, agreed, around)
     for k in range(2):
         seen = weights[k] > 0
         joined = seen[around.rows] & seen[around.indices]
-        entries = (np.full(joined.sum(), SETTINGS.levelling), (around.rows[joined], around.indices[joined]))
+        entries = (np.full(joined.sum(), LEVELLING), (around.rows[joined], around.indices[joined]))
         beside = scipy.sparse.csr_array(entries, shape=(count, count))
         system = scipy.sparse.diags_array(1 + beside.sum(axis=1)) - beside
         aims = np.where(seen[:, None], agreed - codes[k], 0.0)

@@ -7,7 +7,6 @@ import pytest
 
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.segmentation.segment import segment
-from pipeline.settings import Settings
 from pipeline.view_checks.image_assignment import ExchangedPictures, WrongRig, assign_images, misplaced_plates
 from rig.capture import Capture, reassign_images
 from rig.studio.scene.layout import arrangement
@@ -106,10 +105,10 @@ def test_plates_of_one_backdrop_are_nobodys(half_size_shot):
 
 
 def test_segmentation_of_exchanged_cables_ends_where_that_of_good_ones_does(half_size_shot):
-    shot, settings = half_size_shot, Settings().segmentation
+    shot = half_size_shot
 
     def segmented(capture: Capture):
-        return segment(capture, shot.rig, settings, report=lambda stage, share: None)
+        return segment(capture, shot.rig, report=lambda stage, share: None)
 
     exchanged = reassign_images(shot.capture, pictures=EXCHANGE, plates=EXCHANGE)
     found = assign_images(exchanged, shot.rig, segmented, exchanged="repair")

@@ -9,7 +9,6 @@ from calibration.scene.rig_scale import times
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.segmentation.segment import _mask_quality
-from pipeline.settings import SegmentationSettings
 from pipeline.view_checks.head_size import WrongScale
 from pipeline.view_checks.image_assignment import SamePictures
 from pipeline.view_checks.usable_views import TooFewViews, UsableViews, usable_views, view_warnings
@@ -126,12 +125,11 @@ def test_masks_that_may_hold_the_face_alone_are_thought_of_before_the_unit(seen:
 def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
     rows, columns = np.indices((120, 160))
     bust = (np.hypot(columns - 80, rows - 55) < 25) | ((rows > 85) & (np.abs(columns - 80) < 55))
-    settings = SegmentationSettings()
     for turns, side in ((0, "top"), (1, "left"), (2, "bottom"), (3, "right")):
         for cut in (False, True):
             mask = np.roll(bust, -40, axis=0) if cut else bust
             mask[-40:] |= cut & bust[-1]
-            quality = _mask_quality(np.ascontiguousarray(np.rot90(mask, turns)), settings)
+            quality = _mask_quality(np.ascontiguousarray(np.rot90(mask, turns)))
             assert [warning.text for warning in quality.warnings if "cut off" in warning.text] == (
                 [f"the head is cut off at the {side} of the image: move the camera back or "
                  f"{'tilt it up' if side == 'top' else 'turn it'}"] if cut else []

@@ -58,7 +58,7 @@ def test_a_format_that_does_not_exist_is_wrong_usage_and_the_others_reach_the_se
     assert "'fbx' is none of glb, ply, obj, usdz, stl, 3mf" in " ".join(wrong.stderr.replace("│", " ").split())
     assert CliRunner().invoke(app, [*arguments, "--formats", "glb, usdz"]).exit_code == 0
     assert CliRunner().invoke(app, [*arguments, "--albedo"]).exit_code == 0
-    assert requested == [{"formats": ["glb", "usdz"]}, {"delight": True}]
+    assert requested == [{"formats": ["glb", "usdz"]}, {"albedo": "file"}]
     for option in ("--obj", "--atlas", "--delight"):  # of versions before 0.3.0
         refused = CliRunner().invoke(app, [*arguments, option])
         assert refused.exit_code == 2

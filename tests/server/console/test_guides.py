@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.alignment.feature_points import locate_features
 from pipeline.head_model.landmarks import NAMES
-from pipeline.settings import CLICK_NOISE_PX
+from pipeline.multiview.triangulation import CLICK_NOISE_PX
 from rig.messages.message import compose, texts_of
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout

@@ -20,7 +20,7 @@ from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview import tangency
 from pipeline.segmentation.segment import segment
-from pipeline.settings import FittingSettings, Settings
+from pipeline.settings import FittingSettings
 from pipeline.view_checks import camera_assignment, camera_drift, image_assignment, rig_agreement
 from pipeline.view_checks.camera_assignment import find_assignment
 from pipeline.view_checks.camera_drift import find_drift
@@ -126,7 +126,7 @@ def _filed(silhouettes: Mapping[str, Silhouette]) -> Capture:
 
 def _assigned(capture: Capture, rig: Rig) -> ImageAssignment:
     def segmented(shot: Capture) -> dict[str, Silhouette]:
-        return segment(shot, rig, Settings().segmentation, report=lambda stage, fraction: None)
+        return segment(shot, rig, report=lambda stage, fraction: None)
 
     return assign_images(capture, rig, segmented, exchanged="repair")
 

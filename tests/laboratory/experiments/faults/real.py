@@ -109,7 +109,7 @@ def judge(
 ) -> Row:
     """Reconstructs the bust from eleven views, and compares it with the others."""
     started = time.perf_counter()
-    silhouettes = segment(real_capture.capture, real_capture.rig, settings.segmentation, report=report)
+    silhouettes = segment(real_capture.capture, real_capture.rig, report=report)
     seconds_masks = time.perf_counter() - started
     near = views_in_front(real_capture.rig, real_capture.front)
     sound = [name for name in near if silhouettes[name].quality.usable]

@@ -213,7 +213,7 @@ def every_level(
 def hull_row(known: Callable[[], Known]) -> Row:
     """Computes the visual hull of a capture, and returns its distances (mm) from the true face."""
     subject = known()
-    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=discard_progress)
+    silhouettes = segment(subject.capture, subject.rig, report=discard_progress)
     return {"hull": surface_error(subject, visual_hull(silhouettes, subject.rig))}
 
 
@@ -263,7 +263,7 @@ def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) 
     since the latter continues where shoulders, which no model has, hide the former.
     """
     known, settings = read_known(path), Settings()
-    silhouettes = segment(known.capture, known.rig, settings.segmentation, report=discard_progress)
+    silhouettes = segment(known.capture, known.rig, report=discard_progress)
     rest = known.rig.subset(other for other in known.rig.names if other != camera)
     views = pack_views(known.rig.subset([camera]), {camera: silhouettes[camera].distance})
     true = find_rim(make_topology(known.mesh.faces, known.face), known.mesh.vertices, views)

@@ -149,7 +149,7 @@ def faulty(kind: str, model: HeadModel, subject: Planted, renderer: Renderer, rn
     if kind == "swapped":
         masks[first], masks[second] = masks[second], masks[first]
         bad = sorted([first, second])
-    silhouettes = segment(Capture({}, {}, masks, {}), rig, Settings().segmentation, report=lambda stage, fraction: None)
+    silhouettes = segment(Capture({}, {}, masks, {}), rig, report=lambda stage, fraction: None)
     silhouettes, _ = without_moved_cameras(silhouettes, rig)
     left_out = sorted(name for name, silhouette in silhouettes.items() if not silhouette.quality.usable)
     row = fitted(model, subject, silhouettes, rig)

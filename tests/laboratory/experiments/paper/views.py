@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from pipeline.contour_fit.contour import fit_contour
 from pipeline.contour_fit.head_problem import head_problem
+from pipeline.contour_fit.prior_term import SCALE_SPREAD
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, Stage, State, first_evidence, make_problem
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import Silhouette
@@ -119,7 +120,7 @@ def information(model: HeadModel, head: Planted, rig: Rig) -> Information:
 
 def prior(model: HeadModel) -> Float[np.ndarray, "p p"]:
     """Returns the prior's information: z ~ N(0, I), no knowledge of the pose, a metric scale."""
-    return np.diag([*np.ones(len(model.modes)), *np.zeros(POSE - 1), FittingSettings().scale_spread ** -2.0])
+    return np.diag([*np.ones(len(model.modes)), *np.zeros(POSE - 1), SCALE_SPREAD**-2.0])
 
 
 def face_quadratic(model: HeadModel, head: Planted) -> Float[np.ndarray, "p p"]:

@@ -15,7 +15,6 @@ from calibration.scene.rig_scale import times
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.segmentation.segment import segment
-from pipeline.settings import Settings
 from pipeline.view_checks.guards import GUARDS, Guard, Guards
 from pipeline.view_checks.lens_distortion import judge_distortion
 from pipeline.view_checks.usable_views import usable_views
@@ -80,10 +79,9 @@ def guards(
 
 def judge(source: str, good: bool, capture: Capture, rig: Rig) -> Judged:
     """Runs the checks before a fit. A refusal counts with its warnings' codes, as it would with ``anyway``."""
-    settings = Settings()
 
     def segmented(shot: Capture) -> dict[str, Silhouette]:
-        return segment(shot, rig, settings.segmentation, report=lambda stage, share: None)
+        return segment(shot, rig, report=lambda stage, share: None)
 
     try:
         views = usable_views(capture, rig, segmented, exchanged="repair", guards=Guards(anyway=True))

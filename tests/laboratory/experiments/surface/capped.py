@@ -104,7 +104,7 @@ def _row(
     subject = Subject(head, marks, level.face_region, f"head-{number}")
     shot = simulate(subject, default_layout(), PRESET, rng, renderer=renderer, look=look)
     scalp = above_edge_mm(head.vertices, anatomy(head.vertices, marks)) > 0.0
-    silhouettes = segment(shot.capture, shot.rig, Settings().segmentation, report=discard_progress)
+    silhouettes = segment(shot.capture, shot.rig, report=discard_progress)
     ways = {"without": CapSettings(), "with": CapSettings(worn.stated, worn.cap.thickness_mm)}
     ears = head_regions(population)["ears"]
     found: Row = {"cap": worn.stated}

@@ -118,12 +118,12 @@ def hidden(
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer) -> Row:
     """Returns one subject: ``{level: {<seen|hidden>_<region>_<quantity>: value}}``."""
     subject = known()
-    silhouettes = segment(subject.capture, subject.rig, Settings().segmentation, report=discard_progress)
+    silhouettes = segment(subject.capture, subject.rig, report=discard_progress)
 
     def segmented(capture: Capture, *_: object, report: Progress) -> dict[str, Silhouette]:
         """Returns the same for every level; pictures that were put right are segmented anew."""
         again = capture is not subject.capture
-        return segment(capture, subject.rig, Settings().segmentation, report=report) if again else silhouettes
+        return segment(capture, subject.rig, report=report) if again else silhouettes
 
     found: Row = {}
     for level in LEVELS:

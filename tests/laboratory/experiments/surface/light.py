@@ -75,7 +75,7 @@ def light(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int =
         renderer: for the studio.
         subjects: heads in the studio.
     """
-    settings = replace(Settings(), outputs=OutputSettings(surface="head", delight=True, texture_size=2048))
+    settings = replace(Settings(), outputs=OutputSettings(surface="head", albedo="file", texture_size=2048))
     code = (fitted_light, albedo, decision, chart_colours, colour_chart)
     records = bench.records("light", key_of(model.sha256, settings, LIGHTS, *code))
     rows = []

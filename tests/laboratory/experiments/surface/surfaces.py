@@ -34,7 +34,7 @@ from pipeline.settings import Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stereo.crops import Crop, make_crops
 from pipeline.stereo.depth_map import DepthMap, points_world
-from pipeline.stereo.estimate import estimate_depth
+from pipeline.stereo.estimate import PIXEL_MM, estimate_depth
 from rig.errors import EigenheadError
 from rig.mesh import Mesh
 from rig.progress import discard_progress
@@ -65,22 +65,20 @@ class Shown:
     @cached_property
     def silhouettes(self) -> dict[str, Silhouette]:
         """Computes the silhouettes of the capture, by camera."""
-        return segment(self.known.capture, self.known.rig, Settings().segmentation, report=discard_progress)
+        return segment(self.known.capture, self.known.rig, report=discard_progress)
 
     def crops(self) -> list[Crop]:
         """Cuts out the subject in the photographs, undistorted, as the depth maps show it."""
-        at_world, pixel_mm = hull_extent(self.silhouettes, self.known.rig)[0], Settings().dense.pixel_mm
+        at_world = hull_extent(self.silhouettes, self.known.rig)[0]
         images = self.known.capture.images
-        return make_crops(images, self.silhouettes, self.known.rig, pixel_mm=pixel_mm, at_world=at_world)
+        return make_crops(images, self.silhouettes, self.known.rig, pixel_mm=PIXEL_MM, at_world=at_world)
 
     @cached_property
     def depth_maps(self) -> tuple[DepthMap, ...]:
         """Computes the depth maps of the capture, with the head fitted at the level ``photo``."""
         known = self.known
         head = every_level(known.capture, known.rig, self.model, ("photo",), self.renderer)["photo"].mesh()
-        return estimate_depth(
-            known.capture.images, self.silhouettes, known.rig, head, Settings().dense, report=discard_progress
-        )
+        return estimate_depth(known.capture.images, self.silhouettes, known.rig, head, report=discard_progress)
 
 
 def surfaces(

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from pipeline.segmentation.segment import segment
-from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
 from tests.pipeline.segmentation.test_segment import true_mask
@@ -18,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 @pytest.mark.parametrize("folder", ["scan-a", "draw-b"])
 def test_masks_of_another_programs_captures_without_their_plates(folder: str) -> None:
     capture, rig = read_capture(shared(f"data/captures/{folder}"))
-    found = segment(Capture(capture.images), rig, SegmentationSettings(), report=lambda *_: None)
+    found = segment(Capture(capture.images), rig, report=lambda *_: None)
     overlap = np.array([iou(silhouette, true_mask(name, folder)) for name, silhouette in found.items()])
     assert (overlap >= 0.99).mean() >= 0.9
     assert overlap.min() >= 0.97

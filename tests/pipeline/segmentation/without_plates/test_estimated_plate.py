@@ -11,7 +11,6 @@ from pipeline.segmentation.without_plates.estimated_plate import (
 )
 from pipeline.segmentation.without_plates.mask_search import CoarseMask
 from pipeline.segmentation.without_plates.viewing_volume import OtherViews
-from pipeline.settings import SegmentationSettings
 
 RADIUS = 120.3
 
@@ -58,9 +57,9 @@ def test_the_matting_finds_the_edge_to_a_fraction_of_a_pixel() -> None:
     small, from_edge = coarse_of(image, away)
     odds = np.where(from_edge < 3, 4.0, -4.0).astype(np.float32)
     others = OtherViews(odds, odds > 0)
-    decision = decision_without_plate(image, small, CoarseMask(odds, odds > 0, others), SegmentationSettings())
+    decision = decision_without_plate(image, small, CoarseMask(odds, odds > 0, others))
     assert plate_noise(decision) < 4
-    matte = solve_matte(image, decision, SegmentationSettings())
+    matte = solve_matte(image, decision)
     inside = np.zeros(away.shape, bool)
     inside[matte.box] = matte.alpha > 0.5
     assert np.count_nonzero(inside ^ (away < 0)) < 0.3 * 2 * np.pi * RADIUS  # 0.3 px all around
@@ -75,9 +74,8 @@ def test_a_head_encloses_no_backdrop() -> None:
     odds = np.where(hole, -6.0, np.clip(-3.0 * from_edge, -10, 10)).astype(np.float32)
     nothing = np.zeros_like(odds)
     found = CoarseMask(odds, (from_edge < 0) & ~hole, OtherViews(nothing, nothing > 1))
-    settings = SegmentationSettings()
-    assert not decision_without_plate(image, small, found, settings).mask[hole].all()
-    solid = decision_without_plate(image, small, found, settings, solid=True)
+    assert not decision_without_plate(image, small, found).mask[hole].all()
+    solid = decision_without_plate(image, small, found, solid=True)
     assert solid.mask[hole].all()
     assert (solid.probability[hole] > 0.95).all()
-    assert np.array_equal(solid.mask & ~hole, decision_without_plate(image, small, found, settings).mask & ~hole)
+    assert np.array_equal(solid.mask & ~hole, decision_without_plate(image, small, found).mask & ~hole)

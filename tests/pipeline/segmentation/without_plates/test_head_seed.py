@@ -6,7 +6,6 @@ import pytest
 from pipeline.segmentation.segment import segment
 from pipeline.segmentation.without_plates.decide import solid_around
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, above_chin, beside_head, head_core
-from pipeline.settings import SegmentationSettings
 from rig.capture import Capture
 from rig.formats.captures.capture_folder import read_capture
 from tests.pipeline.segmentation.test_segment import true_mask
@@ -78,7 +77,7 @@ def test_a_cut_keeps_the_head_and_has_no_holes() -> None:
 @pytest.mark.timeout(600)
 def test_three_frontal_views_before_a_plain_wall_need_neither_plate_nor_mask() -> None:
     capture, rig = read_capture(shared("data/captures/three-brows"))
-    found = segment(Capture(capture.images), rig, SegmentationSettings(), report=lambda *_: None)
+    found = segment(Capture(capture.images), rig, report=lambda *_: None)
     overlap = [iou(silhouette, true_mask(name, "three-brows")) for name, silhouette in found.items()]
     assert all(silhouette.quality.usable for silhouette in found.values())
     assert min(overlap) > 0.95, overlap
