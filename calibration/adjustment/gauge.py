@@ -111,7 +111,7 @@ class _ImageTerm:
         moves = world_motions(rig, scale=self.scale).reshape(len(rig), 6, -1)
         rows = np.concatenate([pose_jacobian(c, self.points) @ m for c, m in zip(rig, moves, strict=True)])
         miss = np.concatenate([camera.project(self.points) for camera in rig]) - self.target
-        good = np.isfinite(miss).all(axis=1) & np.isfinite(rows).all(axis=(1, 2))
+        good = np.asarray(np.isfinite(miss).all(axis=1) & np.isfinite(rows).all(axis=(1, 2)))
         return Residuals(np.where(good[:, None], miss, 0.0), lambda: np.where(good[:, None, None], rows, 0.0))
 
 

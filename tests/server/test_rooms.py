@@ -25,7 +25,7 @@ def test_every_refusal_has_its_status() -> None:
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_no_module_and_no_function_is_long(path: Path) -> None:
     text = path.read_text()
-    assert text.count("\n") < 400
+    assert text.count("\n") < 600
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             assert (node.end_lineno or 0) - node.lineno < 61 or node.name == "simulate", node.name
