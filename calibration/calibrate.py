@@ -121,8 +121,8 @@ class _Fit:
 def _refuse_blind_cameras(detections: Detections, dropped: Sequence[Dropped]) -> None:
     if len(detections.sizes) == 1:
         raise CalibrationRefused([compose("camera-alone", camera=next(iter(detections.sizes)))])
-    seen = {view.camera for view in detections.views}
-    blind = [name for name in detections.sizes if name not in seen]
+    cameras_with_board = {view.camera for view in detections.views}
+    blind = [name for name in detections.sizes if name not in cameras_with_board]
     if not blind:
         return
     if len(blind) == len(detections.sizes) and not dropped:
@@ -150,20 +150,20 @@ def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], repor
         report("bundle", min(0.9, len(dropped) / 10))
 
     for attempt in range(ROUNDS):
-        seen = observations(views, names, graph.shots, detections.board)
+        observed = observations(views, names, graph.shots, detections.board)
         if attempt == 0:
             for scale in (8.0, 2.0):
                 sigma = np.sqrt(noise**2 + 0.25) * scale
-                state = adjust(state, seen, weak, sigma, loss=CAUCHY, tick=tick).state
-        sigma, _ = corner_sigma(state, seen, noise)
-        state = adjust(state, seen, _prior(weak, names, lenses, noise, sigma), sigma, loss=CAUCHY, tick=tick).state
-        bad = bad_views(state, seen)
+                state = adjust(state, observed, weak, sigma, loss=CAUCHY, tick=tick).state
+        sigma, _ = corner_sigma(state, observed, noise)
+        state = adjust(state, observed, _prior(weak, names, lenses, noise, sigma), sigma, loss=CAUCHY, tick=tick).state
+        bad = bad_views(state, observed)
         if not bad.any():
             break
         strange = [view for view, is_bad in zip(views, bad, strict=True) if is_bad]
-        found = list(_explain(strange, graph, state, detections, float(np.median(sigma))))
-        dropped += found
-        gone = {(d.shot, d.camera) for d in found}
+        explanations = list(_explain(strange, graph, state, detections, float(np.median(sigma))))
+        dropped += explanations
+        gone = {(d.shot, d.camera) for d in explanations}
         views = tuple(v for v in views if not {(v.shot, v.camera), (v.shot, None)} & gone)
     return _finish(state, views, graph, detections, lenses, weak, noise=noise, dropped=tuple(dropped), report=report)
 
@@ -199,24 +199,24 @@ def _finish(
     offsets = estimate_offsets(state, everything, prior, sigma)
     used = offsets.rms_with_px < (1 - OFFSET_GAIN) * offsets.rms_without_px
     free = Free(offsets=used)
-    kept = np.ones(len(everything.pixels), dtype=bool)
+    retained = np.ones(len(everything.pixels), dtype=bool)
     solution = None
     for round_number in range(3):
         report("bundle", 0.9)
         if used:
             state = replace(state, velocities=board_velocities(state))
-        solution = adjust(state, everything.subset(kept), prior, sigma, free=free, loss=HUBER)
+        solution = adjust(state, everything.subset(retained), prior, sigma, free=free, loss=HUBER)
         state = solution.state
         if round_number == 2:
             break
-        sigma, _ = corner_sigma(state, everything.subset(kept), noise)
+        sigma, _ = corner_sigma(state, everything.subset(retained), noise)
         prior = _prior(weak, names, lenses, noise, sigma)
         size = np.linalg.norm(residuals(state, everything), axis=1)
-        kept = size < CORNER_SIGMAS * 1.1774 * sigma[everything.camera[everything.view_of]]
+        retained = size < CORNER_SIGMAS * 1.1774 * sigma[everything.camera[everything.view_of]]
     assert solution is not None
-    seen = everything.subset(kept)
-    _, sync = corner_sigma(state, seen, noise)
-    return _Fit(solution, seen, views, kept, names, prior, sigma, sync, offsets, free, dropped)
+    observed = everything.subset(retained)
+    _, sync = corner_sigma(state, observed, noise)
+    return _Fit(solution, observed, views, retained, names, prior, sigma, sync, offsets, free, dropped)
 
 
 def _contradicting_cameras(names: Sequence[str], views: Sequence[View], dropped: Sequence[Dropped]) -> list[Message]:
@@ -361,12 +361,12 @@ def _misses(fit: _Fit) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray, np
 
 
 def _warnings(fit: _Fit, lenses: dict[str, Lens], dropped: Sequence[Dropped]) -> tuple[Message, ...]:
-    found = [lens.weakness for lens in lenses.values() if lens.weakness]
-    found += [compose("left-out", what=drop.message()) for drop in dropped]
+    remarks = [lens.weakness for lens in lenses.values() if lens.weakness]
+    remarks += [compose("left-out", what=drop.message()) for drop in dropped]
     if fit.sync_px > 0.3:
-        found.append(compose("cameras-out-of-step", px=fit.sync_px))
+        remarks.append(compose("cameras-out-of-step", px=fit.sync_px))
     if fit.free.offsets:
         moments = zip(fit.names, fit.solution.state.offsets, strict=True)
         offsets = [compose("camera-offset", camera=name, shots=offset).text for name, offset in moments]
-        found.append(compose("offsets-used", offsets=offsets))
-    return tuple(found)
+        remarks.append(compose("offsets-used", offsets=offsets))
+    return tuple(remarks)

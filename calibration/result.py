@@ -13,9 +13,7 @@ from calibration.adjustment.intrinsics import Lens
 from calibration.adjustment.state import INTRINSICS, rms
 from calibration.adjustment.timing import TimeOffsets
 from calibration.board.board import Board
-from calibration.quality.checks import (
-    Check,
-)
+from calibration.quality.checks import Check
 from calibration.quality.outliers import Dropped
 from calibration.quality.verdict import CameraEvidence, Verdict, Word, judge
 from rig.atomic_write import write_atomically
@@ -170,7 +168,9 @@ class Calibration:
     def _covered(self, camera: Camera) -> float:
         """Share of the picture's cells that hold a corner."""
         size = (camera.intrinsics.width, camera.intrinsics.height)
-        pixels = np.concatenate([seen for (name, _), (_, seen, _) in self.misses.items() if name == camera.name])
+        pixels = np.concatenate(
+            [observed for (name, _), (_, observed, _) in self.misses.items() if name == camera.name]
+        )
         cells = np.clip((pixels / size * CELLS).astype(int), 0, np.array(CELLS) - 1)
         return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
 

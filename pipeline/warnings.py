@@ -22,6 +22,7 @@ WARNING_CODES = (
     "file-unread",
     "hair-beyond-head",
     "lens-doubtful",
+    "level-lowered",
     "mask-contradicted",
     "mask-doubtful",
     "mask-inverted",

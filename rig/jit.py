@@ -188,21 +188,21 @@ def code_size(dispatcher: Dispatcher) -> int:
     return sum(map(len, _function_parts(dispatcher, set())))
 
 
-def _function_parts(dispatcher: Dispatcher, seen: set[int]) -> Iterator[bytes]:
+def _function_parts(dispatcher: Dispatcher, visited: set[int]) -> Iterator[bytes]:
     function = dispatcher.py_func
     yield f"{function.__module__}.{function.__qualname__} {sorted(dispatcher.targetoptions.items())!r}".encode()
-    if id(dispatcher) in seen:
+    if id(dispatcher) in visited:
         return
-    seen.add(id(dispatcher))
+    visited.add(id(dispatcher))
     yield repr(function.__defaults__).encode()
     names = list(_code_names(function.__code__))
     yield from _code_parts(function.__code__)
     for cell in function.__closure__ or ():
-        yield from _value_parts(cell.cell_contents, names, seen)
+        yield from _value_parts(cell.cell_contents, names, visited)
     for name in names:
         if name in function.__globals__:
             yield name.encode()
-            yield from _value_parts(function.__globals__[name], names, seen)
+            yield from _value_parts(function.__globals__[name], names, visited)
 
 
 def _code_names(code: CodeType) -> Iterator[str]:
@@ -222,19 +222,19 @@ def _code_parts(code: CodeType) -> Iterator[bytes]:
             yield repr(sorted(constant, key=repr) if isinstance(constant, frozenset) else constant).encode()
 
 
-def _value_parts(value: Any, names: list[str], seen: set[int]) -> Iterator[bytes]:
+def _value_parts(value: Any, names: list[str], visited: set[int]) -> Iterator[bytes]:
     """Yields what a compiled function takes over from a global name: the bytes of a value, or the parts of another
     function."""
     if isinstance(value, Dispatcher):
-        yield from _function_parts(value, seen)
+        yield from _function_parts(value, visited)
     elif isinstance(value, ModuleType):
         yield value.__name__.encode()
-        if id(value) in seen:
+        if id(value) in visited:
             return
-        seen.add(id(value))
+        visited.add(id(value))
         if value.__name__.partition(".")[0] == __name__.partition(".")[0]:
             for name in names:
-                yield from _value_parts(getattr(value, name, None), names, seen)
+                yield from _value_parts(getattr(value, name, None), names, visited)
     elif isinstance(value, np.ndarray):
         yield f"{value.dtype} {value.shape}".encode() + value.tobytes()
     elif isinstance(value, FunctionType | type):

@@ -30,8 +30,8 @@ def vertex_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f
     """Computes unit vertex normals, weighted by the area of the faces; (0, 0, 1) where no face has an area."""
     from rig.mesh_kernels import unit_normals  # compiled loops load for half a second, and many meshes need no normals
 
-    found = unit_normals(np.ascontiguousarray(vertices, np.float64), np.array(faces, np.int32, order="C"))
-    return found.astype(vertices.dtype, copy=False)
+    normals = unit_normals(np.ascontiguousarray(vertices, np.float64), np.array(faces, np.int32, order="C"))
+    return normals.astype(vertices.dtype, copy=False)
 
 
 def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:

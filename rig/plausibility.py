@@ -193,12 +193,12 @@ def alternative_conventions(rig: Rig) -> list[tuple[Message, Rig, Message]]:
 def _share_looking_at_one_point(rig: Rig) -> float:
     """Returns the share of the cameras whose picture contains the point nearest to all optical axes."""
     point: Float[np.ndarray, "1 3"] = rig.centre_world()[None]
-    seen = 0
+    inside = 0
     for camera in rig:
         with np.errstate(all="ignore"):
             column, row = camera.project(point)[0]
-        seen += bool(0 <= column <= camera.intrinsics.width - 1 and 0 <= row <= camera.intrinsics.height - 1)
-    return seen / len(rig)
+        inside += bool(0 <= column <= camera.intrinsics.width - 1 and 0 <= row <= camera.intrinsics.height - 1)
+    return inside / len(rig)
 
 
 def _of_shifted_quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

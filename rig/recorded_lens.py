@@ -39,10 +39,10 @@ class RecordedLens:
         rays[:, :2] = (pixels - matrix[:2, 2]) / np.diag(matrix)[:2]
         lens, none = np.array(self.coefficients), np.zeros(3)
         if self.model == "kannala-brandt":
-            found = cv2.fisheye.projectPoints(rays[None], none, none, matrix, lens)[0]
+            projected = cv2.fisheye.projectPoints(rays[None], none, none, matrix, lens)[0]
         else:
-            found = cv2.projectPoints(rays, none, none, matrix, lens)[0]
-        return found.reshape(-1, 2)
+            projected = cv2.projectPoints(rays, none, none, matrix, lens)[0]
+        return projected.reshape(-1, 2)
 
     def undistorted(
         self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]
@@ -54,10 +54,10 @@ class RecordedLens:
         lens, places = np.array(self.coefficients), pixels.reshape(1, -1, 2)
         until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, ROUNDS, EXACT)
         if self.model == "kannala-brandt":
-            found = cv2.fisheye.undistortPoints(places, matrix, lens, R=None, P=matrix, criteria=until)
+            undistorted = cv2.fisheye.undistortPoints(places, matrix, lens, R=None, P=matrix, criteria=until)
         else:
-            found = cv2.undistortPoints(places, matrix, lens, R=None, P=matrix, criteria=until)
-        return np.asarray(found).reshape(-1, 2)
+            undistorted = cv2.undistortPoints(places, matrix, lens, R=None, P=matrix, criteria=until)
+        return np.asarray(undistorted).reshape(-1, 2)
 
     def undistort(
         self, picture: Shaped[np.ndarray, "h w ..."], matrix: Float[np.ndarray, "3 3"], *, smooth: bool = True

@@ -52,8 +52,8 @@ class Rig:
 
     def subset(self, names: Iterable[str]) -> "Rig":
         """Returns the rig of the named cameras only, in the rig's order."""
-        kept = set(names)
-        return Rig(tuple(camera for camera in self.cameras if camera.name in kept))
+        retained = set(names)
+        return Rig(tuple(camera for camera in self.cameras if camera.name in retained))
 
     def scaled(self, factor: float) -> "Rig":
         """Returns the rig for images scaled by ``factor``."""

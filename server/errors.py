@@ -91,6 +91,6 @@ class DataUnwritable(Unavailable):
 def unusable_input(error: InputError) -> InvalidInput:
     """Converts an InputError to a refusal whose ``kind`` follows from the error's subject."""
     kind = type_of_input(error.subject)
-    found = compose("faults-found", subject=error.subject, count=len(error.faults))
-    detail = compose("input-unusable", found=found)
+    title = compose("faults-found", subject=error.subject, count=len(error.faults))
+    detail = compose("input-unusable", found=title)
     return InvalidInput(kind, detail, error.faults)

@@ -96,10 +96,10 @@ def is_public(address: Address) -> bool:
 
 def _addresses(host: str, port: int) -> list[Address]:
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except OSError as error:
         raise _refused(compose("url-host-unknown", host=host, reason=str(error.strerror))) from error
-    return [ipaddress.ip_address(str(place[0]).partition("%")[0]) for *_, place in found]
+    return [ipaddress.ip_address(str(address[0]).partition("%")[0]) for *_, address in addresses]
 
 
 def _refused(why: Message) -> InvalidInput:

@@ -24,6 +24,7 @@ PROBLEM_TYPES = {
     "delivery-active": "Delivery active",
     "delivery-failed": "Delivery failed",
     "disk-full": "Disk full",
+    "file-damaged": "File damaged",
     "first-key": "First key",
     "foreign-origin": "Foreign origin",
     "idempotency-conflict": "Idempotency conflict",
@@ -58,6 +59,7 @@ PROBLEM_TYPES = {
     "too-few-shots": "Too few shots",
     "too-late": "Too late",
     "too-many-checks": "Too many checks",
+    "too-many-uploads": "Too many uploads",
     "too-many-batches": "Too many batches",
     "too-many-jobs": "Too many jobs",
     "upload-busy": "Upload busy",
@@ -234,6 +236,7 @@ FAILURE_TYPES = {
     "bug": "internal-error",
     "crash": "work-crashed",
     "disk-full": "disk-full",
+    "killed": "work-crashed",
     "out-of-memory": "out-of-memory",
 }
 """The type of a failure by the error's class, or by what the child process says of the end of its work."""

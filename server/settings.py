@@ -71,9 +71,7 @@ class ServiceSettings(BaseSettings):
         default=30.0, gt=0, description="age at which results in that store go that no job claims; None keeps them"
     )
     store_endpoint: str | None = Field(
-        default=None,
-        pattern=r"^https?://[^?#\s]+$",
-        description="address of the S3-compatible store; else Amazon's",
+        default=None, pattern=r"^https?://[^?#\s]+$", description="address of the S3-compatible store; else Amazon's"
     )
     store_region: str | None = Field(default=None, description="region of the store; without it what AWS_REGION says")
     store_timeout_s: float = Field(default=10.0, gt=0, description="how long an object store may be silent")
@@ -87,10 +85,7 @@ class ServiceSettings(BaseSettings):
     )
     queues: tuple[str, ...] = Field(default=("cpu", "gpu"), description="queues that a job may name")
     concurrency: int = Field(default=1, ge=1, le=64, description="jobs that one worker runs at once")
-    work: str = Field(
-        default=RECONSTRUCT,
-        description="what a job runs in the worker's child process",
-    )
+    work: str = Field(default=RECONSTRUCT, description="what a job runs in the worker's child process")
     heartbeat_s: float = Field(default=3.0, gt=0, description="how often a worker says that it is alive")
     silent_s: float = Field(
         default=15.0, gt=0, description="a worker that is silent for longer is dead; its jobs are taken over"
@@ -105,6 +100,7 @@ class ServiceSettings(BaseSettings):
     image_pixels: int = Field(default=64_000_000, ge=1, description="pixels of the largest picture of a capture")
     free_bytes: int = Field(default=256 << 20, ge=0, description="disk space that uploads and jobs must leave")
     jobs_per_key: int = Field(default=200, ge=1, description="queued and running jobs of one API key")
+    uploads_per_key: int = Field(default=100, ge=1, description="unfinished resumable uploads of one API key")
     batches_per_key: int = Field(default=100, ge=1, description="unfinished batches of one API key")
     batch_captures: int = Field(default=10_000, ge=1, description="the most captures of one batch")
     checks_at_once: int = Field(default=2, ge=1, description="processes that unpack and check uploads")

@@ -18,7 +18,7 @@ IDENTIFIER = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*(\(\))?")
 PROSE = re.compile(r'"""(?:\\.|[^\\])*?"""|(?:^|(?<=\s))#[ :!].*?$', re.DOTALL | re.MULTILINE)
 COMPOSED = {"precision_seen", "reposed_rms_mm", "drift_rms_mm"}  # columns of tables, put together from pieces
 LEFT = {
-    ("pipeline/faces/matching.py", "landmark_map.LandmarkMap"),  # comes with that room's next module
+    ("pipeline/faces/matching.py", "landmark_map.LandmarkMap")  # comes with that room's next module
 }
 
 

@@ -27,7 +27,7 @@ USES = {
     ("rig/jit.py", "dispatcher._cache"),  # used in tests/rig/test_jit.py
     ("rig/jit.py", "result._reduce"),
     ("rig/jit.py", "CompileResult._rebuild"),
-    ("server/worker/engine.py", "DBOS._recover_pending_workflows"),  # held by tests/server/worker/test_engine.py
+    ("server/services/failures.py", "dbos._serialization: _serialization"),  # tests/server/services/test_failures.py
 }
 
 

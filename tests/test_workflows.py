@@ -14,11 +14,7 @@ TRIGGERS = {
     "fast": {"push", "pull_request"},
     "slow": {"schedule", "workflow_dispatch"},
 }
-TARGETS = {
-    "check": ["check"],
-    "fast": ["setup-tests", "test", "test-shapes"],
-    "slow": ["setup-tests", "test-nightly"],
-}
+TARGETS = {"check": ["check"], "fast": ["setup-tests", "test", "test-shapes"], "slow": ["setup-tests", "test-nightly"]}
 PREREQUISITES = "apt-get update && apt-get install -y --no-install-recommends git make python3 ca-certificates"
 
 

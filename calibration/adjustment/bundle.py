@@ -77,7 +77,7 @@ class BundleSolution:
 
 
 def corner_sigma(
-    state: BundleState, seen: Observations, lens_noise: Float[np.ndarray, " c"]
+    state: BundleState, observed: Observations, lens_noise: Float[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " c"], float]:
     """Estimates the noise (px) of each camera's corners in the joint solution, and the part of it that all cameras
     share.
@@ -85,15 +85,15 @@ def corner_sigma(
     The noise of each camera alone is known from ``lens_noise``. What the joint solution has beyond it comes from
     cameras that were not exactly simultaneous, or from a board that bends. That part is one variance for all cameras:
     with one for each, the fit could call one camera noisy and follow the others exactly."""
-    squares = (residuals(state, seen) ** 2).sum(axis=1)
+    squares = (residuals(state, observed) ** 2).sum(axis=1)
     typical = float(np.median(squares)) / 1.1774**2
-    shared = max(0.0, typical - float(np.median(lens_noise[seen.camera[seen.view_of]] ** 2)))
+    shared = max(0.0, typical - float(np.median(lens_noise[observed.camera[observed.view_of]] ** 2)))
     return np.sqrt(lens_noise**2 + shared), float(np.sqrt(shared))
 
 
 def adjust(
     state: BundleState,
-    seen: Observations,
+    observed: Observations,
     prior: LensPrior,
     sigma: Float[np.ndarray, " c"],
     *,
@@ -106,7 +106,7 @@ def adjust(
 
     Args:
         state: where to start.
-        seen: the corners of all views.
+        observed: the corners of all views.
         prior: of the intrinsics.
         sigma: noise of a corner's coordinate by camera, px.
         free: which parameters change; by default all but the time offsets.
@@ -114,11 +114,11 @@ def adjust(
         steps: how many steps are taken at most.
         tick: called before every step; an exception that it raises ends the adjustment.
     """
-    problem = bundle_problem(state, CornerTerm(seen, sigma, loss or LeastSquares()), prior, free or Free())
+    problem = bundle_problem(state, CornerTerm(observed, sigma, loss or LeastSquares()), prior, free or Free())
     limits = Limits(steps=steps, tolerance=TOLERANCE, tries=6, first_damping=1e-4)
-    found = minimise(problem, state, limits, watch=tick)
+    solution = minimise(problem, state, limits, watch=tick)
     assert problem.free is not None
-    return BundleSolution(found.value, problem.equations(found.at).matrix, problem.free, found.evidence)
+    return BundleSolution(solution.value, problem.equations(solution.at).matrix, problem.free, solution.evidence)
 
 
 def bundle_problem(state: BundleState, corners: CornerTerm, prior: LensPrior, free: Free) -> Problem[BundleState]:

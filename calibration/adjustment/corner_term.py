@@ -58,12 +58,12 @@ class LinearisedCornerTerm:
 
     def add_to(self, equations: NormalEquations) -> None:
         """Adds the blocks of all views to the normal equations."""
-        seen, cameras = self.term.seen, len(self.state.intrinsics)
+        observed, cameras = self.term.seen, len(self.state.intrinsics)
         weight = np.sqrt(self.term.loss.weight((self.residual**2).sum(axis=1)))
         blocks = np.concatenate([self.by_view(), self.residual[:, :, None]], axis=2)
         blocks = (blocks * weight[:, None, None]).reshape(2 * len(self.residual), -1)
-        for view, at in enumerate(places(seen, cameras, len(equations.gradient))):
-            block = blocks[2 * seen.starts[view] : 2 * seen.starts[view + 1]]
+        for view, at in enumerate(places(observed, cameras, len(equations.gradient))):
+            block = blocks[2 * observed.starts[view] : 2 * observed.starts[view + 1]]
             product = block.T @ block
             equations.matrix[np.ix_(at, at)] += product[:-1, :-1]
             equations.gradient[at] += product[:-1, -1]
@@ -71,14 +71,14 @@ class LinearisedCornerTerm:
     def by_view(self) -> Float[np.ndarray, "n 2 22"]:
         """Returns the derivatives of each corner by the 22 parameters of its view: camera (15), board (6), time offset
         (1)."""
-        state, seen = self.state, self.term.seen
-        world, inside, camera = corner_positions(state, seen)
+        state, observed = self.state, self.term.seen
+        world, inside, camera = corner_positions(state, observed)
         behind = inside[:, 2] < DEPTH_LEAST_MM
         inside[behind] = (0.0, 0.0, 1.0)
         by_point, by_lens = lens_jacobians(inside, state.intrinsics[camera])
         by_world = by_point @ state.camera_rotations[camera]
         by_board = np.concatenate([-by_world @ cross_matrix(world), by_world], axis=2)
-        by_offset = by_board @ state.velocities[seen.shot[seen.view_of]][:, :, None]
+        by_offset = by_board @ state.velocities[observed.shot[observed.view_of]][:, :, None]
         by_camera = [by_lens, -by_point @ cross_matrix(inside), by_point]
         rows = np.concatenate([*by_camera, by_board, by_offset], axis=2)
         rows[behind] = 0.0
@@ -88,17 +88,17 @@ class LinearisedCornerTerm:
     def jacobian(self, size: int) -> Float[np.ndarray, "n 2 q"]:
         """Returns the derivatives of each corner by all ``size`` parameters, mostly zeros; for tests and other
         solvers."""
-        seen, rows = self.term.seen, self.by_view()
+        observed, rows = self.term.seen, self.by_view()
         whole = np.zeros((*rows.shape[:2], size))
-        for view, at in enumerate(places(seen, len(self.state.intrinsics), size)):
-            of_view = slice(seen.starts[view], seen.starts[view + 1])
+        for view, at in enumerate(places(observed, len(self.state.intrinsics), size)):
+            of_view = slice(observed.starts[view], observed.starts[view + 1])
             whole[of_view, :, at] = rows[of_view]
         return whole
 
 
-def places(seen: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
+def places(observed: Observations, cameras: int, size: int) -> Int[np.ndarray, "v 22"]:
     """Returns, for each view, the indices of its 22 parameters: those of its camera, its board, and its camera's time
     offset."""
-    of_camera = seen.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
-    board = cameras * PER_CAMERA + seen.shot[:, None] * PER_SHOT + np.arange(PER_SHOT)
-    return np.concatenate([of_camera, board, size - cameras + seen.camera[:, None]], axis=1)
+    of_camera = observed.camera[:, None] * PER_CAMERA + np.arange(PER_CAMERA)
+    board = cameras * PER_CAMERA + observed.shot[:, None] * PER_SHOT + np.arange(PER_SHOT)
+    return np.concatenate([of_camera, board, size - cameras + observed.camera[:, None]], axis=1)

@@ -134,8 +134,8 @@ def _brought_together(rig: Rig, reference: Rig) -> Rig:
     moves = [camera.camera_from_world.inverse() @ reference[camera.name].camera_from_world for camera in rig]
     rotation = nearest_rotation(np.sum([move.rotation for move in moves], axis=0))
     here = np.mean([camera.centre_world for camera in rig], axis=0)
-    there = np.mean([reference[camera.name].centre_world for camera in rig], axis=0)
-    motion = RigidTransform(rotation, here - rotation @ there)
+    reference_centre = np.mean([reference[camera.name].centre_world for camera in rig], axis=0)
+    motion = RigidTransform(rotation, here - rotation @ reference_centre)
     return Rig(tuple(replace(camera, camera_from_world=camera.camera_from_world @ motion) for camera in rig))
 
 

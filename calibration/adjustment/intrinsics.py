@@ -14,14 +14,7 @@ from jaxtyping import Float
 
 from calibration.adjustment.bundle import CAUCHY, BundleSolution, adjust
 from calibration.adjustment.lens_prior import weak_prior
-from calibration.adjustment.state import (
-    INTRINSICS,
-    BundleState,
-    intrinsics_of,
-    observations,
-    orthonormal,
-    residuals,
-)
+from calibration.adjustment.state import INTRINSICS, BundleState, intrinsics_of, observations, orthonormal, residuals
 from calibration.board.board import Board
 from calibration.board.corners import Found
 from calibration.board.detection import Detections, View
@@ -67,10 +60,10 @@ class Lens:
 
 def estimate_lenses(detections: Detections) -> dict[str, Lens]:
     """Estimates the lens of every camera that sees the board, from that camera's views alone."""
-    found = {camera: [v for v in detections.views if v.camera == camera] for camera in detections.sizes}
+    views_of = {camera: [v for v in detections.views if v.camera == camera] for camera in detections.sizes}
     return {
         camera: estimate_lens(views, detections.sizes[camera], detections.board)
-        for camera, views in found.items()
+        for camera, views in views_of.items()
         if views
     }
 
@@ -78,17 +71,17 @@ def estimate_lenses(detections: Detections) -> dict[str, Lens]:
 def estimate_lens(views: Sequence[View], size: tuple[int, int], board: Board) -> Lens:
     """Estimates the lens of one camera, and the board's poses, from one or more views."""
     shots = [view.shot for view in views]
-    seen = observations(views, [views[0].camera], shots, board)
+    observed = observations(views, [views[0].camera], shots, board)
     state = _start(views, size, board)
     prior, sigma = weak_prior([size]), np.array([1.0])
-    solution = adjust(state, seen, prior, sigma, loss=CAUCHY)
+    solution = adjust(state, observed, prior, sigma, loss=CAUCHY)
     # Whole views that no pose explains (a misread grid) must not bend the lens: Cauchy's rho downweights them, and its
     # scale becomes the camera's own noise here.
     for _ in range(2):
-        sigma = np.array([noise_of(residuals(solution.state, seen))])
-        solution = adjust(solution.state, seen, prior, sigma, loss=CAUCHY)
+        sigma = np.array([noise_of(residuals(solution.state, observed))])
+        solution = adjust(solution.state, observed, prior, sigma, loss=CAUCHY)
     state = orthonormal(solution.state)
-    return _lens(views, size, solution, state, float(sigma[0]), residuals(state, seen))
+    return _lens(views, size, solution, state, float(sigma[0]), residuals(state, observed))
 
 
 def _lens(
@@ -150,12 +143,12 @@ def single_state(intrinsics: Intrinsics, camera_from_boards: Sequence[RigidTrans
     )
 
 
-def board_poses_of(found: Found, intrinsics: Intrinsics, board: Board) -> list[tuple[RigidTransform, float]]:
+def board_poses_of(detection: Found, intrinsics: Intrinsics, board: Board) -> list[tuple[RigidTransform, float]]:
     """Returns the possible poses camera_from_board of one view, each with its RMS error (px), best first. The image of
     a plane has up to two."""
-    points = board.corners()[found.ids]
+    points = board.corners()[detection.ids]
     count, turns, shifts, errors = cv2.solvePnPGeneric(
-        points, found.corners, intrinsics.matrix(), intrinsics.distortion.opencv(), flags=cv2.SOLVEPNP_IPPE
+        points, detection.corners, intrinsics.matrix(), intrinsics.distortion.opencv(), flags=cv2.SOLVEPNP_IPPE
     )
     fits = []
     for turn, shift, error in zip(turns[:count], shifts[:count], np.asarray(errors).ravel(), strict=False):

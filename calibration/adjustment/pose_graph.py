@@ -162,21 +162,21 @@ def _disagreement(
     corners = _outline(board)
     values = []
     for poses_a, poses_b in zip(of_a, of_b, strict=True):
-        seen = np.stack([pose.apply(corners) for pose in poses_a])
+        corners_world = np.stack([pose.apply(corners) for pose in poses_a])
         put = np.stack([(a_from_b @ pose).apply(corners) for pose in poses_b])
-        values.append(_squares_apart(seen[:, None], put[None], board).min())
+        values.append(_squares_apart(corners_world[:, None], put[None], board).min())
     return np.array(values)
 
 
 def _squares_apart(
-    seen: Float[np.ndarray, "*k n 3"], put: Float[np.ndarray, "*j n 3"], board: Board
+    corners_world: Float[np.ndarray, "*k n 3"], put: Float[np.ndarray, "*j n 3"], board: Board
 ) -> Float[np.ndarray, "*b"]:
     """Returns the distance in the image, in sides of a square as the camera sees it; large where ``put`` is behind the
     camera."""
-    depth = seen[..., 2:]
+    depth = corners_world[..., 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
-        apart = np.linalg.norm(seen[..., :2] / depth - put[..., :2] / put[..., 2:], axis=-1) * depth[..., 0]
-    apart = np.where((put[..., 2] > 0) & (seen[..., 2] > 0), apart, 1e3 * board.square_mm)
+        apart = np.linalg.norm(corners_world[..., :2] / depth - put[..., :2] / put[..., 2:], axis=-1) * depth[..., 0]
+    apart = np.where((put[..., 2] > 0) & (corners_world[..., 2] > 0), apart, 1e3 * board.square_mm)
     return np.sqrt((apart**2).mean(axis=-1)) / board.square_mm
 
 
@@ -206,14 +206,11 @@ def _span(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, RigidTransfo
 
 
 def _place_boards(
-    views: Sequence[View],
-    cameras: dict[str, RigidTransform],
-    options: dict[tuple[str, str], Candidates],
-    board: Board,
+    views: Sequence[View], cameras: dict[str, RigidTransform], options: dict[tuple[str, str], Candidates], board: Board
 ) -> tuple[dict[str, RigidTransform], list[View], list[View]]:
     """Returns world_from_board by shot, the views with the fitting turn applied, and the views that fit in no turn."""
     boards: dict[str, RigidTransform] = {}
-    kept, strays = [], []
+    retained, strays = [], []
     corners, turns = _outline(board), board.turns()
     for shot in sorted({view.shot for view in views}):
         inside = [view for view in views if view.shot == shot]
@@ -225,8 +222,8 @@ def _place_boards(
             if distance > 2 * AGREE_SQUARES:
                 strays.append(view)
             else:
-                kept.append(_turned(view, turns[turn]))
-    return boards, kept, strays
+                retained.append(_turned(view, turns[turn]))
+    return boards, retained, strays
 
 
 def _fits(
@@ -242,8 +239,8 @@ def _fits(
     for view in views:
         option = options[view.camera, view.shot]
         put = (cameras[view.camera] @ world_from_board).apply(corners)
-        seen = np.stack([pose.apply(corners) for pose in option.poses])
-        distances = _squares_apart(seen, np.broadcast_to(put, seen.shape), board)
+        corners_world = np.stack([pose.apply(corners) for pose in option.poses])
+        distances = _squares_apart(corners_world, np.broadcast_to(put, corners_world.shape), board)
         best = int(np.argmin(distances))
         table.append((float(distances[best]), option.turns[best]))
     return table
@@ -309,18 +306,18 @@ def _fits_when_mirrored(
     flipped = {view.shot: replace(view, found=_mirror(view.found, board, size[0])) for view in views}
     trial = dict(options) | {(name, shot): _candidates(view, lens, board) for shot, view in flipped.items()}
     checked = [_edge(name, other, trial, board) for other in sorted(main)]
-    found = [edge for edge in checked if edge is not None and edge.shared >= 2]
-    return bool(found) and sum(edge.consistent for edge in found) > len(found) / 2
+    edges = [edge for edge in checked if edge is not None and edge.shared >= 2]
+    return bool(edges) and sum(edge.consistent for edge in edges) > len(edges) / 2
 
 
-def _mirror(found: Found, board: Board, width: int) -> Found:
+def _mirror(detection: Found, board: Board, width: int) -> Found:
     """Returns the detection in the picture mirrored left to right, with its corners in an order that keeps the board's
     colours."""
     columns, rows = board.grid
     index = np.arange(board.corner_count).reshape(rows, columns)
     # A mirrored row starts with the same colour where the number of columns of squares is odd; else turn the rows over.
     order = (index[:, ::-1] if board.columns % 2 == 1 else index[::-1]).ravel()
-    ids = order[found.ids]
-    corners = found.corners * [-1.0, 1.0] + [width - 1.0, 0.0]
+    ids = order[detection.ids]
+    corners = detection.corners * [-1.0, 1.0] + [width - 1.0, 0.0]
     arranged = np.argsort(ids)
-    return replace(found, ids=ids[arranged], corners=corners[arranged])
+    return replace(detection, ids=ids[arranged], corners=corners[arranged])

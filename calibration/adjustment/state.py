@@ -35,11 +35,11 @@ class Observations:
         """Returns the index of the view of each corner."""
         return np.repeat(np.arange(len(self.camera)), np.diff(self.starts))
 
-    def subset(self, kept: Bool[np.ndarray, " n"]) -> "Observations":
-        """Returns only the corners marked in ``kept``. All views stay, possibly without corners."""
-        counts = np.bincount(self.view_of[kept], minlength=len(self.camera))
+    def subset(self, retained: Bool[np.ndarray, " n"]) -> "Observations":
+        """Returns only the corners marked in ``retained``. All views stay, possibly without corners."""
+        counts = np.bincount(self.view_of[retained], minlength=len(self.camera))
         starts = np.concatenate([[0], np.cumsum(counts)])
-        return replace(self, starts=starts, points=self.points[kept], pixels=self.pixels[kept])
+        return replace(self, starts=starts, points=self.points[retained], pixels=self.pixels[retained])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,11 +119,11 @@ def orthonormal(state: BundleState) -> BundleState:
 
 
 def corner_positions(
-    state: BundleState, seen: Observations
+    state: BundleState, observed: Observations
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
     """Returns all corners in the world frame and in their camera's frame (mm), and the camera index of each."""
-    camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
-    world = np.einsum("nij,nj->ni", state.board_rotations[shot], seen.points) + state.board_translations[shot]
+    camera, shot = observed.camera[observed.view_of], observed.shot[observed.view_of]
+    world = np.einsum("nij,nj->ni", state.board_rotations[shot], observed.points) + state.board_translations[shot]
     if state.offsets.any():
         motion = state.velocities[shot] * state.offsets[camera][:, None]
         # The offsets are small: the board's motion is taken to first order.
@@ -132,12 +132,12 @@ def corner_positions(
     return world, inside, camera
 
 
-def residuals(state: BundleState, seen: Observations) -> Float[np.ndarray, "n 2"]:
+def residuals(state: BundleState, observed: Observations) -> Float[np.ndarray, "n 2"]:
     """Returns projected minus detected pixels; ``BEHIND_PX`` for corners behind their camera."""
-    _, inside, camera = corner_positions(state, seen)
+    _, inside, camera = corner_positions(state, observed)
     behind = inside[:, 2] < DEPTH_LEAST_MM
     inside[behind] = (0.0, 0.0, 1.0)
-    miss = lens_image(inside, state.intrinsics[camera]) - seen.pixels
+    miss = lens_image(inside, state.intrinsics[camera]) - observed.pixels
     miss[behind] = BEHIND_PX
     return miss
 

@@ -44,15 +44,15 @@ def board_velocities(state: BundleState) -> Float[np.ndarray, "s 6"]:
 
 
 def estimate_offsets(
-    state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"]
+    state: BundleState, observed: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"]
 ) -> TimeOffsets:
     """Estimates the offsets by solving the bundle again with them, starting from its solution ``state``."""
-    before = rms(residuals(state, seen))
+    before = rms(residuals(state, observed))
     state = replace(state, velocities=board_velocities(state))
-    first = adjust(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER).state
+    first = adjust(state, observed, prior, sigma, free=Free(offsets=True), loss=HUBER).state
     state = replace(first, velocities=board_velocities(first))  # which follow the poses, and those moved a little
-    solution = adjust(state, seen, prior, sigma, free=Free(offsets=True), loss=HUBER)
+    solution = adjust(state, observed, prior, sigma, free=Free(offsets=True), loss=HUBER)
     state = solution.state
     cameras = len(state.intrinsics)
     spread = np.sqrt(np.diag(solution.covariance())[-cameras:])
-    return TimeOffsets(state.offsets, spread, before, rms(residuals(state, seen)))
+    return TimeOffsets(state.offsets, spread, before, rms(residuals(state, observed)))

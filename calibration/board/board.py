@@ -231,12 +231,14 @@ def _rectangles(board: Board) -> list[tuple[float, float, float, float, bool]]:
     """x, y, width, height in mm, and whether white; in the order of drawing."""
     side = board.square_mm
     paint = board.inverted  # white squares on black paper, or black on white
-    found = [(c * side, r * side, side, side, paint) for r, c in zip(*np.nonzero(board.squares() ^ paint), strict=True)]
+    squares = [
+        (c * side, r * side, side, side, paint) for r, c in zip(*np.nonzero(board.squares() ^ paint), strict=True)
+    ]
     if board.kind == "charuco":
         for number, corners in enumerate(board.opencv().getObjPoints()):
             x, y = np.asarray(corners)[:, :2].min(axis=0)
-            found += _marker(board, board.first_marker + number, float(x), float(y))
-    return found
+            squares += _marker(board, board.first_marker + number, float(x), float(y))
+    return squares
 
 
 def _marker(board: Board, number: int, x: float, y: float) -> list[tuple[float, float, float, float, bool]]:

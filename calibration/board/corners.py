@@ -39,10 +39,10 @@ def detect(grey: UInt8[np.ndarray, "h w"], board: Board) -> Found | None:
     """Finds the board in one grey picture. Returns its corners to a fraction of a pixel, in the board's order; None if
     the board is not found."""
     picture = 255 - grey if board.inverted else grey
-    found = (_charuco if board.kind == "charuco" else _checkerboard)(picture, board)
-    if found is None or len(found[0]) < CORNERS_LEAST or not is_flat_grid(board, *found):
+    corners = (_charuco if board.kind == "charuco" else _checkerboard)(picture, board)
+    if corners is None or len(corners[0]) < CORNERS_LEAST or not is_flat_grid(board, *corners):
         return None
-    return Found(*found, rise(picture, board, found))
+    return Found(*corners, rise(picture, board, corners))
 
 
 def is_flat_grid(board: Board, ids: Int[np.ndarray, " n"], corners: Float[np.ndarray, "n 2"]) -> bool:

@@ -190,12 +190,7 @@ def _refuse_markers(pictures: dict[str, dict[str, Path]]) -> None:
 
 
 def _detect_pictures(
-    folder: Path,
-    pictures: dict[str, dict[str, Path]],
-    board: Board,
-    cache: Path | None,
-    workers: int,
-    report: Progress,
+    folder: Path, pictures: dict[str, dict[str, Path]], board: Board, cache: Path | None, workers: int, report: Progress
 ) -> Detections:
     """One pass over all pictures for one board. Raises InputError on damaged input."""
     tasks = [(camera, shot, path) for camera, shots in pictures.items() for shot, path in shots.items()]
@@ -219,7 +214,7 @@ def _detect_pictures(
     for (camera, shot, path), result in zip(tasks, results, strict=True):
         if isinstance(result, Message):
             continue
-        size, found = result
+        size, detection = result
         if sizes.setdefault(camera, size) != size:
             faults.append(
                 compose(
@@ -229,10 +224,10 @@ def _detect_pictures(
                     first="{} x {}".format(*sizes[camera]),
                 )
             )
-        if found is None:
+        if detection is None:
             missed.append((camera, shot))
         else:
-            views.append(View(camera, shot, found))
+            views.append(View(camera, shot, detection))
     if faults:
         raise InputError(folder.name, faults)
     shots = tuple(sorted({shot for _, shot, _ in tasks}))
@@ -253,14 +248,19 @@ def _detect_file(path: Path, board: Board, cache: Path | None) -> tuple[tuple[in
     if cache is None:
         return size, detect(grey, board)
     key = hashlib.sha256(f"{VERSION} {cv2.__version__} {board!r} ".encode() + data).hexdigest()
-    kept = cache / f"{key}.npz"
+    cached = cache / f"{key}.npz"
     with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):  # absent or damaged: detect again
-        return size, _from_cache(kept)
-    found = detect(grey, board)
+        return size, _from_cache(cached)
+    detection = detect(grey, board)
     buffer = io.BytesIO()
-    np.savez(buffer, **({} if found is None else {"ids": found.ids, "corners": found.corners, "rise": found.rise_px}))
-    write_atomically(kept, buffer.getvalue())
-    return size, found
+    np.savez(
+        buffer,
+        **(
+            {} if detection is None else {"ids": detection.ids, "corners": detection.corners, "rise": detection.rise_px}
+        ),
+    )
+    write_atomically(cached, buffer.getvalue())
+    return size, detection
 
 
 def _decode(data: bytes) -> UInt8[np.ndarray, "h w"] | None:
@@ -271,8 +271,8 @@ def _decode(data: bytes) -> UInt8[np.ndarray, "h w"] | None:
 
 
 def _from_cache(path: Path) -> Found | None:
-    with np.load(path) as kept:
-        return Found(kept["ids"], kept["corners"], float(kept["rise"])) if "ids" in kept else None
+    with np.load(path) as stored:
+        return Found(stored["ids"], stored["corners"], float(stored["rise"])) if "ids" in stored else None
 
 
 def _explain_missing(
@@ -280,8 +280,8 @@ def _explain_missing(
 ) -> list[PictureNote]:
     """For each camera that never sees the board: what its pictures show instead, where that can be told."""
     notes = []
-    seen = {view.camera for view in views}
-    for camera in (camera for camera in sizes if camera not in seen):
+    cameras_with_board = {view.camera for view in views}
+    for camera in (camera for camera in sizes if camera not in cameras_with_board):
         paths = list(pictures[camera].values())
         for path in paths[:: max(1, len(paths) // EXPLAINED)][:EXPLAINED]:
             grey = _decode(path.read_bytes())

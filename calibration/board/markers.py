@@ -85,8 +85,8 @@ def _explaining(shown: Sequence[Markers], columns: int, first: int, *, legacy: b
         numbers = np.array([number for number in markers if 0 <= number - first < len(corners)])
         if len(numbers) < max(MARKERS_LEAST, 0.8 * len(markers)):
             continue
-        flat, seen = corners[numbers - first], np.array([markers[number] for number in numbers.tolist()])
-        miss, ratio = _fit(flat, seen)
+        flat, observed = corners[numbers - first], np.array([markers[number] for number in numbers.tolist()])
+        miss, ratio = _fit(flat, observed)
         if miss < LAYOUT_MISS:
             ratios.append(ratio)
     if len(ratios) <= 0.5 * len(shown):
@@ -103,12 +103,12 @@ def _layout_corners(columns: int, *, legacy: bool) -> Float[np.ndarray, "m 4 2"]
     return np.array([np.asarray(points)[:, :2] for points in board.getObjPoints()], float)
 
 
-def _fit(flat: Float[np.ndarray, "m 4 2"], seen: Float[np.ndarray, "m 4 2"]) -> tuple[float, float]:
+def _fit(flat: Float[np.ndarray, "m 4 2"], observed: Float[np.ndarray, "m 4 2"]) -> tuple[float, float]:
     """How far (squares, RMS) the centres of markers miss their layout, and the measured side of a marker (squares)."""
-    homography, _ = cv2.findHomography(seen.mean(axis=1), flat.mean(axis=1), 0)
+    homography, _ = cv2.findHomography(observed.mean(axis=1), flat.mean(axis=1), 0)
     if homography is None or np.linalg.det(homography) <= 0:
         return np.inf, 0.0
-    back = cv2.perspectiveTransform(seen.reshape(-1, 1, 2), homography).reshape(seen.shape)
+    back = cv2.perspectiveTransform(observed.reshape(-1, 1, 2), homography).reshape(observed.shape)
     miss = float(np.sqrt(((back.mean(axis=1) - flat.mean(axis=1)) ** 2).sum(axis=1).mean()))
     sides = np.linalg.norm(np.roll(back, -1, axis=1) - back, axis=2)
     turned = ((back[:, 1] - back[:, 0]) * (flat[:, 1] - flat[:, 0])).sum(axis=1) > 0  # markers lie as the layout's do
@@ -136,15 +136,15 @@ def is_april_grid(markers: Markers) -> bool:
     if len(markers) < MARKERS_LEAST:
         return False
     numbers = np.array(sorted(markers))
-    seen = np.array([markers[number].mean(axis=0) for number in numbers.tolist()])
+    observed = np.array([markers[number].mean(axis=0) for number in numbers.tolist()])
     for columns in range(2, COLUMNS_MOST):
         for turn in (1.0, -1.0):  # Kalibr counts rows upwards
             flat = np.stack([numbers % columns, turn * (numbers // columns)], axis=1).astype(float)
             if np.linalg.matrix_rank(flat - flat.mean(axis=0)) < 2:
                 continue
-            homography, _ = cv2.findHomography(seen, flat, 0)
+            homography, _ = cv2.findHomography(observed, flat, 0)
             if homography is not None:
-                back = cv2.perspectiveTransform(seen[:, None], homography)[:, 0]
+                back = cv2.perspectiveTransform(observed[:, None], homography)[:, 0]
                 if float(np.sqrt(((back - flat) ** 2).sum(axis=1).mean())) < LAYOUT_MISS:
                     return True
     return False

@@ -36,15 +36,15 @@ class Check:
     advice: Message | None = None
 
 
-def check_cheirality(state: BundleState, seen: Observations, board: Board) -> Check:
+def check_cheirality(state: BundleState, observed: Observations, board: Board) -> Check:
     """Checks that every corner lies in front of its camera, that every board shows its front, and that all rotations
     are proper."""
-    camera, shot = seen.camera[seen.view_of], seen.shot[seen.view_of]
-    world = np.einsum("nij,nj->ni", state.board_rotations[shot], seen.points) + state.board_translations[shot]
+    camera, shot = observed.camera[observed.view_of], observed.shot[observed.view_of]
+    world = np.einsum("nij,nj->ni", state.board_rotations[shot], observed.points) + state.board_translations[shot]
     points = np.einsum("nij,nj->ni", state.camera_rotations[camera], world) + state.camera_translations[camera]
     normals = np.einsum("nij,nj->ni", state.camera_rotations[camera], state.board_rotations[shot][:, :, 2])
     behind = int((points[:, 2] <= 0).sum())
-    backs = len(np.unique(seen.view_of[(normals * points).sum(axis=1) <= 0]))
+    backs = len(np.unique(observed.view_of[(normals * points).sum(axis=1) <= 0]))
     rotations = np.concatenate([state.camera_rotations, state.board_rotations])
     proper = bool((np.linalg.det(rotations) > 0).all())
     code = "cheirality-chiral" if board.is_chiral else "cheirality-symmetric"
@@ -55,7 +55,7 @@ def check_cheirality(state: BundleState, seen: Observations, board: Board) -> Ch
 
 def check_held_out(
     state: BundleState,
-    seen: Observations,
+    observed: Observations,
     prior: LensPrior,
     sigma: Float[np.ndarray, " c"],
     free: Free,
@@ -63,17 +63,17 @@ def check_held_out(
 ) -> Check:
     """Checks that cameras estimated without every fifth shot fit the boards of those shots as well as they fit the
     others."""
-    several = np.flatnonzero(np.bincount(seen.shot, minlength=len(state.board_rotations)) >= 2)
+    several = np.flatnonzero(np.bincount(observed.shot, minlength=len(state.board_rotations)) >= 2)
     held = several[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     if len(held) < 2 or len(several) - len(held) < 4:
         return Check("held-out shots", None, compose("held-out-too-few", shots=len(several)))
-    out = np.isin(seen.shot[seen.view_of], held)
-    trained = adjust(state, seen.subset(~out), prior, sigma, free=free, loss=HUBER, tick=tick, steps=25).state
+    out = np.isin(observed.shot[observed.view_of], held)
+    trained = adjust(state, observed.subset(~out), prior, sigma, free=free, loss=HUBER, tick=tick, steps=25).state
     boards = replace(free, intrinsics=False, poses=False, offsets=False)
-    rest = seen.subset(out)
+    rest = observed.subset(out)
     tested = adjust(trained, rest, fixed_prior(trained.intrinsics), sigma, free=boards, loss=HUBER, tick=tick).state
     inside, outside = (
-        float(np.sqrt((residuals(s, o) ** 2).sum(axis=1).mean())) for s, o in ((state, seen), (tested, rest))
+        float(np.sqrt((residuals(s, o) ** 2).sum(axis=1).mean())) for s, o in ((state, observed), (tested, rest))
     )
     detail = compose("held-out", outside_px=outside, shots=len(held), inside_px=inside)
     passed = outside < max(HELD_OUT_RATIO * inside, inside + HELD_OUT_LEAST_PX)
@@ -83,10 +83,7 @@ def check_held_out(
 def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
     """Checks the size of the squares against the measured size of the print, and the print's height over width against
     the value that the cameras measured."""
-    pairs = [
-        ("width", board.measured_width_mm, board.columns),
-        ("height", board.measured_height_mm, board.rows),
-    ]
+    pairs = [("width", board.measured_width_mm, board.columns), ("height", board.measured_height_mm, board.rows)]
     ratios = {name: value / (count * board.square_mm) for name, value, count in pairs if value is not None}
     off = [
         compose("print-off", side=name, percent=100 * (ratio - 1))
@@ -205,14 +202,14 @@ def _check_lenses(now: Rig, then: Rig) -> Check:
 
 
 def measure_aspect(
-    state: BundleState, seen: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
+    state: BundleState, observed: Observations, prior: LensPrior, sigma: Float[np.ndarray, " c"], free: Free
 ) -> tuple[float, float]:
     """Measures the height of the board's squares over their width, and its standard deviation: the minimum of a
     parabola through the costs of three solutions with the board stretched."""
     step = 0.003
     costs = []
     for stretch in (-step, 0.0, step):
-        stretched = replace(seen, points=seen.points * [1.0, 1.0 + stretch, 1.0])
+        stretched = replace(observed, points=observed.points * [1.0, 1.0 + stretch, 1.0])
         costs.append(adjust(state, stretched, prior, sigma, free=free, loss=HUBER, steps=12).cost)
     low, middle, high = costs
     curvature = second_difference(low, middle, high)

@@ -44,7 +44,7 @@ class Dropped:
 def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
     """Returns the detections without views whose edges are too blurred to locate corners, and these views with the
     reason."""
-    kept, dropped = [], []
+    retained, dropped = [], []
     for view in detections.views:
         side = square_side_px(view, detections.board)
         if view.found.rise_px > max(BLUR_PX, BLUR_SQUARES * side):
@@ -52,19 +52,19 @@ def drop_blurred(detections: Detections) -> tuple[Detections, list[Dropped]]:
             endless = compose("view-blurred-beyond") if np.isinf(width_px) else None
             dropped.append(Dropped(view.shot, view.camera, endless or compose("view-blurred", width_px=width_px)))
         else:
-            kept.append(view)
-    return replace(detections, views=tuple(kept)), dropped
+            retained.append(view)
+    return replace(detections, views=tuple(retained)), dropped
 
 
 def square_side_px(view: View, board: Board) -> float:
     """Returns the median side (px) of the board's squares in a view; 0 if no two neighbouring corners are seen."""
     columns = board.grid[0]
-    place = dict(zip(view.found.ids.tolist(), view.found.corners, strict=True))
+    corner_of = dict(zip(view.found.ids.tolist(), view.found.corners, strict=True))
     sides = [
-        float(np.linalg.norm(place[i + step] - corner))
-        for i, corner in place.items()
+        float(np.linalg.norm(corner_of[i + step] - corner))
+        for i, corner in corner_of.items()
         for step in (1, columns)
-        if i + step in place and (step > 1 or (i + 1) % columns)
+        if i + step in corner_of and (step > 1 or (i + 1) % columns)
     ]
     return float(np.median(sides)) if sides else 0.0
 
@@ -72,7 +72,7 @@ def square_side_px(view: View, board: Board) -> float:
 def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detections, list[Dropped]]:
     """Returns the detections without views that no pose of a flat board fits with the camera's lens, and these views
     with the reason."""
-    kept, dropped = [], []
+    retained, dropped = [], []
     for view in detections.views:
         lens = lenses[view.camera]
         rms = miss(
@@ -81,21 +81,21 @@ def drop_misread(detections: Detections, lenses: dict[str, Lens]) -> tuple[Detec
         if rms > max(VIEW_RATIO * lens.noise_px, VIEW_LEAST_PX):
             dropped.append(Dropped(view.shot, view.camera, compose("corners-off-board", rms_px=rms)))
         else:
-            kept.append(view)
-    return replace(detections, views=tuple(kept)), dropped
+            retained.append(view)
+    return replace(detections, views=tuple(retained)), dropped
 
 
-def view_rms(state: BundleState, seen: Observations) -> Float[np.ndarray, " v"]:
+def view_rms(state: BundleState, observed: Observations) -> Float[np.ndarray, " v"]:
     """Returns the RMS reprojection error (px) of each view."""
-    squares = (residuals(state, seen) ** 2).sum(axis=1)
-    counts = np.bincount(seen.view_of, minlength=len(seen.camera))
-    return np.sqrt(np.bincount(seen.view_of, squares, minlength=len(seen.camera)) / np.maximum(counts, 1))
+    squares = (residuals(state, observed) ** 2).sum(axis=1)
+    counts = np.bincount(observed.view_of, minlength=len(observed.camera))
+    return np.sqrt(np.bincount(observed.view_of, squares, minlength=len(observed.camera)) / np.maximum(counts, 1))
 
 
-def bad_views(state: BundleState, seen: Observations) -> np.ndarray:
+def bad_views(state: BundleState, observed: Observations) -> np.ndarray:
     """Tells which views the joint solution does not fit. A robust solution may fit one camera of a shot and let the
     others fail; ``explain_shot`` finds out what is wrong with such a shot."""
-    rms = view_rms(state, seen)
+    rms = view_rms(state, observed)
     return rms > max(VIEW_RATIO * float(np.median(rms)), VIEW_LEAST_PX)
 
 
@@ -168,8 +168,8 @@ def board_scale(
     flat = board.corners()[ids]
     spread = np.sqrt(((flat - flat.mean(axis=0)) ** 2).sum())
     size = float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum()) / spread)
-    place = rigid_fit(size * flat, points)
-    misses = [camera.project(place.apply(size * corners)) - pixels for camera, corners, pixels in triples]
+    board_pose = rigid_fit(size * flat, points)
+    misses = [camera.project(board_pose.apply(size * corners)) - pixels for camera, corners, pixels in triples]
     squares = np.concatenate([(m**2).sum(axis=1) for m in misses])
     return size, float(np.sqrt(squares.mean())) if np.isfinite(squares).all() else np.inf
 

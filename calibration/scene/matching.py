@@ -156,9 +156,9 @@ def _match_shots(photographs: Photographs, scratch: Path, report: Progress) -> N
     options.num_threads, options.use_gpu, options.skip_geometric_verification = 1, False, True
     for number, shot in enumerate(photographs.shots):
         report("matches", 0.8 * number / len(photographs.shots))
-        seen = [f"{camera}/{shot}.png" for camera, shots in photographs.files.items() if shot in shots]
+        files = [f"{camera}/{shot}.png" for camera, shots in photographs.files.items() if shot in shots]
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = _pairs_file(scratch / "shot.pairs", combinations(seen, 2))
+        pairing.match_list_path = _pairs_file(scratch / "shot.pairs", combinations(files, 2))
         pycolmap.match_image_pairs(
             scratch / "shots.db", options, pairing, pycolmap.TwoViewGeometryOptions(), pycolmap.Device.cpu
         )

@@ -160,7 +160,7 @@ def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) 
 def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
     """Computes the scale from the known side of tags: the median over all tags that two views or more show. Raises
     InputError if there is none."""
-    found = []
+    markers = []
     for number, views in tags.items():
         joined = {camera: corners for camera, corners in views.items() if camera in rig}
         try:
@@ -173,15 +173,17 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
                 _between([corners[k], corners[(k + 1) % 4]], known.size_mm, "tag", compose("scale-unsaid"))
                 for k in range(4)
             ]
-            found.append((np.mean([side.factor for side in sides]), np.mean([side.share for side in sides]), number[1]))
-    if not found:
-        seen = sorted({camera for views in tags.values() for camera in views})
-        provenance = compose("scale-tag-seen", cameras=seen) if seen else compose("scale-tag-unseen")
+            markers.append(
+                (np.mean([side.factor for side in sides]), np.mean([side.share for side in sides]), number[1])
+            )
+    if not markers:
+        cameras = sorted({camera for views in tags.values() for camera in views})
+        provenance = compose("scale-tag-seen", cameras=cameras) if cameras else compose("scale-tag-unseen")
         raise InputError("scale.json", [provenance])
-    factor = float(np.median([factor for factor, _, _ in found]))
-    numbers = sorted({number for *_, number in found})
+    factor = float(np.median([factor for factor, _, _ in markers]))
+    numbers = sorted({number for *_, number in markers})
     provenance = compose("scale-by-tags", count=len(numbers), size_mm=known.size_mm, numbers=numbers)
-    return Scale(factor, float(np.median([share for _, share, _ in found])), "tag", provenance)
+    return Scale(factor, float(np.median([share for _, share, _ in markers])), "tag", provenance)
 
 
 def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:

@@ -95,8 +95,8 @@ def calibrate_scene(
     structure, left_out = judged(structure, matches)
     report("scale", 0.0)
     head = np.zeros((0, 3)) if known is not None else load_model().cage(np.zeros(0))
-    found = find_scale(structure, known, photographs, head)
-    calibration = placed(structure, found, matches, left_out, front)
+    scale_result = find_scale(structure, known, photographs, head)
+    calibration = placed(structure, scale_result, matches, left_out, front)
     report("silhouettes", 0.0)
     calibration = refined_by_masks(calibration, find_masks(folder, photographs, calibration.rig))
     first = {name: next(iter(photographs.files[name].values())) for name in calibration.rig.names}

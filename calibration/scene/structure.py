@@ -80,8 +80,8 @@ def solve_structure(matches: Matches, scratch: Path, *, report: Progress) -> Str
             pycolmap.set_random_seed(SEED)
             models = scratch / f"models-{number}"
             models.mkdir()
-            found = pycolmap.incremental_mapping(database, scratch / "pictures", models, _pipeline_options())
-            best = max(found.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+            reconstructions = pycolmap.incremental_mapping(database, scratch / "pictures", models, _pipeline_options())
+            best = max(reconstructions.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
             if best is not None:
                 one = len(best.cameras) == 1
                 _adjust(best, one_lens=one, principal_point=one and best.num_reg_images() >= CENTRE_VIEWS)
@@ -139,17 +139,17 @@ def _adjust(model: "pycolmap.Reconstruction", *, one_lens: bool, principal_point
 def _structure(model: "pycolmap.Reconstruction", *, one_lens: bool) -> Structure:
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     cameras = tuple(_camera(Path(image.name).parts[0], image, model.cameras[image.camera_id]) for image in images)
-    place = {image.image_id: index for index, image in enumerate(images)}
+    index_of = {image.image_id: index for index, image in enumerate(images)}
     ids = sorted(key for key, point in model.points3D.items() if point.track.length() >= TRACK_LEAST)
     camera_of, point_of, pixels = [], [], []
     for index, key in enumerate(ids):
         for element in model.points3D[key].track.elements:
-            camera_of.append(place[element.image_id])
+            camera_of.append(index_of[element.image_id])
             point_of.append(index)
             pixels.append(model.images[element.image_id].points2D[element.point2D_idx].xy - HALF_PIXEL)
     points = np.array([model.points3D[key].xyz for key in ids]).reshape(-1, 3)
-    seen = np.array(pixels, dtype=float).reshape(-1, 2)
-    return Structure(Rig(cameras), points, np.array(camera_of, int), np.array(point_of, int), seen, one_lens)
+    observed = np.array(pixels, dtype=float).reshape(-1, 2)
+    return Structure(Rig(cameras), points, np.array(camera_of, int), np.array(point_of, int), observed, one_lens)
 
 
 def _camera(name: str, image: Any, lens: Any) -> Camera:

@@ -52,8 +52,8 @@ class Contour:
     @classmethod
     def of(cls, camera: Camera, silhouette: Silhouette) -> "Contour":
         """Extracts the outline of a silhouette, smoothed by ``SMOOTH_PX``."""
-        found, _ = cv2.findContours(silhouette.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        chain = max(found, key=len).reshape(-1, 2).astype(float)
+        outlines, _ = cv2.findContours(silhouette.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        chain = max(outlines, key=len).reshape(-1, 2).astype(float)
         pixels = gaussian_filter1d(on_contour(chain, silhouette.distance), SMOOTH_PX, axis=0, mode="wrap")
         far = np.array([camera.intrinsics.width, camera.intrinsics.height]) - 1.0
         margin = np.minimum(chain, far - chain).min(axis=1)
@@ -76,10 +76,10 @@ def find_frontier(silhouettes: Mapping[str, Silhouette], rig: Rig, gate_px: floa
     """Returns the frontier points of every pair of cameras that both contours show without ambiguity. ``rig`` must
     contain only cameras with a usable silhouette."""
     contours = [Contour.of(camera, silhouettes[camera.name]) for camera in rig]
-    found = []
+    frontier = []
     for one, two in combinations(contours, 2):
-        found += _pair(one, two, gate_px)
-    return found
+        frontier += _pair(one, two, gate_px)
+    return frontier
 
 
 def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
@@ -98,15 +98,15 @@ def _pair(one: Contour, two: Contour, gate_px: float) -> list[Tangency]:
         * np.sqrt(2.0)
     )
     apart[first.side[:, None] != second.side[None, :]] = np.inf
-    found = []
+    frontier = []
     for i, j in zip(*np.nonzero(apart < gate_px), strict=True):
         rivals = np.concatenate([np.delete(apart[i], j), np.delete(apart[:, j], i)])
         if len(rivals) and rivals.min() < 2.0 * gate_px:
             continue
         names, pixels = (one.camera.name, two.camera.name), (first.pixels[i], second.pixels[j])
         difference = float(first.angle[i] - second.angle[j])
-        found.append(tangency(names, pixels, (first.slopes[i], second.slopes[j]), difference, float(first.side[i])))
-    return found
+        frontier.append(tangency(names, pixels, (first.slopes[i], second.slopes[j]), difference, float(first.side[i])))
+    return frontier
 
 
 def _extremes(contour: Contour, angle: Float[np.ndarray, " n"], u: np.ndarray, v: np.ndarray) -> _Extremes:

@@ -136,9 +136,9 @@ def refine(
     noise = noise_of(after.px)
     gain, deviation = gain_of(before.px, after.px, noise)
     before_px, after_px = robust_rms(before.px, noise), robust_rms(after.px, noise)
-    kept = gain > GAIN_SIGMAS * deviation
+    accepted = gain > GAIN_SIGMAS * deviation
     reason = compose(
-        "refinement-captures-shrink" if kept else "refinement-captures-stay",
+        "refinement-captures-shrink" if accepted else "refinement-captures-stay",
         captures=len(captures),
         before_px=before_px,
         after_px=after_px,
@@ -146,14 +146,14 @@ def refine(
         sigmas=gain / max(deviation, 1e-9),
     )
     return Refinement(
-        rig=proposed if kept else rig,
+        rig=proposed if accepted else rig,
         proposed=proposed,
         before=before,
         after=after,
         before_px=before_px,
         after_px=after_px,
         noise_px=noise,
-        kept=kept,
+        kept=accepted,
         reason=reason,
         change_px=dict(zip(rig.names, image_distance(proposed, rig).tolist(), strict=True)),
     )
@@ -265,17 +265,17 @@ class _Refining:
         """Returns the cost of the tangencies that the corrected cameras find in all captures, with their robust
         noise."""
         rig = self.rig(correction)
-        found = [t for capture in self.captures for t in _tangencies(capture, rig, self.pairs, outer=outer)]
-        seen = PackedTangencies.of(found, rig)
-        return TangencyTerm(seen, self.start, self.focal, noise_of(tangency_residuals(seen, rig)))
+        tangencies = [t for capture in self.captures for t in _tangencies(capture, rig, self.pairs, outer=outer)]
+        packed = PackedTangencies.of(tangencies, rig)
+        return TangencyTerm(packed, self.start, self.focal, noise_of(tangency_residuals(packed, rig)))
 
     def rim_terms(self, correction: Float[np.ndarray, " p"], heads: Heads) -> list[Quadratic]:
         """Returns the cost of each capture's rims as a quadratic function of the cameras."""
         rig, poses = self.rig(correction), _pose_places(self.start, focal=self.focal)
         terms = []
-        for capture, place in zip(self.captures, heads.starts, strict=True):
+        for capture, start in zip(self.captures, heads.starts, strict=True):
             matrix, gradient = np.zeros((len(correction),) * 2), np.zeros(len(correction))
-            matrix[np.ix_(poses, poses)], gradient[poses] = rim_equations(capture, rig, heads, place)
+            matrix[np.ix_(poses, poses)], gradient[poses] = rim_equations(capture, rig, heads, start)
             terms.append(Quadratic(matrix, correction, -gradient))
         return terms
 
@@ -288,8 +288,8 @@ def _with_covariances(rig: Rig, covariance: Float[np.ndarray, "p p"], *, focal: 
 
 def _tangencies(capture: Mapping[str, Silhouette], rig: Rig, pairs: Pairs | None, *, outer: bool) -> list[Tangency]:
     usable = rig.subset(name for name in rig.names if name in capture and capture[name].quality.usable)
-    found = find_tangencies(capture, usable) if outer else find_frontier(capture, usable)
-    return found if pairs is None else [tangency for tangency in found if pairs(tangency.cameras)]
+    tangencies = find_tangencies(capture, usable) if outer else find_frontier(capture, usable)
+    return tangencies if pairs is None else [tangency for tangency in tangencies if pairs(tangency.cameras)]
 
 
 def _pose_places(rig: Rig, *, focal: bool) -> Int[np.ndarray, " q"]:

@@ -63,30 +63,30 @@ class RefinementRun:
 
     def document(self) -> RefinementDocument:
         """Returns what ``refine --json`` prints."""
-        found = self.refinement
+        refinement = self.refinement
         return {
-            "kept": found.kept,
-            "reason": found.reason.text,
-            "reason_message": found.reason.document(),
+            "kept": refinement.kept,
+            "reason": refinement.reason.text,
+            "reason_message": refinement.reason.document(),
             "captures": list(self.captures),
             "held_out": {
-                "before_px": found.before_px,
-                "after_px": found.after_px,
-                "noise_px": found.noise_px,
-                "equations": len(found.after.px),
+                "before_px": refinement.before_px,
+                "after_px": refinement.after_px,
+                "noise_px": refinement.noise_px,
+                "equations": len(refinement.after.px),
             },
             "cameras": {name: _camera(self, name) for name in self.start.names},
             "warnings": texts_of(self.warnings),
             "warning_messages": documents_of(self.warnings),
-            "rig": document_from_rig(found.rig),
+            "rig": document_from_rig(refinement.rig),
         }
 
 
 def refinement_page(run: RefinementRun) -> str:
     """Returns the report as an HTML page."""
-    found = run.refinement
-    verdict = "kept" if found.kept else "rejected: the calibration stays as it was"
-    kind = "good" if found.kept else "bad"
+    refinement = run.refinement
+    verdict = "kept" if refinement.kept else "rejected: the calibration stays as it was"
+    kind = "good" if refinement.kept else "bad"
     cameras = run.document()["cameras"]
     head = (
         "camera", "held-out RMS before px", "after px", "equations", "change at the subject px", "turn mrad",
@@ -108,7 +108,7 @@ def refinement_page(run: RefinementRun) -> str:
     parts = [
         "<!doctype html><html lang='en'><meta charset='utf-8'><title>Silhouette refinement</title>",
         f"<style>{STYLE}</style><h1>Silhouette refinement</h1>",
-        f"<p>The change is <b class='{kind}'>{verdict}</b>: {escape(found.reason.text)}.</p>",
+        f"<p>The change is <b class='{kind}'>{verdict}</b>: {escape(refinement.reason.text)}.</p>",
         f"<p>Captures: {escape(', '.join(run.captures))}. Each was judged with the cameras where the others alone put "
         "them.</p>",
         listed("Warnings", run.warnings),
@@ -118,22 +118,22 @@ def refinement_page(run: RefinementRun) -> str:
         "large where the change at the subject is small.</p>",
         table(head, rows),
         "<h2>Held-out residuals</h2>",
-        f"<p>Before: outline. After: filled. Noise {found.noise_px:.2f} px.</p>",
-        _histogram(found.before.px, found.after.px),
+        f"<p>Before: outline. After: filled. Noise {refinement.noise_px:.2f} px.</p>",
+        _histogram(refinement.before.px, refinement.after.px),
         "</html>",
     ]
     return "\n".join(parts)
 
 
 def _camera(run: RefinementRun, name: str) -> RefinedCamera:
-    found, start, end = run.refinement, run.start[name], run.refinement.proposed[name]
+    refinement, start, end = run.refinement, run.start[name], run.refinement.proposed[name]
     motion = end.camera_from_world @ start.camera_from_world.inverse()
-    after = found.after.of(name)
+    after = refinement.after.of(name)
     return {
-        "before_px": robust_rms(found.before.of(name), found.noise_px) if len(after) else 0.0,
-        "after_px": robust_rms(after, found.noise_px) if len(after) else 0.0,
+        "before_px": robust_rms(refinement.before.of(name), refinement.noise_px) if len(after) else 0.0,
+        "after_px": robust_rms(after, refinement.noise_px) if len(after) else 0.0,
         "equations": len(after),
-        "change_px": found.change_px[name],
+        "change_px": refinement.change_px[name],
         "turn_mrad": 1000.0 * float(np.linalg.norm(vector_from_rotation(motion.rotation))),
         "shift_mm": float(np.linalg.norm(end.centre_world - start.centre_world)),
         "focal_change": end.intrinsics.fx / start.intrinsics.fx - 1.0,

@@ -47,32 +47,32 @@ def refine_one(capture: Mapping[str, Silhouette], rig: Rig) -> SingleRefinement 
     The result is kept if pairs of cameras agree better while they are held out, a fifth of them at a time. Returns None
     if fewer than ``VIEWS_LEAST`` views have a usable silhouette.
     """
-    seen = [name for name in rig.names if name in capture and capture[name].quality.usable]
-    if len(seen) < VIEWS_LEAST:
+    usable = [name for name in rig.names if name in capture and capture[name].quality.usable]
+    if len(usable) < VIEWS_LEAST:
         return None
     proposed = minimise_tangencies([capture], rig, focal=False, prior_px=PRIOR_PX, heads=None)
     parts = []
     for fold in range(FOLDS):
-        held, others = _pairs(seen, fold, inside=True), _pairs(seen, fold, inside=False)
+        held, others = _pairs(usable, fold, inside=True), _pairs(usable, fold, inside=False)
         without = minimise_tangencies([capture], rig, focal=False, prior_px=PRIOR_PX, heads=None, pairs=others)
-        parts.append([residuals([capture], each, held).px for each in (rig, without)])
+        parts.append([residuals([capture], candidate, held).px for candidate in (rig, without)])
     before, after = (np.concatenate(side) for side in zip(*parts, strict=True))
     noise = noise_of(after)
     gain, deviation = gain_of(before, after, noise)
-    kept = gain > GAIN_SIGMAS * deviation
+    accepted = gain > GAIN_SIGMAS * deviation
     reason = compose(
-        "refinement-pairs-shrink" if kept else "refinement-pairs-stay",
+        "refinement-pairs-shrink" if accepted else "refinement-pairs-stay",
         before_px=robust_rms(before, noise),
         after_px=robust_rms(after, noise),
         equations=len(after),
         sigmas=gain / max(deviation, 1e-9),
     )
     change_px = float(np.median(image_distance(proposed, rig)))
-    return SingleRefinement(proposed if kept else rig, proposed, kept, change_px, reason)
+    return SingleRefinement(proposed if accepted else rig, proposed, accepted, change_px, reason)
 
 
 def _pairs(names: list[str], fold: int, *, inside: bool) -> Pairs:
     """Returns a test of whether a pair of cameras is in a fold (``inside``), or outside. Every camera has pairs in each
     fold."""
-    place = {name: index for index, name in enumerate(names)}
-    return lambda pair: (sum(place[name] for name in pair) % FOLDS == fold) == inside
+    index_of = {name: index for index, name in enumerate(names)}
+    return lambda pair: (sum(index_of[name] for name in pair) % FOLDS == fold) == inside

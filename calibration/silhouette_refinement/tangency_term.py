@@ -95,54 +95,54 @@ def zoomed(camera: Camera, log_scale: float) -> Camera:
     return replace(camera, intrinsics=replace(lens, fx=lens.fx * scale, fy=lens.fy * scale))
 
 
-def tangency_residuals(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, " n"]:
+def tangency_residuals(packed: PackedTangencies, rig: Rig) -> Float[np.ndarray, " n"]:
     """Returns the residuals (px) that the module's docstring defines."""
-    base, rays = _bases(seen, rig), _rays(seen, rig)
+    base, rays = _bases(packed, rig), _rays(packed, rig)
     across = np.cross(rays[:, 0], rays[:, 1])
-    return _gain(seen, base, rays) * (base * across).sum(axis=1)
+    return _gain(packed, base, rays) * (base * across).sum(axis=1)
 
 
-def tangency_jacobian(seen: PackedTangencies, rig: Rig, *, focal: bool) -> Float[np.ndarray, "n p"]:
+def tangency_jacobian(packed: PackedTangencies, rig: Rig, *, focal: bool) -> Float[np.ndarray, "n p"]:
     """Returns the derivatives of the residuals by the corrections of all cameras (px per rad, mm and unit of the
     logarithm). The factor from angles to pixels is taken as constant."""
-    size, count = per_camera(focal=focal), len(seen.cameras)
-    base, rays = _bases(seen, rig), _rays(seen, rig)
-    gain = _gain(seen, base, rays)[:, None]
+    size, count = per_camera(focal=focal), len(packed.cameras)
+    base, rays = _bases(packed, rig), _rays(packed, rig)
+    gain = _gain(packed, base, rays)[:, None]
     across = np.cross(rays[:, 0], rays[:, 1])
     turns = np.stack([camera.camera_from_world.rotation for camera in rig])
     rows = np.zeros((count, len(rig), size))
     for side, by_ray, by_centre in ((0, np.cross(rays[:, 1], base), across), (1, np.cross(base, rays[:, 0]), -across)):
-        camera = seen.cameras[:, side]
+        camera = packed.cameras[:, side]
         by_ray_inside, ray_inside, by_centre_inside = (
             np.einsum("nij,nj->ni", turns[camera], vector) for vector in (by_ray, rays[:, side], by_centre)
         )
         rows[np.arange(count), camera, :3] = gain * np.cross(by_ray_inside, ray_inside)
         rows[np.arange(count), camera, 3:6] = gain * by_centre_inside
         if focal:
-            wider, narrower = (_rays(seen, Rig(tuple(zoomed(c, s * ZOOM_STEP) for c in rig))) for s in (1.0, -1.0))
+            wider, narrower = (_rays(packed, Rig(tuple(zoomed(c, s * ZOOM_STEP) for c in rig))) for s in (1.0, -1.0))
             widening = (wider[:, side] - narrower[:, side]) / (2.0 * ZOOM_STEP)
             rows[np.arange(count), camera, 6] = gain[:, 0] * (by_ray * widening).sum(axis=1)
     return rows.reshape(count, -1)
 
 
-def _bases(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 3"]:
+def _bases(packed: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 3"]:
     """Returns the vectors from the first camera's centre to the second's (mm)."""
     centres = np.stack([camera.centre_world for camera in rig])
-    return centres[seen.cameras[:, 1]] - centres[seen.cameras[:, 0]]
+    return centres[packed.cameras[:, 1]] - centres[packed.cameras[:, 0]]
 
 
-def _rays(seen: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 2 3"]:
+def _rays(packed: PackedTangencies, rig: Rig) -> Float[np.ndarray, "n 2 3"]:
     """Returns unit rays through both tangent pixels, in the world frame."""
-    rays = np.empty((*seen.cameras.shape, 3))
+    rays = np.empty((*packed.cameras.shape, 3))
     for k, camera in enumerate(rig):
-        here = seen.cameras == k
-        rays[here] = camera.rays_world(seen.pixels[here])
+        here = packed.cameras == k
+        rays[here] = camera.rays_world(packed.pixels[here])
     return rays
 
 
 def _gain(
-    seen: PackedTangencies, base: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2 3"]
+    packed: PackedTangencies, base: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 2 3"]
 ) -> Float[np.ndarray, " n"]:
     """Returns the factor from the triple product to pixels, with both contours equally noisy."""
     planes = [np.linalg.norm(np.cross(base, rays[:, side]), axis=1) for side in (0, 1)]
-    return np.linalg.norm(base, axis=1) / (planes[0] * planes[1] * seen.steepness)
+    return np.linalg.norm(base, axis=1) / (planes[0] * planes[1] * packed.steepness)

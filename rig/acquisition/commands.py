@@ -206,9 +206,9 @@ def _row(name: str, session: RigSession, shot: Shot) -> tuple[str, ...]:
     image, measured = shot.images.get(name), shot.checks.get(name)
     sync = next((line for line in shot.certificate.cameras if line.camera == name), None)
     faults = [f"{fault.code}: {fault.detail}" for fault in shot.faults if fault.camera == name]
-    seen = "never"
+    last_seen = "never"
     if state is not None and state.last_seen_s is not None:
-        seen = f"{time.monotonic() - state.last_seen_s:.1f} s ago"
+        last_seen = f"{time.monotonic() - state.last_seen_s:.1f} s ago"
     return (
         name,
         "yes" if state is not None and state.opened else "no",
@@ -217,7 +217,7 @@ def _row(name: str, session: RigSession, shot: Shot) -> tuple[str, ...]:
         "-" if measured is None else f"{measured.exposure.mean / 2.55:.0f} %",
         "-" if measured is None or measured.blur_px is None else f"{measured.blur_px:.1f} px",
         "-" if sync is None else sync.status if sync.skew_s is None else f"{sync.skew_s * 1000:+.1f} ms",
-        seen,
+        last_seen,
         "; ".join(faults) or "ok",
     )
 

@@ -136,7 +136,7 @@ def register(image: ImageRgb, plate: ImageRgb) -> Registration:
         factor /= 2
     here, there = _working(plate, factor), _working(image, factor)
     points = _textured_points(here)
-    moved = [(point, place) for point in points if (place := _find(here, there, point)) is not None]
+    moved = [(point, shifted) for point in points if (shifted := _find(here, there, point)) is not None]
     in_place = sum(_is_alike(here, there, point) for point in points) / max(len(points), 1)
     nothing = Registration(len(points), 0.0, 0.0, in_place=in_place)
     if len(points) < _PATCHES_LEAST or len(moved) < 3:
@@ -148,10 +148,10 @@ def register(image: ImageRgb, plate: ImageRgb) -> Registration:
     moved_px = _largest_move(similarity, here.shape)
     if abs(np.hypot(similarity[0, 0], similarity[1, 0]) - 1) > _SCALE_MOST or moved_px > 2 * _REACH_PX:
         return nothing  # no camera can move like this: the patches agree by chance
-    kept = agree.ravel() > 0
-    moved_sd_px = _corner_deviation(similarity, source[kept], target[kept], here.shape)
-    found = float(kept.sum()) / len(points)
-    return Registration(len(points), found, moved_px / factor, moved_sd_px / factor, in_place)
+    matched = agree.ravel() > 0
+    moved_sd_px = _corner_deviation(similarity, source[matched], target[matched], here.shape)
+    matched_share = float(matched.sum()) / len(points)
+    return Registration(len(points), matched_share, moved_px / factor, moved_sd_px / factor, in_place)
 
 
 def _block_variance(after: ImageRgb, before: ImageRgb) -> float:

@@ -43,8 +43,8 @@ def examine_picture(image: ImageRgb, plate: ImageRgb | None) -> PictureCheck:
 def examine(images: Mapping[str, ImageRgb], plates: Plates) -> dict[str, PictureCheck]:
     """Measures every picture, in parallel. Returns the measurements by camera."""
     with ThreadPoolExecutor(4) as pool:
-        found = pool.map(lambda name: examine_picture(images[name], plates.first.get(name)), images)
-        return dict(zip(images, found, strict=True))
+        examined = pool.map(lambda name: examine_picture(images[name], plates.first.get(name)), images)
+        return dict(zip(images, examined, strict=True))
 
 
 def judge(
@@ -102,20 +102,22 @@ def _light_faults(
     return faults, {name: ratios.get(name, 1.0) >= shot.dark_below for name in checks}
 
 
-def _view_faults(name: str, found: Registration, lit: bool, shot: ShotConfig, whose_view: OtherView) -> list[Fault]:
-    if not found.conclusive:
+def _view_faults(
+    name: str, registration: Registration, lit: bool, shot: ShotConfig, whose_view: OtherView
+) -> list[Fault]:
+    if not registration.conclusive:
         return []
-    if found.found < (FOUND_SURELY if lit else FOUND_LEAST):
-        other = whose_view(name, found)
+    if registration.found < (FOUND_SURELY if lit else FOUND_LEAST):
+        other = whose_view(name, registration)
         if other is not None:
             return [Fault("swapped", name, compose("picture-of-other-camera", other=other))]
-        if found.found < FOUND_LEAST:
-            return [] if found.in_place >= MIN_IN_PLACE else [Fault("view", name, compose("background-unknown"))]
-        if found.found < found.in_place:  # the few that agree on a movement do so by chance
+        if registration.found < FOUND_LEAST:
+            return [] if registration.in_place >= MIN_IN_PLACE else [Fault("view", name, compose("background-unknown"))]
+        if registration.found < registration.in_place:  # the few that agree on a movement do so by chance
             return []
     most_px = shot.moved_most_px if lit else max(shot.moved_most_px, MOVED_DARK_PX)
-    if found.moved_px - MOVED_DEVIATIONS * found.moved_sd_px > most_px:
-        return [Fault("moved", name, compose("background-moved", moved_px=found.moved_px))]
+    if registration.moved_px - MOVED_DEVIATIONS * registration.moved_sd_px > most_px:
+        return [Fault("moved", name, compose("background-moved", moved_px=registration.moved_px))]
     return []
 
 

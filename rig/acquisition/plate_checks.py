@@ -46,10 +46,10 @@ def occupied(taken: Mapping[str, Sequence[ImageRgb]], before: Plates) -> list[Fa
     """Returns a fault for each camera whose new plate differs from the plate in use as if a person sat there. Returns
     none where fewer than ``SEEN_SHARE`` of the cameras do."""
     compared = [name for name in taken if name in before and taken[name][0].shape == before.first[name].shape]
-    seen = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
+    positions = {name: find_subject(taken[name][0], before.first[name]) for name in compared}
     faults = [
-        Fault("occupied", name, compose("plate-differs", percent=place.share * 100))
-        for name, place in seen.items()
-        if place is not None
+        Fault("occupied", name, compose("plate-differs", percent=position.share * 100))
+        for name, position in positions.items()
+        if position is not None
     ]
     return faults if len(faults) >= SEEN_SHARE * len(compared) else []

@@ -50,9 +50,9 @@ NO_PLATES = Plates({}, {}, {}, None)
 def read_plates(folder: Path, names: tuple[str, ...]) -> Plates:
     """Reads the clean plates in ``folder``; cameras without any are left out. Raises InputError for a file that is no
     picture."""
-    files = {name: found for name in names if (found := _files(folder, name))}
+    files = {name: paths for name in names if (paths := _files(folder, name))}
     with ThreadPoolExecutor(4) as pool:
-        first = dict(zip(files, pool.map(lambda found: read_image(found[0]), files.values()), strict=True))
+        first = dict(zip(files, pool.map(lambda paths: read_image(paths[0]), files.values()), strict=True))
     noise: dict[str, float | None] = dict.fromkeys(files)
     taken = None
     try:
@@ -108,10 +108,10 @@ def keep_plates(folder: Path, images: Mapping[str, tuple[ImageRgb, ...]], refuse
 def use_plates(folder: Path, version: str, names: tuple[str, ...]) -> Plates:
     """Puts a kept version of the clean plates to use; the plates in use become a version. Raises InputError for a
     version that is not kept."""
-    wanted, kept = _versions(folder) / version, {found.id: found for found in plates_versions(folder)}
-    if version in kept and kept[version].in_use:
+    wanted, stored = (_versions(folder) / version, {entry.id: entry for entry in plates_versions(folder)})
+    if version in stored and stored[version].in_use:
         return read_plates(folder, names)
-    if version not in kept:
+    if version not in stored:
         raise InputError("clean plates", [compose("plates-version-not-kept", version=f"{version!r:.40}")])
     if folder.exists():
         folder.rename(_versions(folder) / _version_of(folder).id)
@@ -138,11 +138,11 @@ def _remove_unfinished(folder: Path) -> None:
 
 def plates_versions(folder: Path) -> list[PlatesVersion]:
     """Returns the clean plates in use and the versions kept beside them, newest first."""
-    kept = [path for path in _versions(folder).glob("*Z") if path.is_dir()] if _versions(folder).is_dir() else []
-    found = [_version_of(path) for path in kept]
+    folders = [path for path in _versions(folder).glob("*Z") if path.is_dir()] if _versions(folder).is_dir() else []
+    versions = [_version_of(path) for path in folders]
     if folder.is_dir():
-        found.append(replace(_version_of(folder), in_use=True))
-    return sorted(found, key=lambda version: version.id, reverse=True)
+        versions.append(replace(_version_of(folder), in_use=True))
+    return sorted(versions, key=lambda version: version.id, reverse=True)
 
 
 def _version_of(folder: Path) -> PlatesVersion:

@@ -247,11 +247,11 @@ class RigSession:
         frames = {name: feed.collect(now_s, 0.0) for name, feed in feeds.items()}
         for feed in feeds.values():
             feed.unwant()
-        found = {name: frame for name, frame in frames.items() if frame is not None}
-        silent = {name: time.monotonic() + _SILENT_S for name in awaited if name not in found}
-        self._silent_until_s = {n: s for n, s in self._silent_until_s.items() if n not in found} | silent
-        self._last_seen |= found
-        return found
+        received = {name: frame for name, frame in frames.items() if frame is not None}
+        silent = {name: time.monotonic() + _SILENT_S for name in awaited if name not in received}
+        self._silent_until_s = {n: s for n, s in self._silent_until_s.items() if n not in received} | silent
+        self._last_seen |= received
+        return received
 
     def _fire(self) -> Fired | None:
         """Arms and fires the box. Returns None, and keeps the error, if that fails."""

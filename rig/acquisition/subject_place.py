@@ -62,10 +62,10 @@ def _reduced(picture: np.ndarray) -> np.ndarray:
 
 
 def _place(different: Bool[np.ndarray, "h w"], shape: tuple[int, ...]) -> SubjectPlace | None:
-    kept = cv2.morphologyEx(different.astype(np.uint8), cv2.MORPH_OPEN, np.ones((LOOSE_PX, LOOSE_PX), np.uint8))
+    opened = cv2.morphologyEx(different.astype(np.uint8), cv2.MORPH_OPEN, np.ones((LOOSE_PX, LOOSE_PX), np.uint8))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (GAP_PX, GAP_PX))
     contours, _ = cv2.findContours(
-        cv2.morphologyEx(kept, cv2.MORPH_CLOSE, disc), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        cv2.morphologyEx(opened, cv2.MORPH_CLOSE, disc), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
     largest = max(contours, key=cv2.contourArea, default=None)
     if largest is None:

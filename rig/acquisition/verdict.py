@@ -73,12 +73,12 @@ def check_view(
     """Measures one camera's picture and finds the subject in it. ``place_only``: only the subject is looked for,
     because the shot has measured the rest."""
     if mask is not None and mask.shape == image.shape[:2]:
-        place = subject_of_mask(mask)
+        position = subject_of_mask(mask)
     else:
-        place = None if plate is None else find_subject(image, plate)
+        position = None if plate is None else find_subject(image, plate)
     picture = None if place_only else examine_picture(image, plate)
     return ViewCheck(
-        picture, None if plate is None else plate_level(plate), place, not (mask is None and plate is None)
+        picture, None if plate is None else plate_level(plate), position, not (mask is None and plate is None)
     )
 
 
@@ -112,17 +112,17 @@ def _place_faults(views: Mapping[str, ViewCheck]) -> list[Fault]:
     if looked and not any(looked.values()):
         return [Fault("empty", None, compose("nobody-in-pictures"))]
     faults = []
-    for name, place in looked.items():
-        if place is None:
+    for name, position in looked.items():
+        if position is None:
             faults.append(Fault("empty", name, compose("nobody-in-picture")))
-        elif place.cut_off:
-            faults.append(Fault("cut-off", name, compose("head-cut-off", sides=place.cut_off)))
+        elif position.cut_off:
+            faults.append(Fault("cut-off", name, compose("head-cut-off", sides=position.cut_off)))
     return faults
 
 
-def _place_document(place: SubjectPlace) -> SubjectDocument:
-    outline = [[round(x, 1), round(y, 1)] for x, y in place.outline]
-    return {"share": round(place.share, 4), "cut_off": [*place.cut_off], "outline": outline}
+def _place_document(position: SubjectPlace) -> SubjectDocument:
+    outline = [[round(x, 1), round(y, 1)] for x, y in position.outline]
+    return {"share": round(position.share, 4), "cut_off": [*position.cut_off], "outline": outline}
 
 
 def _known(check: CheckDocument) -> ViewDocument:

@@ -14,15 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from rig.drivers.aravis import AUTO_OFF, BUFFER_SUCCESS, PACKET_SOCKET_DISABLED, Aravis, AravisError, library
-from rig.drivers.base import (
-    Arrival,
-    CameraLost,
-    CameraNotFound,
-    Driver,
-    DriverError,
-    DriverMissing,
-    GrabTimeout,
-)
+from rig.drivers.base import Arrival, CameraLost, CameraNotFound, Driver, DriverError, DriverMissing, GrabTimeout
 from rig.formats.rig_toml import CameraConfig
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
@@ -139,14 +131,14 @@ class GenicamDriver:
         wanted = self._camera.identity
         with _discovery:
             self._aravis.call("arv_update_device_list")
-            found = []
+            cameras = []
             for index in range(self._aravis.call("arv_get_n_devices")):
                 device_id = self._aravis.call("arv_get_device_id", index)
                 serial = self._aravis.call("arv_get_device_serial_nbr", index)
                 if wanted in (device_id, serial, self._aravis.call("arv_get_device_physical_id", index)):
                     return device_id
-                found.append(serial or device_id)
-        raise CameraNotFound(self._camera, compose("serial-numbers-found", found=found or ["none"]))
+                cameras.append(serial or device_id)
+        raise CameraNotFound(self._camera, compose("serial-numbers-found", found=cameras or ["none"]))
 
     def _apply(self) -> tuple[Message, ...]:
         camera, unmet = self._camera, []
@@ -205,10 +197,7 @@ class GenicamDriver:
 
     def _decode(self, data: UInt8[np.ndarray, " n"], width: int, height: int, pixel_format: int) -> ImageRgb:
         if pixel_format not in _CONVERSIONS:
-            raise DriverError(
-                self._camera.name,
-                compose("pixel-format-unread", pixel_format=f"{pixel_format:08X}"),
-            )
+            raise DriverError(self._camera.name, compose("pixel-format-unread", pixel_format=f"{pixel_format:08X}"))
         channels = pixel_format >> 16 & 0xFF
         if len(data) < width * height * channels // 8:
             raise CameraLost(self._camera, compose("frame-incomplete"))

@@ -132,8 +132,8 @@ class GphotoDriver:
                     _ports_by_serial[serial.lstrip("0")] = port
         port = _ports_by_serial.get(sought)
         if port is None:
-            found = ", ".join(sorted(_ports_by_serial)) or "none"
-            raise CameraNotFound(self._camera, compose("serial-numbers-found", found=found))
+            serials = ", ".join(sorted(_ports_by_serial)) or "none"
+            raise CameraNotFound(self._camera, compose("serial-numbers-found", found=serials))
         return port
 
     def _serial(self, port: str) -> str | None:

@@ -196,9 +196,9 @@ def decode_jpeg(camera: CameraConfig, data: bytes) -> ImageRgb:
     return image
 
 
-def _is_taken(prop: int, wanted: float, found: float) -> bool:
+def _is_taken(prop: int, wanted: float, actual: float) -> bool:
     """Numbers within a twentieth, since cameras have steps; a pixel format is a code, which nothing comes near to."""
-    return abs(found - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
+    return abs(actual - wanted) <= (0.0 if prop == cv2.CAP_PROP_FOURCC else _NEAR * abs(wanted))
 
 
 def _reason(error: Exception, otherwise: Message) -> Message | str:

@@ -37,7 +37,7 @@ def draw_colour(
     box = box_points(mesh.vertices)
     ranges = np.array([depth_range(camera, box) for camera in rig])
     colours = np.full((len(mesh.vertices), 3), GREY, np.uint8) if mesh.colours is None else mesh.colours
-    found = {}
+    pictures = {}
     arrays = ((mesh.vertices - origin).astype(np.float32), mesh.normals().astype(np.float32), colours)
     with context.current() as gl, Owned() as owned:
         program = context.program("colour.vert", "colour.frag")
@@ -53,8 +53,8 @@ def draw_colour(
             program["atlas_size"] = (float(page.width), float(page.height))
             image = draw_antialiased(context, draw, page, min(samples, context.most_samples))
             for position, index in enumerate(page.cameras):
-                found[index] = _straight(page.cut(image, position))
-    return {camera.name: found[index] for index, camera in enumerate(rig)}
+                pictures[index] = _straight(page.cut(image, position))
+    return {camera.name: pictures[index] for index, camera in enumerate(rig)}
 
 
 def draw_antialiased(

@@ -82,8 +82,8 @@ class ComputeDevice:
             yield held
         finally:
             with self._current():
-                for each in held:
-                    each.buffer.release()
+                for buffer in held:
+                    buffer.buffer.release()
 
     def run(
         self,

@@ -75,16 +75,16 @@ def draw_photographs(
     at a time, since the samples of one take 25 MB."""
     origin = rig.centre_world()
     box = np.concatenate([box_points(part.vertices) for part in parts])
-    found = {}
+    pictures = {}
     with context.current() as gl, Owned() as owned:
         owned(_noise_texture(gl, gallery)).use(0)
         program = context.program("studio.vert", "studio.frag")
         pieces = [(part, _upload(gl, owned, part, origin)) for part in parts]
         for camera in rig:
-            found[camera.name] = _draw(
+            pictures[camera.name] = _draw(
                 context, program, camera, pieces, gallery, origin=origin, box=box, samples=samples
             )
-    return found
+    return pictures
 
 
 def draw_vertex_radiance(context: GlContext, part: Part, gallery: Gallery) -> Float[np.ndarray, "v 3"]:

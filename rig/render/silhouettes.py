@@ -84,7 +84,7 @@ class SilhouetteSet:
 
     def masks(self, vertices_world: Float[np.ndarray, "v 3"]) -> dict[str, Bool[np.ndarray, "_ _"]]:
         """Returns the mask of the mesh in each camera: which pixel centres it covers."""
-        found = {}
+        silhouettes = {}
         with self._context.current():
             self._draw(vertices_world)
             for surface in self._surfaces:
@@ -92,8 +92,8 @@ class SilhouetteSet:
                 raw = surface.mask.read(components=1, alignment=1)
                 image = np.frombuffer(raw, np.uint8).reshape(page.height, page.width) > 0
                 for position, index in enumerate(page.cameras):
-                    found[index] = page.cut(image, position).copy()
-        return {camera.name: found[index] for index, camera in enumerate(self.rig)}
+                    silhouettes[index] = page.cut(image, position).copy()
+        return {camera.name: silhouettes[index] for index, camera in enumerate(self.rig)}
 
     def set_inputs(
         self, masks: Mapping[str, Bool[np.ndarray, "_ _"]], weights: Mapping[str, Float[np.ndarray, "_ _"]]

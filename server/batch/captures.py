@@ -49,13 +49,13 @@ def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
     """
     if is_capture(folder) and (find_rig_file(folder) is not None or (folder / "images").is_dir()):
         raise InputError(folder.name, [compose("batch-folder-is-capture")])
-    found = [BatchCapture(_name(path, folder), path) for path in _walk(folder, out.resolve())]
-    if not found:
+    captures = [BatchCapture(_name(path, folder), path) for path in _walk(folder, out.resolve())]
+    if not captures:
         raise InputError(folder.name, [compose("batch-folder-empty")])
-    faults = _name_faults(found, [capture.path.relative_to(folder).as_posix() for capture in found])
+    faults = _name_faults(captures, [capture.path.relative_to(folder).as_posix() for capture in captures])
     if faults:
         raise InputError(folder.name, faults)
-    return tuple(sorted(found, key=lambda capture: capture.name))
+    return tuple(sorted(captures, key=lambda capture: capture.name))
 
 
 def is_capture(path: Path) -> bool:
@@ -82,22 +82,22 @@ def read_list(path: Path) -> tuple[BatchCapture, ...]:
         raise InputError(path.name, [compose("batch-list-unreadable", reason=reason_of(error))]) from error
     faults: list[Message] = []
     rows = list(_csv_rows(text, faults) if _is_csv(path, text) else _text_rows(text))
-    found: dict[int, BatchCapture] = {}
+    chosen: dict[int, BatchCapture] = {}
     for line, row in rows:
         wrong: list[Message] = []
         if MORE in row:
             wrong.append(compose("batch-cells-many", cells=len(row) - 1 + int(row[MORE]), columns=len(row) - 1))
         else:
-            found[line] = _capture_of(row, path.parent, wrong)
+            chosen[line] = _capture_of(row, path.parent, wrong)
         faults += [compose("batch-line", line=line, fault=fault) for fault in wrong]
     if not rows and not faults:
         faults.append(compose("batch-list-empty"))
-    named = {line: capture for line, capture in found.items() if capture.name}
+    named = {line: capture for line, capture in chosen.items() if capture.name}
     places = [compose("batch-line-number", line=line).text for line in named]
     faults += _name_faults(list(named.values()), places)
     if faults:
         raise InputError(path.name, faults)
-    return tuple(found.values())
+    return tuple(chosen.values())
 
 
 def _walk(folder: Path, out: Path) -> Iterator[Path]:
@@ -199,13 +199,13 @@ def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Messag
     another."""
     faults: list[Message] = []
     folded: dict[str, list[str]] = {}
-    for capture, place in zip(captures, places, strict=True):
-        folded.setdefault(capture.name.casefold(), []).append(place)
+    for capture, position in zip(captures, places, strict=True):
+        folded.setdefault(capture.name.casefold(), []).append(position)
         parts = capture.name.split("/")
         if any(not part or part.startswith(".") or "\0" in part or "\\" in part for part in parts) or (
             parts[0].casefold() in TAKEN_NAMES
         ):
-            faults.append(compose("batch-name-wrong", name=f"{capture.name!r}", where=place))
+            faults.append(compose("batch-name-wrong", name=f"{capture.name!r}", where=position))
     for name, where in folded.items():
         if len(where) > 1:
             faults.append(compose("batch-name-twice", name=name, where=where))

@@ -168,16 +168,16 @@ class BatchFolder:
 
         Raises ForeignFiles, and OSError if a process with another division into shares has just published it.
         """
-        made, target = attempt / "result", self.result(name)
+        complete, target = attempt / "result", self.result(name)
         self.check_replaceable(name)
-        sizes = {path.relative_to(made).as_posix(): path.stat().st_size for path in _files(made)}
+        sizes = {path.relative_to(complete).as_posix(): path.stat().st_size for path in _files(complete)}
         sizes.pop(REPORT, None)  # it contains durations, so its size varies
         document = {"format": RECORD_FORMAT, "capture": name, **asdict(origin), "files": dict(sorted(sizes.items()))}
-        write_atomically(made / RECORD, json.dumps(document, indent=1).encode())
+        write_atomically(complete / RECORD, json.dumps(document, indent=1).encode())
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists():
             target.rename(attempt / "replaced")
-        made.rename(target)  # fails if a folder with files exists there
+        complete.rename(target)  # fails if a folder with files exists there
         self.failure_file(name).unlink(missing_ok=True)
 
     def check_replaceable(self, name: str) -> None:

@@ -31,13 +31,12 @@ from pathlib import Path
 from rig.messages.message import Message
 from server.tasks.child import DISK_FULL, WorkFailed
 
-SIGKILL = 9
-
 
 def failure_of(error: EigenheadError | OSError, capture: Path, origin: Origin | None) -> FailureRecord:
     """Returns the failure record for an error. ``origin``: None if the capture could not be read."""
     if isinstance(error, WorkFailed):
-        return FailureRecord(error.kind, _of_work(error), error.faults, origin, error.trace)
+        kind = "crash" if error.kind == "killed" else error.kind
+        return FailureRecord(kind, _of_work(error), error.faults, origin, error.trace)
     if isinstance(error, EigenheadError):
         kind = "input" if isinstance(error, InputError) else "refused"
         return FailureRecord(kind, error.message, getattr(error, "faults", ()), origin)
@@ -52,8 +51,7 @@ def failure_of(error: EigenheadError | OSError, capture: Path, origin: Origin | 
 
 
 def _of_work(error: WorkFailed) -> Message:
-    how = error.message.parameters.get("how")
-    if error.kind == "crash" and isinstance(how, Message) and how.parameters.get("number") == SIGKILL:
+    if error.kind == "killed":
         return compose("batch-worker-killed")
     if error.kind == "disk-full":
         return compose("batch-disk-full")

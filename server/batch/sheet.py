@@ -81,8 +81,8 @@ def card_class(card: Card) -> str:
     """Returns the class by which a card is coloured: its worst warning, or the state of a capture that is not done."""
     if card.state != "done":
         return card.state
-    found = {severity(message["code"]) for message in card.messages}
-    return next((kind for kind in ("severe", "warning") if kind in found), "good")
+    severities = {severity(message["code"]) for message in card.messages}
+    return next((kind for kind in ("severe", "warning") if kind in severities), "good")
 
 
 def ranked_cards(cards: Iterable[Card]) -> list[Card]:
@@ -146,8 +146,8 @@ def figures_of(row: Mapping[str, object]) -> str:
     """Returns the most requested figures of a head as one line: breadth, length and deviation (mm). ``row`` is the
     head's row of the table."""
     names = {"head_breadth_mm": "breadth", "head_length_mm": "length", "quality_median_mm": "deviation"}
-    found = [(word, row.get(name)) for name, word in names.items()]
-    return ", ".join(f"{word} {value:.1f} mm" for word, value in found if isinstance(value, float))
+    cells = [(word, row.get(name)) for name, word in names.items()]
+    return ", ".join(f"{word} {value:.1f} mm" for word, value in cells if isinstance(value, float))
 
 
 def _article(card: Card) -> str:

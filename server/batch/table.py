@@ -171,8 +171,8 @@ def _expression(report: Mapping[str, Any], columns: Sequence[Column]) -> Row:
         for column in columns
         if column.name.startswith("expression_") and not column.name.endswith("_std")
     }
-    for made in report["expression"]:
-        row |= {f"expression_{made['name']}": made["weight"], f"expression_{made['name']}_std": made["std"]}
+    for weight in report["expression"]:
+        row |= {f"expression_{weight['name']}": weight["weight"], f"expression_{weight['name']}_std": weight["std"]}
     return row
 
 

@@ -97,9 +97,9 @@ def batch(
     options = {"outputs": requested or None, "anyway": anyway or None}
     document = settings_document(settings, method=method, detail=detail, **options)
     with wrong_usage("FOLDER|LIST"):
-        found = _captures_in(captures, out)
+        batch_captures = _captures_in(captures, out)
     with wrong_usage("settings"):
-        tasks = plan_batch(found, document, model)
+        tasks = plan_batch(batch_captures, document, model)
     prepare_folder(out)
     _run(tasks, out, workers, share, json_out)
 
@@ -118,16 +118,16 @@ def _captures_in(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
 
     if captures.is_file() and is_archive(captures):
         raise InputError(captures.name, [compose("batch-folder-is-capture")])
-    found = find_captures(captures, out) if captures.is_dir() else read_list(captures)
-    place = out.resolve()
+    captures_found = find_captures(captures, out) if captures.is_dir() else read_list(captures)
+    out_folder = out.resolve()
     faults = [
         compose("batch-out-within", out=str(out), capture=capture.name)
-        for capture in found
-        if place.is_relative_to(capture.path.resolve())
+        for capture in captures_found
+        if out_folder.is_relative_to(capture.path.resolve())
     ]
     if faults:
         raise InputError("out", faults)
-    return found
+    return captures_found
 
 
 def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "Shard", json_out: bool) -> None:

@@ -85,10 +85,7 @@ def calibrate(
     scale: Annotated[
         Path | None, typer.Option(help="From a scene: a known length, scale.json.", exists=True, dir_okay=False)
     ] = None,
-    lenses: Annotated[
-        str | None,
-        chosen("From a scene: one (all of one camera) or each; guessed.", _lenses),
-    ] = None,
+    lenses: Annotated[str | None, chosen("From a scene: one (all of one camera) or each; guessed.", _lenses)] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
     anyway: Annotated[
@@ -126,7 +123,7 @@ def _calibrate_board(
     page = out.with_suffix(".html")
     try:
         with progress_bar() as report:
-            found = run(images, read_board(board), front=front, previous=known, report=report)
+            calibration = run(images, read_board(board), front=front, previous=known, report=report)
     except CalibrationRefused as refusal:
         if refusal.calibration is None:
             raise
@@ -135,13 +132,13 @@ def _calibrate_board(
             reasons = (*refusal.reasons, "its report is written, and --anyway writes cameras.json, too, for a look")
             raise CalibrationRefused(reasons, refusal.calibration) from refusal
         warn(str(refusal))
-        found = refusal.calibration
-    write_calibration(found, out)
-    write_report(found, page)
-    figures = found.figures()
+        calibration = refusal.calibration
+    write_calibration(calibration, out)
+    write_report(calibration, page)
+    figures = calibration.figures()
     cameras = [f"{name}  {figure['rms_px']:.3f} px" for name, figure in figures["cameras"].items()]
     total = f"{figures['rms_px']:.3f} px over {figures['used_share']:.1%} of the corners"
-    answer(found.document(), json_out, [str(out), str(page), *cameras, total, *texts_of(found.warnings)])
+    answer(calibration.document(), json_out, [str(out), str(page), *cameras, total, *texts_of(calibration.warnings)])
 
 
 def _calibrate_scene(
@@ -154,18 +151,22 @@ def _calibrate_scene(
     page = out.with_suffix(".html")
     one_lens = None if lenses is None else lenses == "one"
     with progress_bar() as report:
-        found = calibrate_scene(photographs, scale=scale, front=front, one_lens=one_lens, report=report)
-    write_rig(found.rig, out)
-    write_scene_report(found, page)
-    figures = found.figures()
+        calibration = calibrate_scene(photographs, scale=scale, front=front, one_lens=one_lens, report=report)
+    write_rig(calibration.rig, out)
+    write_scene_report(calibration, page)
+    figures = calibration.figures()
     cameras = [
         f"{name}  {figure['rms_px']:.3f} px, {figure['points']} points, known to {figure['pose_sigma_px']:.2f} px"
         for name, figure in figures["cameras"].items()
     ]
-    total = f"{figures['rms_px']:.3f} px over {figures['points']} points; front camera {found.front}"
-    for warning in found.warnings:
+    total = f"{figures['rms_px']:.3f} px over {figures['points']} points; front camera {calibration.front}"
+    for warning in calibration.warnings:
         warn(warning.text)
-    answer(found.document(), json_out, [str(out), str(page), *cameras, total, f"scale: {found.scale.provenance}"])
+    answer(
+        calibration.document(),
+        json_out,
+        [str(out), str(page), *cameras, total, f"scale: {calibration.scale.provenance}"],
+    )
 
 
 @app.command(epilog="Example: eigenhead refine shots/anna shots/ben shots/cleo shots/dora --out cameras.json")

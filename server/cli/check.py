@@ -53,27 +53,27 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
-    found = Checked(capture=str(capture), cameras=[], front=None, faults=[], fault_messages=[], warnings=[], will=[])
+    document = Checked(capture=str(capture), cameras=[], front=None, faults=[], fault_messages=[], warnings=[], will=[])
     try:
         with folder_of(capture) as folder:
             if photographs_alone(folder):
-                found["cameras"], found["will"] = _plan_for_photographs(folder, report)
-                _check_front(chosen.front, found["cameras"])
-                return found
-            found["warnings"] = _file_warnings(capture_root(folder))
+                document["cameras"], document["will"] = _plan_for_photographs(folder, report)
+                _check_front(chosen.front, document["cameras"])
+                return document
+            document["warnings"] = _file_warnings(capture_root(folder))
             content = check_capture(capture_root(folder), service_settings().image_pixels, report, strays_pass=True)
-            found["cameras"] = [camera.name for camera in content.cameras]
-            _check_front(chosen.front, found["cameras"])
-            found["front"] = chosen.front or content.front
-            seen = _outline_warnings(folder, chosen, report)
-            found["warnings"] += [warned for warned in seen if warned not in found["warnings"]]
+            document["cameras"] = [camera.name for camera in content.cameras]
+            _check_front(chosen.front, document["cameras"])
+            document["front"] = chosen.front or content.front
+            outline_warnings = _outline_warnings(folder, chosen, report)
+            document["warnings"] += [warned for warned in outline_warnings if warned not in document["warnings"]]
     except (WrongVariable, WorkFailed):
         raise
     except InputError as error:
-        found["faults"], found["fault_messages"] = texts_of(error.faults), documents_of(error.faults)
+        document["faults"], document["fault_messages"] = texts_of(error.faults), documents_of(error.faults)
     except EigenheadError as error:
-        found["faults"], found["fault_messages"] = [error.message.text], [error.message.document()]
-    return found
+        document["faults"], document["fault_messages"] = [error.message.text], [error.message.document()]
+    return document
 
 
 def _check_front(front: str | None, cameras: list[str]) -> None:
@@ -159,12 +159,12 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
     return documents_of(warnings)
 
 
-def lines(found: Checked) -> list[str]:
+def lines(document: Checked) -> list[str]:
     """Returns the findings of a check as lines for people."""
-    findings = [f"fault    {fault}" for fault in found["faults"]]
-    findings += [f"warning  {warning['code']}: {warning['message']}" for warning in found["warnings"]]
-    findings += [f"will     {step}" for step in found["will"]]
-    verdict = "cannot be reconstructed" if found["faults"] else "can be reconstructed"
-    seen = f"{len(found['cameras'])} cameras, " if found["cameras"] else ""
-    seen += f"front {found['front']}; " if found["front"] else ""
-    return [f"{found['capture']}: {seen}{verdict}", *findings]
+    findings = [f"fault    {fault}" for fault in document["faults"]]
+    findings += [f"warning  {warning['code']}: {warning['message']}" for warning in document["warnings"]]
+    findings += [f"will     {step}" for step in document["will"]]
+    verdict = "cannot be reconstructed" if document["faults"] else "can be reconstructed"
+    summary = f"{len(document['cameras'])} cameras, " if document["cameras"] else ""
+    summary += f"front {document['front']}; " if document["front"] else ""
+    return [f"{document['capture']}: {summary}{verdict}", *findings]

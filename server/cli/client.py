@@ -15,14 +15,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import httpx
 
 from rig.errors import EigenheadError
 from rig.formats.captures.archive import is_archive, pack_folder
 from rig.progress import Progress
-from server.services.documents import CaptureDocument, ErrorDocument, JobDocument
 from server.storage.result_folder import fresh_folder
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ class Unreachable(EigenheadError):
 class JobEnded(EigenheadError):
     """Reports a job that failed or was cancelled; ``job`` is its document."""
 
-    def __init__(self, job: JobDocument) -> None:
+    def __init__(self, job: "JsonObject") -> None:
         error = job.get("error")
         faults = "" if error is None else "".join(f"\n  - {fault}" for fault in error["errors"])
         detail = "no reason given" if error is None else error["detail"]
@@ -108,7 +107,7 @@ class Client:
         """Sends a DELETE. Raises ServiceError if the service refuses it, and Unreachable."""
         self._request("DELETE", path)
 
-    def upload(self, source: Path, *, report: Progress | None = None, **about: str) -> CaptureDocument:
+    def upload(self, source: Path, *, report: Progress | None = None, **about: str) -> "JsonObject":
         """Uploads a capture folder or an archive of one, resuming after every interruption, and returns the capture.
 
         ``about`` may hold session, label and expression. Raises ServiceError naming every fault of the capture, and
@@ -128,7 +127,7 @@ class Client:
         model: str | None = None,
         settings: Mapping[str, object] | None = None,
         key: str | None = None,
-    ) -> JobDocument:
+    ) -> "JsonObject":
         """Queues a job and returns its document. ``key`` is the idempotency key that makes the request safe to repeat;
         by default a new one is made. Raises ServiceError and Unreachable."""
         request = {"capture_id": capture_id, "model": model, "settings": settings}
@@ -159,14 +158,13 @@ class Client:
                     raise Unreachable(self.url, error) from error
             time.sleep(0.3)
 
-    def wait(self, job_id: str, *, report: Progress | None = None) -> JobDocument:
+    def wait(self, job_id: str, *, report: Progress | None = None) -> "JsonObject":
         """Waits until the job ends and returns its document. Raises JobEnded if it failed or was cancelled."""
         for kind, document in self.events(job_id):
             if kind == "end":
-                job = cast(JobDocument, document)
-                if job["state"] != "succeeded":
-                    raise JobEnded(job)
-                return job
+                if document["state"] != "succeeded":
+                    raise JobEnded(document)
+                return document
             if report is not None and "stage" in document:
                 report(document["stage"], document["progress"])
         raise AssertionError("a stream of events ends with 'end'")
@@ -185,7 +183,7 @@ class Client:
                 path.write_bytes(data)
         return [folder / name for name in job["files"]]
 
-    def _upload_archive(self, archive: Path, report: Progress, about: dict[str, str]) -> CaptureDocument:
+    def _upload_archive(self, archive: Path, report: Progress, about: dict[str, str]) -> "JsonObject":
         if not is_archive(archive):
             raise ServiceError(422, "no-archive", f"{archive.name} is no .zip, .tar or .tar.gz", [])
         size = archive.stat().st_size
@@ -266,7 +264,7 @@ def _events(response: httpx.Response, last: str) -> Iterator[Event]:
 def _raise_for(response: httpx.Response) -> None:
     if response.status_code < 400:
         return
-    problem: ErrorDocument | None = None
+    problem: "JsonObject | None" = None
     with suppress(ValueError):
         problem = response.json()
     detail = f"{response.request.method} {response.request.url.path}: {response.status_code}"

@@ -119,9 +119,9 @@ def register(
 
     patient = read_surface(surface, cast(Axes | None, axes))
     marks = None if landmarks is None else read_surface_landmarks(landmarks, patient.axes)
-    found = register_head(read_visit(result, model), patient, marks)
+    registered = register_head(read_visit(result, model), patient, marks)
     prepare_folder(out)
-    document = write_registration(out, found)
+    document = write_registration(out, registered)
     answer(document | {"out": str(out)}, json_out, _registration_lines(document, out))
 
 

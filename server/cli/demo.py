@@ -91,16 +91,16 @@ def run_demo(out: Path, *, seed: int, full: bool, compare: bool, report: Progres
                 client.wait(job["id"], report=_part(report, f"{method}: ", start, share))
                 client.download(job["id"], folders[method])
         truth = data / "captures" / capture["id"] / "truth"
-        found = {method: _described(folders[method], truth) for method in folders}
+        documents = {method: _described(folders[method], truth) for method in folders}
     if compare:
-        side_by_side(found, out / "contact_sheet.png")
+        side_by_side(documents, out / "contact_sheet.png")
     return {
-        "ply": found["contour"]["ply"],
+        "ply": documents["contour"]["ply"],
         "contact_sheet": str(out / "contact_sheet.png"),
         "seconds": round(time.monotonic() - began, 3),
-        "error_mm": found["contour"]["error_mm"],
-        "warnings": found["contour"]["warnings"],
-        "methods": found,
+        "error_mm": documents["contour"]["error_mm"],
+        "warnings": documents["contour"]["warnings"],
+        "methods": documents,
     }
 
 
@@ -120,11 +120,11 @@ def _described(folder: Path, truth: Path) -> MethodDocument:
     }
 
 
-def side_by_side(found: dict[str, MethodDocument], target: Path) -> None:
+def side_by_side(documents: dict[str, MethodDocument], target: Path) -> None:
     """Writes one picture that joins the contact sheets of all solvers: the input and the start once, then silhouettes
     and head of each solver."""
     columns = []
-    for method, described in found.items():
+    for method, described in documents.items():
         sheet = cv2.imread(str(Path(described["ply"]).with_name("contact_sheet.png")))
         assert sheet is not None  # the job wrote it
         both = [sheet[:, : 2 * PANEL[0]]] if not columns else []  # input, before the fit: the same for every solver

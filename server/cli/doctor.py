@@ -1,10 +1,12 @@
 """Implements ``eigenhead doctor``: finds what is wrong with this machine and says what to do about it."""
 
+import json
 import os
 import shutil
 import socket
 import sqlite3
 import sys
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -19,6 +21,8 @@ from rig.errors import EigenheadError
 from rig.text import suggest
 from server.address import is_loopback
 from server.settings import PREFIX, ServiceSettings
+from server.storage.folders import STOPPED
+from server.storage.objects import sha256_of
 from server.tasks.child import Child, WorkFailed
 from server.tasks.egl import try_compute, try_egl
 
@@ -30,11 +34,9 @@ TABLES = {
     "postgresql": "SELECT tablename FROM pg_tables WHERE tablename = '{}'",
 }
 JOBS = {"sqlite": "workflow_status", "postgresql": "dbos.workflow_status"}
-NOW = {
-    "sqlite": "((julianday('now') - 2440587.5) * 86400.0)",
-    "postgresql": "extract(epoch from clock_timestamp())",
-}
+NOW = {"sqlite": "((julianday('now') - 2440587.5) * 86400.0)", "postgresql": "extract(epoch from clock_timestamp())"}
 STORE_S = 3.0  # how long doctor waits for a store at most
+COMPARE_S = 30.0  # how long doctor compares files of results
 MEMORY_LEAST = 2 << 30  # a job takes up to 1.5 GB
 
 
@@ -71,6 +73,7 @@ def examine(settings: ServiceSettings) -> dict[str, Finding]:
         "models": _models,
         "cache": _cache,
         "database": _database,
+        "retention": _retention,
         "results": _results,
         "variables": _variables,
         "rig": _rig,
@@ -136,13 +139,13 @@ def _memory(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _data(settings: ServiceSettings) -> tuple[bool, str]:
-    there = next(folder for folder in (settings.data.resolve(), *settings.data.resolve().parents) if folder.exists())
-    if not (there.is_dir() and os.access(there, os.W_OK)):
-        return False, f"{there} cannot be written; give it to the user that runs the service"
-    free = shutil.disk_usage(there).free
+    existing = next(folder for folder in (settings.data.resolve(), *settings.data.resolve().parents) if folder.exists())
+    if not (existing.is_dir() and os.access(existing, os.W_OK)):
+        return False, f"{existing} cannot be written; give it to the user that runs the service"
+    free = shutil.disk_usage(existing).free
     held = (f"{len(list((settings.data / name).glob('*')))} {name}" for name in ("captures", "jobs"))
     detail = f"{settings.data.resolve()}, {', '.join(held)}, {free / 1e9:.1f} GB free"
-    detail += "" if there == settings.data.resolve() else "; `eigenhead serve` will make it"
+    detail += "" if existing == settings.data.resolve() else "; `eigenhead serve` will make it"
     return free > settings.free_bytes, detail if free > settings.free_bytes else detail + ": delete captures or jobs"
 
 
@@ -153,10 +156,10 @@ def _models(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _cache(settings: ServiceSettings) -> tuple[bool, str]:
     folder = cache_folder().resolve()
-    there = next(place for place in (folder, *folder.parents) if place.exists())
-    if not (there.is_dir() and os.access(there, os.W_OK)):
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    if not (existing.is_dir() and os.access(existing, os.W_OK)):
         return False, f"{folder} cannot be written: every start compiles anew; {CACHE} names another folder"
-    return True, f"{folder}, what can be made again" + ("" if there == folder else "; not made yet")
+    return True, f"{folder}, what can be made again" + ("" if existing == folder else "; not made yet")
 
 
 def _database(settings: ServiceSettings) -> tuple[bool, str]:
@@ -186,25 +189,45 @@ def _database(settings: ServiceSettings) -> tuple[bool, str]:
 
 
 def _results(settings: ServiceSettings) -> tuple[bool, str]:
-    """Names the jobs that succeeded but whose result folder is missing: removed by hand, or not in a restored
-    backup."""
+    """Names the jobs that succeeded but whose result folder is missing, removed by hand or not in a restored backup,
+    and files whose content is not what the job made: the newest first, for ``COMPARE_S`` seconds."""
     kind = _kind(settings)
     connection = _connected(settings)
     if connection is None:
         return True, "none yet"
     with closing(connection):
-        if not _rows(connection, TABLES[kind].format("workflow_status")):
+        if not _rows(connection, TABLES[kind].format("workflow_output")):
             return True, "none yet"
-        query = f"SELECT workflow_uuid FROM {JOBS[kind]} WHERE name = 'reconstruct' AND status = 'SUCCESS'"
-        jobs = [str(job) for (job,) in _rows(connection, query)]
-    missing = [job for job in jobs if not (settings.data / "jobs" / job / "result").is_dir()]
+        outputs = JOBS[kind].replace("status", "output")
+        query = f"SELECT job.workflow_uuid, made.output FROM {JOBS[kind]} AS job LEFT JOIN {outputs} AS made"
+        query += " ON made.workflow_uuid = job.workflow_uuid WHERE job.name = 'reconstruct' AND job.status = 'SUCCESS'"
+        rows = _rows(connection, query + " ORDER BY job.created_at DESC")
+    missing = [job for job, _ in rows if not (settings.data / "jobs" / job / "result").is_dir()]
+    damaged, compared, end = list[str](), 0, time.monotonic() + COMPARE_S
+    for job, output in rows:
+        if job not in missing and str(output).startswith("{") and time.monotonic() < end:  # not an older, pickled one
+            compared += 1
+            damaged += _damaged(settings.data / "jobs" / job, json.loads(output))
+    if damaged:
+        return False, f"changed since their jobs made them: {', '.join(damaged[:5])}; restore them, or restart the jobs"
     if not missing:
-        return True, f"of {len(jobs)} jobs, all there"
+        return True, f"of {len(rows)} jobs, all there; the files of {compared} were compared"
     named = f"{', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}"
     return (
         False,
-        f"of {len(jobs)} jobs {len(missing)} are gone ({named}): restore `jobs` from a backup, or restart them",
+        f"of {len(rows)} jobs {len(missing)} are gone ({named}): restore `jobs` from a backup, or restart them",
     )
+
+
+def _damaged(folder: Path, files: dict[str, dict[str, str]]) -> list[str]:
+    found = ((folder / "result" / name, entry["sha256"]) for name, entry in files.items())
+    there = ((path, sha256) for path, sha256 in found if path.is_file())  # the others may lie in a store
+    return [f"{folder.name}/{path.name}" for path, sha256 in there if sha256_of(path) != sha256]
+
+
+def _retention(settings: ServiceSettings) -> tuple[bool, str]:
+    stopped = settings.data / STOPPED
+    return not stopped.exists(), stopped.read_text(encoding="utf-8") if stopped.exists() else "the clock is trusted"
 
 
 def _kind(settings: ServiceSettings) -> str:
@@ -257,16 +280,16 @@ def _rig(settings: ServiceSettings) -> tuple[bool, str]:
 
 def _stores(settings: ServiceSettings) -> tuple[bool, str]:
     """Lists the first object of each place; what may be written there only a delivery shows."""
-    kept = [place for place in (settings.captures_store, settings.results_store) if place is not None]
-    places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *kept])
+    stores = [place for place in (settings.captures_store, settings.results_store) if place is not None]
+    places = dict.fromkeys([*settings.import_prefixes, *settings.deliver_prefixes, *stores])
     if not places:
         return True, "none; EIGENHEAD_IMPORT_PREFIXES and EIGENHEAD_DELIVER_PREFIXES name places"
     from server.storage.object_places import open_objects
 
     faults, hasty = [], settings.model_copy(update={"store_timeout_s": min(settings.store_timeout_s, STORE_S)})
-    for place in places:
+    for store in places:
         try:
-            next(iter(open_objects(place, hasty).entries("")), None)
+            next(iter(open_objects(store, hasty).entries("")), None)
         except EigenheadError as error:
             faults.append(str(error))
     return not faults, " ".join(faults) or f"{', '.join(places)}: answer"

@@ -42,11 +42,7 @@ def export(
     *,
     result: Annotated[
         Path | None,
-        typer.Option(
-            help="The capture's result folder: head and FLAME parameters.",
-            exists=True,
-            file_okay=False,
-        ),
+        typer.Option(help="The capture's result folder: head and FLAME parameters.", exists=True, file_okay=False),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
     axes: Annotated[str, chosen("For slicer: LPS (the default) or RAS.", axes_choices)] = "LPS",
@@ -73,14 +69,7 @@ def export(
 
 
 def _export_dataset(
-    capture: Path,
-    out: Path,
-    form: str,
-    *,
-    result: Path | None,
-    settings: Path | None,
-    overwrite: bool,
-    json_out: bool,
+    capture: Path, out: Path, form: str, *, result: Path | None, settings: Path | None, overwrite: bool, json_out: bool
 ) -> None:
     """Writes a capture as a data set."""
     from typing import cast
@@ -98,17 +87,23 @@ def _export_dataset(
         raise Overwrites(out / "transforms.json")
     prepare_folder(out)
     with progress_bar() as report, folder_of(capture) as folder:
-        made = export_folder(folder, out, cast(DatasetFormat, form), result=result, chosen=wanted, report=report)
-    for warning in made.warnings:
+        exported = export_folder(folder, out, cast(DatasetFormat, form), result=result, chosen=wanted, report=report)
+    for warning in exported.warnings:
         warn(f"{warning.code}: {warning}")
-    document = {"out": str(out), "as": form, "cameras": made.cameras, "left_out": made.left_out, "points": made.points}
-    document |= {"flame": made.flame}
-    seen = (
-        f"{len(made.cameras)} views"
-        + (", FLAME parameters" if made.flame else "")
-        + (f", without {', '.join(made.left_out)}" if made.left_out else "")
+    document = {
+        "out": str(out),
+        "as": form,
+        "cameras": exported.cameras,
+        "left_out": exported.left_out,
+        "points": exported.points,
+    }
+    document |= {"flame": exported.flame}
+    summary = (
+        f"{len(exported.cameras)} views"
+        + (", FLAME parameters" if exported.flame else "")
+        + (f", without {', '.join(exported.left_out)}" if exported.left_out else "")
     )
-    answer(document, json_out, [f"{out}  {seen}"])
+    answer(document, json_out, [f"{out}  {summary}"])
 
 
 def _export_patient(

@@ -67,8 +67,7 @@ def format_names(value: str | None) -> str | None:
 Formats = Annotated[
     str | None,
     typer.Option(
-        help="Of the head: glb, ply (both by default), obj, usdz, stl, 3mf, with commas between.",
-        callback=format_names,
+        help="Of the head: glb, ply (both by default), obj, usdz, stl, 3mf, with commas between.", callback=format_names
     ),
 ]
 Trace = Annotated[
@@ -126,8 +125,7 @@ def reconstruct(
     surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
     formats: Formats = None,
     albedo: Annotated[
-        bool,
-        typer.Option("--albedo", help="Also texture/albedo.png: the texture with its light taken off."),
+        bool, typer.Option("--albedo", help="Also texture/albedo.png: the texture with its light taken off.")
     ] = False,
     cap: CapColour = None,
     cap_thickness: CapThickness = None,
@@ -164,8 +162,8 @@ def reconstruct(
     for warning in written["warnings"]:
         warn(f"{warning['code']}: {warning['message']}")
     names = ("contact_sheet.png", "head.ply", "bust.ply", f"head-{template}.obj")  # in the order of looking at them
-    made = [out / name for name in names if (out / name).is_file()]
-    answer(written, json_out, [*(str(path) for path in made), *flame_lines(written, out)])
+    files = [out / name for name in names if (out / name).is_file()]
+    answer(written, json_out, [*(str(path) for path in files), *flame_lines(written, out)])
 
 
 @app.command(epilog="Example: eigenhead check shots/anna.tar.gz --json")
@@ -183,9 +181,9 @@ def check(
 
     with progress_bar() as report:
         document = settings_document(settings, texture={"chart": True} if chart else None)
-        found = checked(capture, document, report=report)
-    answer(found, json_out, lines(found))
-    if found["faults"]:
+        checks = checked(capture, document, report=report)
+    answer(checks, json_out, lines(checks))
+    if checks["faults"]:
         raise typer.Exit(2)
 
 
@@ -219,13 +217,13 @@ def verify(
     wanted, chosen = read_limits(limits), settings_document(settings)
     prepare_file(out / "report.json")
     with progress_bar() as report:
-        found = verify_captures(
+        verification = verify_captures(
             captures, out, reference=reference, landmarks=landmarks, model=model, settings=chosen, limits=wanted,
             report=report,
         )  # fmt: skip
-    answer(found, json_out, lines(found, out))
-    if not found["passed"]:
-        raise LimitsMissed(found, out)
+    answer(verification, json_out, lines(verification, out))
+    if not verification["passed"]:
+        raise LimitsMissed(verification, out)
 
 
 @app.command(epilog="Example: eigenhead demo --out out/demo")

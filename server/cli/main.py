@@ -8,20 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.errors import EigenheadError
-from server.cli import (
-    batch,
-    cameras,
-    clinic,
-    export,
-    heads,
-    measure,
-    models,
-    rig,
-    service,
-    simulate,
-    templates,
-    wrap,
-)
+from server.cli import batch, cameras, clinic, export, heads, measure, models, rig, service, simulate, templates, wrap
 from server.cli.answers import fail
 
 app = typer.Typer(
@@ -75,6 +62,8 @@ def main() -> None:
         app()
     except EigenheadError as error:
         fail(str(error))
+    except MemoryError as error:
+        fail(f"more memory is needed than there is ({error}): a file is too large, or not what it says")
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:

@@ -38,16 +38,16 @@ def measure(
     tables = [] if sizes is None else read_size_tables(sizes)
     visit = read_visit(result, model)
     _check_measures(sizes, tables, {*visit.measurements, *MEASURES})
-    found = {
+    measures = {
         name: Fitted(of.value_mm, of.std_mm, "mm") for name, of in visit.measurements.items() if of.std_mm is not None
     }
-    found |= fitting_measures(visit)
-    _check_measures(sizes, tables, found.keys())
-    chosen = [choose_size(table, found[table.measure].value, found[table.measure].std) for table in tables]
+    measures |= fitting_measures(visit)
+    _check_measures(sizes, tables, measures.keys())
+    chosen = [choose_size(table, measures[table.measure].value, measures[table.measure].std) for table in tables]
     document = {
         "measures": {
             name: {"value": of.value, "std": of.std, "unit": of.unit, "iso": ISO_NAMES.get(name)}
-            for name, of in found.items()
+            for name, of in measures.items()
         },
         "sizes": {
             of.table: {"measure": of.measure, "best": of.best, "probabilities": dict(of.probabilities), "none": of.none}

@@ -15,8 +15,8 @@ def model_list(data: Data = None, json_out: Json = False) -> None:
     """List the head models at hand."""
     from pipeline.head_model.model_names import list_models
 
-    found = {name: str(path) for name, path in list_models().items()}
-    answer({"models": found}, json_out, [f"{name}  {path}" for name, path in found.items()])
+    models = {name: str(path) for name, path in list_models().items()}
+    answer({"models": models}, json_out, [f"{name}  {path}" for name, path in models.items()])
 
 
 @model_app.command("info", epilog="Example: eigenhead model info --json")

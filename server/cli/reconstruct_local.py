@@ -90,12 +90,12 @@ def check_apart(out: Path, capture: Path, option: str = "--out") -> None:
 
     if not capture.is_dir():
         return
-    place, whole, root = out.resolve(), capture.resolve(), capture_root(capture).resolve()
+    out_folder, whole, root = out.resolve(), capture.resolve(), capture_root(capture).resolve()
     pictures = [root / kind for kind in ("images", *BESIDE_PICTURES, TEXTURE_SETS)]
     pictures += [picture_folder(root)] if photographs_alone(root) else []  # there every folder counts as a camera's
     # The root is recognised as the only folder within ``whole``: a result beside it would hide it.
-    beside_root = place.is_relative_to(whole) and not place.is_relative_to(root)
-    if place == root or beside_root or any(place.is_relative_to(folder) for folder in pictures):
+    beside_root = out_folder.is_relative_to(whole) and not out_folder.is_relative_to(root)
+    if out_folder == root or beside_root or any(out_folder.is_relative_to(folder) for folder in pictures):
         raise SpoilsCapture(out, option)
 
 

@@ -41,7 +41,7 @@ def refine_locally(
     settings = Settings()
     head = None if model is None else load_model(model)
     head = head and with_modes(head, min(settings.fitting.modes, len(head.modes)))
-    seen: list[Mapping[str, Silhouette]] = []
+    silhouettes: list[Mapping[str, Silhouette]] = []
     starts: list[Similarity] = []
     moved: dict[str, list[str]] = {}
     for number, path in enumerate(captures):
@@ -52,18 +52,18 @@ def refine_locally(
         faults = _differences(recorded, rig, same_poses=calibration is None)
         if faults:
             raise InputError(path.name, [*faults, compose("captures-of-one-rig")])
-        found = segment(capture, rig, report=discard_progress)
-        kept, warnings = without_moved_cameras(found, rig)
-        seen.append(kept)
+        segmented = segment(capture, rig, report=discard_progress)
+        retained, warnings = without_moved_cameras(segmented, rig)
+        silhouettes.append(retained)
         if head is not None:
-            views = Views(capture, kept, {})
+            views = Views(capture, retained, {})
             alignment = align_to_views(head, views, rig, settings, progress=discard_progress).product
             starts.append(alignment.world_from_head)
-        for name in (name for name in kept if warnings and kept[name] is not found[name]):
+        for name in (name for name in retained if warnings and retained[name] is not segmented[name]):
             moved.setdefault(name, []).append(path.name)
     assert rig is not None
     refined = refine(
-        seen,
+        silhouettes,
         rig,
         focal=focal,
         heads=None if head is None else Heads(head, starts, settings.fitting),

@@ -19,14 +19,14 @@ def rig_check(rig: RigFile = Path("rig.toml"), json_out: Json = False) -> None:
     from rig.acquisition.commands import COLUMNS, check
     from rig.formats.rig_toml import read_rig_config
 
-    found = check(read_rig_config(rig))
-    widths = [max(len(row[i]) for row in (COLUMNS, *found.rows)) for i in range(len(COLUMNS))]
-    lines = ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)) for row in (COLUMNS, *found.rows)]
-    lines += [str(fault) for fault in found.faults if fault.camera is None]
-    rows = [dict(zip(COLUMNS, row, strict=True)) for row in found.rows]
-    faults = [fault.document() for fault in found.faults]
-    answer({"healthy": found.healthy, "cameras": rows, "faults": faults}, json_out, lines)
-    if not found.healthy:
+    checked = check(read_rig_config(rig))
+    widths = [max(len(row[i]) for row in (COLUMNS, *checked.rows)) for i in range(len(COLUMNS))]
+    lines = ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)) for row in (COLUMNS, *checked.rows)]
+    lines += [str(fault) for fault in checked.faults if fault.camera is None]
+    rows = [dict(zip(COLUMNS, row, strict=True)) for row in checked.rows]
+    faults = [fault.document() for fault in checked.faults]
+    answer({"healthy": checked.healthy, "cameras": rows, "faults": faults}, json_out, lines)
+    if not checked.healthy:
         sys.exit(1)
 
 

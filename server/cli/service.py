@@ -6,11 +6,14 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from server.cli.answers import Data, Json, answer, progress_bar, service_settings
+
+if TYPE_CHECKING:
+    from server.settings import ServiceSettings
 
 app = typer.Typer(rich_markup_mode=None)
 keys_app = typer.Typer(help="API keys of the service.", no_args_is_help=True, rich_markup_mode=None)
@@ -42,15 +45,34 @@ def worker(
     data: Data = None,
     queue: Annotated[str | None, typer.Option(help="The queue to serve.")] = None,
     concurrency: Annotated[int | None, typer.Option(help="Jobs at once.", min=1)] = None,
+    check: Annotated[bool, typer.Option("--check", help="Run none; fail if none of this host is alive.")] = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
 ) -> None:
     """Run a worker that takes jobs from the service's queue."""
+    settings = service_settings(data=data, queue=queue, concurrency=concurrency)
+    if check:
+        sys.exit(not _worker_lives(settings))
     from server.log import set_up
     from server.worker.worker import run_worker
 
-    settings = service_settings(data=data, queue=queue, concurrency=concurrency)
     set_up(settings.log_json, jobs=settings.data / "jobs")
     run_worker(settings, until_eof=until_eof)
+
+
+def _worker_lives(settings: "ServiceSettings") -> bool:
+    """Tells whether a worker of this host is alive; yes where the database does not answer, which workers outlast."""
+    import platform
+
+    import sqlalchemy as sa
+
+    from server.storage.database import DatabaseUnavailable, alive_workers, open_database, workers
+
+    try:
+        with open_database(settings).connect() as connection:
+            query = sa.select(workers.c.id).where(alive_workers(connection, settings.silent_s))
+            return connection.scalar(query.where(workers.c.host == platform.node())) is not None
+    except DatabaseUnavailable:
+        return True
 
 
 @app.command(epilog="Example: eigenhead prepare")
@@ -112,9 +134,9 @@ def keys_add(
 def keys_list(data: Data = None, json_out: Json = False) -> None:
     """List the API keys, without their secrets."""
     with _keys(data) as keys:
-        found = keys.all()
-    lines = [f"{key.id}  {key.name}  {' '.join(key.scopes)}" for key in found]
-    answer({"keys": [asdict(key) for key in found]}, json_out, lines)
+        keys_listed = keys.all()
+    lines = [f"{key.id}  {key.name}  {' '.join(key.scopes)}" for key in keys_listed]
+    answer({"keys": [asdict(key) for key in keys_listed]}, json_out, lines)
 
 
 @keys_app.command("remove", epilog="Example: eigenhead keys remove 3f2a90b1c4d5")
@@ -126,11 +148,13 @@ def keys_remove(key_id: str, data: Data = None) -> None:
 
 @contextmanager
 def _keys(data: Path | None) -> Iterator[Any]:
-    from server.services.keys import Keys
+    from server.services.keys import Keys, note_keys
     from server.storage.database import open_database
 
-    engine = open_database(service_settings(data=data))
+    settings = service_settings(data=data)
+    engine = open_database(settings)
     try:
         yield Keys(engine)
+        note_keys(settings.data, Keys(engine))
     finally:
         engine.dispose()

@@ -24,8 +24,7 @@ HairNames = Annotated[
 ]
 
 Expressions = Annotated[
-    list[str] | None,
-    typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names."),
+    list[str] | None, typer.Option(help="NAME=WEIGHT, 0 to 1; may be repeated. `eigenhead model info` lists the names.")
 ]
 Gaze = Annotated[
     tuple[float, float] | None,
@@ -133,11 +132,11 @@ def _check_planted(faults: list[str], expression: list[str]) -> None:
 
 def _make_way(out: Path, overwrite: bool) -> None:
     """Removes an earlier simulated capture if ``overwrite`` is true. Raises Overwrites and CannotWrite."""
-    there = out.exists() and (not out.is_dir() or any(out.iterdir()))
-    if there and not (overwrite and (out / "cameras.json").is_file()):
+    occupied = out.exists() and (not out.is_dir() or any(out.iterdir()))
+    if occupied and not (overwrite and (out / "cameras.json").is_file()):
         raise Overwrites(out)
     prepare_file(out)
-    if there:
+    if occupied:
         shutil.rmtree(out)
         shutil.rmtree(out.with_name(out.name + ".truth"), ignore_errors=True)
 

@@ -57,9 +57,9 @@ def template_add(
     points = read_landmarks(marked) if marked else None
     head_model = load_model(model)
     with progress_bar() as report:
-        template, found = make_template(file, path.stem, head_model, landmarks=points, report=report)
+        template, fitted = make_template(file, path.stem, head_model, landmarks=points, report=report)
         picture = path.with_suffix(".png")
-        write_image(picture, template_picture(template, found, head_model))
+        write_image(picture, template_picture(template, fitted, head_model))
         save_template(path, template)
     document = {"name": path.stem, "file": str(path), "picture": str(picture), "model": head_model.name}
     answer(
@@ -85,17 +85,17 @@ def template_list(data: Data = None, json_out: Json = False) -> None:
     from pipeline.applications.templates.header import BadTemplate, read_header
     from pipeline.applications.templates.names import list_templates
 
-    found, lines = {}, []
+    templates, lines = {}, []
     for name, path in list_templates().items():
         try:
             template = read_header(path)
         except BadTemplate as error:
-            found[name], status = {"file": str(path), "fault": str(error)}, "damaged"
+            templates[name], status = {"file": str(path), "fault": str(error)}, "damaged"
         else:
-            found[name] = {"file": str(path), "model": template.model_name, **template.figures}
+            templates[name] = {"file": str(path), "model": template.model_name, **template.figures}
             status = template.model_name
         lines.append(f"{name}  {status}  {path}")
-    answer({"templates": found}, json_out, lines)
+    answer({"templates": templates}, json_out, lines)
 
 
 @template_app.command("remove", epilog="Example: eigenhead template remove flame")

@@ -90,12 +90,12 @@ def read_limits(path: Path | None) -> "Limits":
 def lines(document: "VerificationReport", out: Path) -> list[str]:
     """Returns lines for people: each figure beside its limit, then the paths of report and certificate."""
     verdicts = {None: "not judged", True: "met", False: "missed"}
-    found = [
+    visits = [
         f"{name:<20} {'-' if check['value'] is None else format(check['value'], '.4g'):>8}   "
         f"limit {check['limit']:<6g} {verdicts[check['passed']]}"
         for name, check in document["checks"].items()
     ]
-    return [*found, str(out / "report.json"), str(out / "certificate.pdf")]
+    return [*visits, str(out / "report.json"), str(out / "certificate.pdf")]
 
 
 def _names(captures: Sequence[Path]) -> list[str]:

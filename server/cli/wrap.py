@@ -62,11 +62,11 @@ def wrap(
 def _lines(wrapped: "Wrapped", out: Path) -> list[str]:
     figures, placed = wrapped.figures(), wrapped.placed
     unit = placed.unit or f"{placed.mm_per_unit:.4g} mm"
-    seen = f"face found in {placed.views} renders" if placed.views else "placed by landmarks"
+    placement = f"face found in {placed.views} renders" if placed.views else "placed by landmarks"
     turned = ", triangles turned over" if placed.turned_over else ""
     return [
         f"{out / 'wrapped.obj'}",
-        f"unit {unit}, up {placed.up}, front {placed.front}{turned}; {seen}",
+        f"unit {unit}, up {placed.up}, front {placed.front}{turned}; {placement}",
         f"{figures['vertices']:.0f} vertices, {figures['covered_share']:.0%} of them on the scan",
         f"these from its surface: {figures['median_mm']:.3f} mm (median), {figures['p95_mm']:.3f} (95 %)",
         f"its points from the template: {figures['scan_median_mm']:.3f} mm (median)",

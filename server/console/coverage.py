@@ -42,16 +42,16 @@ def detect_shot(context: WorkerContext, report: Progress, *, files: str, board: 
     """Finds the corners of the board in each image of a capture, in a child process. Returns them by camera, as shares
     of width and height; the list is empty if the board is not seen. Raises InputError for an impossible board."""
     described = board_from_document(board)
-    found = {}
+    corners = {}
     for number, path in enumerate(sorted((Path(files) / "images").iterdir())):
         report("detect", number / 64)
         grey = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
-        seen = None if grey is None else detect(grey.astype(np.uint8, copy=False), described)
-        if grey is None or seen is None:
-            found[path.stem] = []
+        detection = None if grey is None else detect(grey.astype(np.uint8, copy=False), described)
+        if grey is None or detection is None:
+            corners[path.stem] = []
         else:
-            found[path.stem] = (seen.corners / (grey.shape[1], grey.shape[0])).round(4).tolist()
-    return found
+            corners[path.stem] = (detection.corners / (grey.shape[1], grey.shape[0])).round(4).tolist()
+    return corners
 
 
 def covered(corners: Float[np.ndarray, "n 2"]) -> float:

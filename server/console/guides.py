@@ -38,8 +38,8 @@ def guide(rig: Rig, source: str, pixel: Float[np.ndarray, " 2"], target: str) ->
     ray = camera.rays_world(np.asarray(pixel, float)[None])[0]
     middle = float((rig.centre_world() - camera.centre_world) @ ray)
     depths = np.linspace(max(middle - REACH_MM, 50.0), middle + REACH_MM, SAMPLES)
-    seen = rig[target].project(camera.centre_world + depths[:, None] * ray)
-    return seen[_near_image(rig[target], seen)]
+    projected = rig[target].project(camera.centre_world + depths[:, None] * ray)
+    return projected[_near_image(rig[target], projected)]
 
 
 class Helps(TypedDict):
@@ -88,25 +88,25 @@ class Guides:
         """
         targets = self._rig.names if views is None else [name for name in self._rig.names if name in views]
         located = {name: self._of(name, views) for name, views in points.items()}
-        places = {name: found.position for name, found in located.items() if found.position is not None}
+        places = {name: landmark.position for name, landmark in located.items() if landmark.position is not None}
         self._curves = {key: curve for key, curve in self._curves.items() if key[:2] in _picks(points, shown)}
         return {
             "guides": {name: self._guides(points[name], targets) for name in shown if name in points},
-            "reprojected": {name: found.reprojected for name, found in located.items() if found.reprojected},
-            "off_px": {name: found.off_px for name, found in located.items() if found.off_px},
+            "reprojected": {name: landmark.reprojected for name, landmark in located.items() if landmark.reprojected},
+            "off_px": {name: landmark.off_px for name, landmark in located.items() if landmark.off_px},
             "predicted": self._predict(places, landmarks),
             "contradictions": {
-                n: found.contradiction.document() for n, found in located.items() if found.contradiction
+                n: landmark.contradiction.document() for n, landmark in located.items() if landmark.contradiction
             },
         }
 
     def _of(self, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) -> Located:
         key = tuple((camera, tuple(pixel)) for camera, pixel in views.items())
-        known, found = self._located.get(name, (None, None))
-        if found is None or known != key:
-            found = locate(self._rig, name, views)
-            self._located[name] = (key, found)
-        return found
+        known, located = self._located.get(name, (None, None))
+        if located is None or known != key:
+            located = locate(self._rig, name, views)
+            self._located[name] = (key, located)
+        return located
 
     def _guides(
         self, views: Mapping[str, Float[np.ndarray, " 2"]], targets: Collection[str]
@@ -125,7 +125,7 @@ class Guides:
     def _predict(
         self, places: Mapping[str, Float[np.ndarray, " 3"]], landmarks: Landmarks
     ) -> dict[str, dict[str, list[float]]]:
-        key = (len(landmarks), {name: tuple(place) for name, place in places.items()})
+        key = (len(landmarks), {name: tuple(position) for name, position in places.items()})
         if self._predicted[0] != key:
             self._predicted = (key, predicted(self._rig, places, landmarks))
         return self._predicted[1]
@@ -135,13 +135,13 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
     """Triangulates one point from the pixels picked in several views, and finds those that contradict the others, which
     a job would leave out."""
     try:
-        found = triangulate(views, rig, noise_px=CLICK_NOISE_PX)
+        landmark = triangulate(views, rig, noise_px=CLICK_NOISE_PX)
     except NoPoint:
         return Located(None, {}, {}, None)
     remarks = locate_features({name: views}, rig, noise_px=CLICK_NOISE_PX).remarks
-    off = {camera: round(float(np.linalg.norm(r)), 2) for camera, r in found.residuals_px.items()}
-    seen = _seen(rig, {name: found.position_world})[name]
-    return Located(found.position_world, seen, off, _together(remarks))
+    off = {camera: round(float(np.linalg.norm(r)), 2) for camera, r in landmark.residuals_px.items()}
+    projected = _seen(rig, {name: landmark.position_world})[name]
+    return Located(landmark.position_world, projected, off, _together(remarks))
 
 
 def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
@@ -188,13 +188,13 @@ def mean_landmarks(context: WorkerContext, report: Progress, *, model: str, name
 def _seen(rig: Rig, points: Mapping[str, Float[np.ndarray, " 3"]]) -> dict[str, dict[str, list[float]]]:
     """Where the cameras see each point; a camera outside whose picture it lies is left out."""
     places = np.array(list(points.values()))
-    found: dict[str, dict[str, list[float]]] = {name: {} for name in points}
+    clicks: dict[str, dict[str, list[float]]] = {name: {} for name in points}
     for camera in rig:
         pixels = camera.project(places)
         for name, near, pixel in zip(points, _near_image(camera, pixels), pixels.round(2).tolist(), strict=True):
             if near:
-                found[name][camera.name] = pixel
-    return found
+                clicks[name][camera.name] = pixel
+    return clicks
 
 
 def _near_image(camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> np.ndarray:

@@ -62,16 +62,16 @@ def _local_folder(service: Service, job_id: str) -> Path:
 def head_picture(service: Service, job_id: str, name: HeadPicture) -> Path:
     """Returns the file of a picture of a job's head, which the first call draws. Raises NotFound if the job or its head
     is gone, Conflict if the job has not succeeded, and InputError if the head cannot be read."""
-    kept = _local_folder(service, job_id).parent / name
-    if not kept.is_file():
+    stored = _local_folder(service, job_id).parent / name
+    if not stored.is_file():
         with _drawing:
-            if not kept.is_file():
+            if not stored.is_file():
                 try:  # the folder of a job that is erased meanwhile is not made anew: the face would stay
                     result = result_folder(service, job_id)
-                    write_image(kept, DRAWN[name](result), quality=QUALITY, parents=False)
+                    write_image(stored, DRAWN[name](result), quality=QUALITY, parents=False)
                 except FileNotFoundError as error:
                     raise NotFound(compose("thing-job"), job_id) from error
-    return kept
+    return stored
 
 
 def draw_first_view(service: Service, job_id: str) -> None:
@@ -129,8 +129,8 @@ def lit(mesh: Mesh) -> UInt8[np.ndarray, "v 3"]:
     light over pi."""
     normals = vertex_normals(mesh.vertices, mesh.faces)
     light: Float[np.ndarray, " v"] = np.full(len(normals), AMBIENT)
-    for *place, power in LIGHTS:
-        whence = np.array(place) / np.linalg.norm(place)
+    for *direction, power in LIGHTS:
+        whence = np.array(direction) / np.linalg.norm(direction)
         light += power * np.clip(normals @ whence, 0.0, None)
     colours = np.full((len(normals), 3), 255.0) if mesh.colours is None else mesh.colours.astype(float)
     return np.clip(colours * (light[:, None] / np.pi) ** (1.0 / GAMMA), 0.0, 255.0).astype(np.uint8)

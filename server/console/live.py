@@ -84,7 +84,7 @@ def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
         return {"name": name, "jpeg": None, "fault": compose("camera-shows-nothing").document()}
     small = reduced(picture, WIDTH)
     level = exposure(small)
-    found: LiveFrame = {
+    frame: LiveFrame = {
         "name": name,
         "mean": round(level.mean, 1),
         "clipped": round(level.clipped_share, 4),
@@ -92,8 +92,8 @@ def _frame(name: str, picture: ImageRgb | None, sharp: bool) -> LiveFrame:
     }
     if sharp:
         blur = blur_px(picture)
-        found["blur_px"] = None if blur is None else round(blur, 2)
-    return found
+        frame["blur_px"] = None if blur is None else round(blur, 2)
+    return frame
 
 
 class LiveView:
@@ -111,12 +111,12 @@ class LiveView:
     async def stream(self) -> AsyncIterator[bytes]:
         """Yields the pictures of all cameras as they are taken, each time as one message of ``look_bytes``. Starts the
         thread if needed."""
-        seen = 0
+        shown = 0
         while True:
             self._watch()
             number, message = self._latest
-            if number != seen and message:
-                seen = number
+            if number != shown and message:
+                shown = number
                 yield message
             await asyncio.sleep(LOOK_S)
 
@@ -149,17 +149,17 @@ class LiveView:
 
     def _look(self, source: Source, blur: dict[str, float | None]) -> bytes:
         try:
-            found, self.fault = source.frames(), None
+            frames, self.fault = source.frames(), None
         except Exception as error:  # the rig may come back
             problem = problem_from(error)
             log.warning("no live view", error=problem.detail.text)
-            found, self.fault = [], problem.detail
+            frames, self.fault = [], problem.detail
             time.sleep(1.0)
-        for frame in found:
+        for frame in frames:
             if "blur_px" in frame:
                 blur[frame["name"]] = frame["blur_px"]
             frame["blur_px"] = blur.get(frame["name"])
-        return look_bytes(found, self.fault)
+        return look_bytes(frames, self.fault)
 
 
 def look_bytes(frames: list[LiveFrame], fault: Message | None) -> bytes:

@@ -183,10 +183,10 @@ async def upload_calibration_pictures(who: Taker, request: Request) -> Response:
     """Receives an archive of board pictures or photographs and queues a calibration. Answers 202 with its id, or a
     problem document."""
     try:
-        made = await receive_calibration_pictures(who[0], request, who[1].key)
+        calibration = await receive_calibration_pictures(who[0], request, who[1].key)
     except Exception as error:
         return as_problem(error).response()
-    return JSONResponse({"id": made.id}, 202)
+    return JSONResponse({"id": calibration.id}, 202)
 
 
 @pages.get("/console/jobs/{job_id}/overlays/{name}")
@@ -225,12 +225,12 @@ def first_view(who: Reader, job_id: str) -> Response:
 def cameras(who: Reader, job_id: str) -> Response:
     """Returns the cameras of a job's capture as seen from the head. The list is empty if the capture was removed or the
     report has no pose of the head."""
-    service, found = who[0], []
+    service, views = who[0], []
     report = result_folder(who[0], job_id) / "report.json"
     with suppress(NotFound, FileNotFoundError, KeyError):
         capture, _ = _capture_files(service, job_id)
-        found = camera_views(rig_of(capture), json.loads(report.read_text()))
-    return JSONResponse(found, headers={"Cache-Control": "no-store"})
+        views = camera_views(rig_of(capture), json.loads(report.read_text()))
+    return JSONResponse(views, headers={"Cache-Control": "no-store"})
 
 
 @pages.get("/console/jobs/{job_id}/photographs/{camera}.jpg")
@@ -239,19 +239,21 @@ def photograph(who: Reader, job_id: str, camera: str) -> Response:
     service = who[0]
     capture, record = _capture_files(service, job_id)
     name = _image_name(record, camera)
-    kept = service.store.cache_of(record.id) / "straightened" / f"{Path(name).stem}.jpg"
-    if not kept.is_file():
+    stored = service.store.cache_of(record.id) / "straightened" / f"{Path(name).stem}.jpg"
+    if not stored.is_file():
         picture = straightened(read_image(capture / name), rig_of(capture)[camera])
-        write_image(kept, picture, quality=STRAIGHTENED_QUALITY)
-    return FileResponse(kept, headers=FOREVER)
+        write_image(stored, picture, quality=STRAIGHTENED_QUALITY)
+    return FileResponse(stored, headers=FOREVER)
 
 
 @pages.get("/console/jobs/{job_id}/faces")
 def faces_of_job(who: Reader, job_id: str) -> Response:
     """Returns the faces in the job's pictures, in pixels of the photographs without distortion, at full size."""
     capture, record = _capture_files(who[0], job_id)
-    rig, found = rig_of(capture), found_faces(who[0], record.id)["faces"]
-    straight = {name: [straightened_face(face, rig[name]) for face in seen] for name, seen in found.items()}
+    rig, faces_of = rig_of(capture), found_faces(who[0], record.id)["faces"]
+    straight = {
+        name: [straightened_face(face, rig[name]) for face in detections] for name, detections in faces_of.items()
+    }
     return JSONResponse(straight, headers=FOREVER)
 
 
@@ -347,8 +349,8 @@ def draw(context: WorkerContext, report: Progress, *, capture: str, cache: str, 
     from server.tasks.photographs import read_scaled_capture
 
     shot, rig = read_scaled_capture(Path(capture))
-    found = segment_once(Path(cache), shot, rig, report=report)
-    for name, silhouette in found.items():
+    silhouettes = segment_once(Path(cache), shot, rig, report=report)
+    for name, silhouette in silhouettes.items():
         done, data = cv2.imencode(".png", outline(silhouette.mask)[:, :, [2, 1, 0, 3]])
         assert done
         write_atomically(Path(target) / f"{name}.png", data.tobytes())
@@ -368,18 +370,18 @@ def outline(mask: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "y x 4"]:
 def camera_views(rig: Rig, report: Report) -> list[CameraView]:
     """Returns every camera of a capture as seen from the head. The head's pose is that of ``report``, its size the true
     one: x_world = R x_head + s t."""
-    place = report["world_from_head"]
-    shift = np.array(place["translation"]) * place["scale"]
-    world_from_head = RigidTransform(np.array(place["rotation"]), shift)
+    pose = report["world_from_head"]
+    shift = np.array(pose["translation"]) * pose["scale"]
+    world_from_head = RigidTransform(np.array(pose["rotation"]), shift)
     return [_view(camera, camera.camera_from_world @ world_from_head) for camera in rig]
 
 
 def rig_of(capture: Path) -> Rig:
     """Reads the rig from the files of a capture. Raises InputError if there is none or it cannot be read."""
-    found = find_rig_file(capture)
-    if found is None:
+    rig_file = find_rig_file(capture)
+    if rig_file is None:
         raise InputError("capture", [compose("no-cameras-json")])
-    return read_rig_file(found)
+    return read_rig_file(rig_file)
 
 
 def straightened(image: ImageRgb, camera: Camera) -> ImageRgb:

@@ -79,9 +79,9 @@ class Cache:
         with self._lock:
             key_lock = self._locks.setdefault(key, Lock())
         with key_lock:
-            made, took, value = self._values.get(key, (0.0, 0.0, None))
+            made_s, took, value = self._values.get(key, (0.0, 0.0, None))
             began = time.monotonic()
-            if began - made > max(age_s, min(KEEP_TIMES * took, KEEP_MOST_S)) or key not in self._values:
+            if began - made_s > max(age_s, min(KEEP_TIMES * took, KEEP_MOST_S)) or key not in self._values:
                 forgets = self._forgets
                 value = make()
                 if forgets == self._forgets:  # else something changed meanwhile, which the value may not show
@@ -101,7 +101,7 @@ class Cache:
         """What no page has asked for anew: reports of jobs, mostly."""
         with self._lock:
             before = time.monotonic() - KEEP_S
-            for key in [key for key, (made, _, _) in self._values.items() if made < before]:
+            for key in [key for key, (made_s, _, _) in self._values.items() if made_s < before]:
                 self._values.pop(key, None)
                 self._locks.pop(key, None)
 
@@ -195,9 +195,9 @@ class Page(Element):
 
     async def _refresh_followed(self) -> None:
         ids = tuple(self._followed)
-        found = await anyio.to_thread.run_sync(followed_jobs, self.service, ids, limiter=_threads)
-        self.frame.show(followed=found)
-        for job in found:
+        jobs = await anyio.to_thread.run_sync(followed_jobs, self.service, ids, limiter=_threads)
+        self.frame.show(followed=jobs)
+        for job in jobs:
             if job["state"] == "succeeded":  # the page goes there now
                 await anyio.to_thread.run_sync(draw_first_view, self.service, job["id"], limiter=_threads)
 

@@ -38,8 +38,8 @@ def portrait(result: Path) -> UInt8[np.ndarray, "h w 3"]:
 def placed(result: Path) -> RigidTransform:
     """Returns the rigid transform head_from_world of a result's report; the identity if the report has none."""
     try:
-        place = json.loads((result / "report.json").read_text())["world_from_head"]
+        pose = json.loads((result / "report.json").read_text())["world_from_head"]
     except (FileNotFoundError, KeyError):
         return RigidTransform(np.eye(3), np.zeros(3))
-    shift = np.array(place["translation"]) * place["scale"]
-    return RigidTransform(np.array(place["rotation"]), shift).inverse()
+    shift = np.array(pose["translation"]) * pose["scale"]
+    return RigidTransform(np.array(pose["rotation"]), shift).inverse()

@@ -42,13 +42,13 @@ def _draw() -> dict[str, tuple[Sensor, np.ndarray, np.ndarray]]:
     subject = drawn_subject(load_model(), rng)
     with Renderer.create() as renderer:
         scene: Scene = build_scene(subject, default_layout(), QUICK, rng, renderer=renderer)
-    found = {}
+    pictures = {}
     for name, view in scene.views.items():
         light = view_light(view)
         height = round(light.shape[0] * WIDTH / light.shape[1])
         small = cv2.resize(light, (WIDTH, height), interpolation=cv2.INTER_AREA)
-        found[name] = (view.sensor, light.astype(np.float16), small)  # 11 bits hold an 8-bit picture
-    return found
+        pictures[name] = (view.sensor, light.astype(np.float16), small)  # 11 bits hold an 8-bit picture
+    return pictures
 
 
 def _frame(
@@ -59,7 +59,7 @@ def _frame(
     level = exposure(picture)
     done, data = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     assert done
-    found: LiveFrame = {
+    frame: LiveFrame = {
         "name": name,
         "mean": round(level.mean, 1),
         "clipped": round(level.clipped_share, 4),
@@ -67,5 +67,5 @@ def _frame(
     }
     if sharp:
         blur = blur_px(expose(light.astype(np.float32), sensor, rng))
-        found["blur_px"] = None if blur is None else round(blur, 2)
-    return found
+        frame["blur_px"] = None if blur is None else round(blur, 2)
+    return frame

@@ -39,7 +39,9 @@ def preset_lines() -> list[PresetLine]:
 
 def template_lines() -> list[TemplateLine]:
     """Converts the templates whose model is at hand to entries of a form's list."""
-    return [{"name": found.name, "models": list(found.models)} for found in templates_at_hand() if found.models]
+    return [
+        {"name": template.name, "models": list(template.models)} for template in templates_at_hand() if template.models
+    ]
 
 
 def chosen_work(event: WorkForm) -> ReconstructionRequest:

@@ -17,7 +17,7 @@ from server.address import listen
 from server.processes import python_command, python_environment
 from server.services.keys import Keys, check_address
 from server.settings import ServiceSettings
-from server.storage.database import open_database
+from server.storage.database import check_pages, open_database
 
 if TYPE_CHECKING:
     import uvicorn
@@ -97,6 +97,7 @@ def run_service(settings: ServiceSettings, *, worker: bool = True, ready: Callab
         read_rig_config(settings.rig)
     sock = listen(settings.host, settings.port)
     engine = open_database(settings)
+    check_pages(engine, settings.place)
     check_address(settings, Keys(engine))
     engine.dispose()
     host = f"[{settings.host}]" if ":" in settings.host else settings.host

@@ -7,7 +7,6 @@ A scene has no board.toml, and may have scale.json. Its pictures may show a pers
 job has ended.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping
@@ -28,6 +27,7 @@ from server.services.records import Calibration
 from server.services.texts import check_texts
 from server.storage.events import EventLog
 from server.storage.folders import move_durably
+from server.storage.objects import sha256_of
 from server.storage.records import CALIBRATION, CalibrationOutcome, CalibrationRecord, EventDocument
 from server.storage.store import Store, StoredFile, new_id
 from server.tasks.calibrate import BOARD, check_scale, is_of_board
@@ -141,7 +141,7 @@ class Calibrations:
         """Returns a file in the result folder of a calibration, with its SHA-256. Raises NotFound, and Conflict if the
         calibration has not succeeded."""
         path = self.result(identity, name)
-        return StoredFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
+        return StoredFile(path, sha256_of(path))
 
     def remove(self, identity: str) -> None:
         """Removes a calibration, its pictures and its result. A rig that uses it keeps its own copy of cameras.json.
@@ -168,7 +168,7 @@ class Calibrations:
     def mark_in_use(self, identity: str) -> None:
         """Notes, in one atomic write, that the rig uses this calibration. Raises NotFound, and Conflict if the
         calibration has not succeeded."""
-        digest = hashlib.sha256(self.cameras_json(identity).read_bytes()).hexdigest()
+        digest = sha256_of(self.cameras_json(identity))
         write_atomically(self._store.data / "rig" / "in_use", digest.encode())
 
     def _row(self, identity: str) -> WorkflowStatus | None:

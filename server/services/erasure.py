@@ -50,7 +50,7 @@ def holdings(store: Store, jobs: Jobs, capture: str) -> Holdings:
 
 def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: Collection[str] = ()) -> None:
     """Cancels the jobs of the captures, and the jobs ``others``, then removes their results, pictures, caches and rows
-    of the job database.
+    of the job database, messages to webhooks and labels of batches included.
 
     A call that was interrupted is completed by a second one. Raises Unavailable if a worker still writes ``CANCEL_S``
     seconds after its job was cancelled.
@@ -64,6 +64,7 @@ def erase_captures(store: Store, jobs: Jobs, captures: Collection[str], others: 
         jobs.delete(job)
         if store.folder("jobs", job).exists():
             raise Unavailable("still-writing", compose("still-writing"))
+    jobs.forget_messages(of_captures)
     jobs.batches.forget_captures(captures)
     for capture in captures:
         store.remove_capture(capture)

@@ -1,10 +1,18 @@
-"""Describes how a job failed: the exception that the job engine stores, and the failure that clients get."""
+"""Describes how a job failed: the exception that the job engine stores, and the failure that clients get.
 
+The job engine keeps requests, results and errors as JSON (``SERIALIZER``). Rows of versions before 0.3 are pickled;
+reading them builds plain values and JobFailed only, so that a row runs no code whoever wrote it.
+"""
+
+import base64
+import io
+import pickle
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, cast
 
 import structlog
-from dbos import WorkflowStatus
+from dbos import DBOSPortableJSONSerializer, PortableWorkflowError, WorkflowStatus
+from dbos._serialization import DefaultSerializer
 
 from rig.errors import EigenheadError
 from rig.messages.message import Message, MessageDocument, compose, documents_of, read_message
@@ -13,27 +21,45 @@ from server.services.records import Failure
 
 Kept = str | MessageDocument  # texts are those of earlier versions
 
+SERIALIZER = DBOSPortableJSONSerializer()
+
 log = structlog.get_logger()
 
 
 class JobFailed(EigenheadError):
-    """Reports a job that cannot succeed, however often it is repeated. The job engine pickles it as the workflow's
-    error; the pickle holds plain values only, so that later versions can read it."""
+    """Reports a job that cannot succeed, however often it is repeated. The job engine stores ``data`` of it."""
 
     def __init__(self, kind: str, detail: Message | Kept, errors: Iterable[Message | Kept] = ()) -> None:
         super().__init__(_read(detail))
         self.kind, self.detail, self.errors = kind, self.message, tuple(map(_read, errors))
-        # What the engine pickles, and restores the error with; plain values outlast a change of our own classes.
-        self.args = (kind, self.detail.document(), tuple(documents_of(self.errors)))
+        self.data = {"kind": kind, "detail": self.detail.document(), "errors": documents_of(self.errors)}
 
     def __str__(self) -> str:
         return self.detail.text
 
-    def __reduce__(self) -> tuple[type["JobFailed"], tuple[Any, ...]]:
-        return JobFailed, self.args
-
     def __setstate__(self, state: object) -> None:
         """Earlier versions stored the attributes as well, as texts; the arguments say all of it."""
+
+
+class _PlainUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> type[JobFailed]:
+        if name == JobFailed.__name__:  # whatever the module was called then: nothing is imported
+            return JobFailed
+        raise pickle.UnpicklingError(f"{module}.{name}")
+
+
+def _read_pickled(cls: DefaultSerializer, serialized_data: str) -> Any:
+    return _PlainUnpickler(io.BytesIO(base64.b64decode(serialized_data))).load()
+
+
+DefaultSerializer.deserialize = _read_pickled
+
+
+def restored(error: Exception | None) -> JobFailed | None:
+    """Returns the JobFailed that the job engine kept as ``error``; None for any other error."""
+    if isinstance(error, PortableWorkflowError) and error.name == JobFailed.__name__ and isinstance(error.data, dict):
+        return JobFailed(**cast(dict[str, Any], error.data))
+    return error if isinstance(error, JobFailed) else None
 
 
 def _read(kept: Message | Kept) -> Message:
@@ -44,8 +70,8 @@ def failure(row: WorkflowStatus) -> Failure:
     """Returns why the job of a workflow's row failed. An error that is no JobFailed is logged and becomes
     "internal-error"; a job that took too many workers down becomes "worker-died"."""
     error = row.error
-    if isinstance(error, JobFailed):
-        return Failure(URN + error.kind, error.detail, error.errors)
+    if (failed := restored(error)) is not None:
+        return Failure(URN + failed.kind, failed.detail, failed.errors)
     if row.status == "MAX_RECOVERY_ATTEMPTS_EXCEEDED":
         return Failure(URN + "worker-died", compose("worker-died"))
     log.error("job failed in an unforeseen way", job=row.workflow_id, error=str(error))

@@ -18,6 +18,7 @@ from server.metrics import QueueFigures, StoreFigures
 from server.services.service import Check, Service
 from server.storage.database import alive_workers, slots_by_queue
 from server.storage.failure_counts import failure_counts
+from server.storage.folders import STOPPED
 from server.storage.job_index import Queued
 from server.storage.records import JsonObject
 from server.tasks.child import WorkFailed
@@ -39,6 +40,7 @@ def readiness(service: Service) -> dict[str, Check]:
         "egl": _egl(service),
         "rig": _rig(service),
         "records": _records(service),
+        "retention": _retention(service),
         "store": _store(service),
         "results": service.known.get("results") or Check(ok=True, detail=compose("not-examined")),
     }
@@ -113,6 +115,13 @@ def _records(service: Service) -> Check:
     names = service.store.list_quarantined()
     detail = compose("records-damaged", count=len(names), names=names[:5]) if names else compose("no-record-damaged")
     return Check(ok=True, detail=detail)
+
+
+def _retention(service: Service) -> Check:
+    try:
+        return Check(ok=True, detail=verbatim((service.settings.data / STOPPED).read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        return Check(ok=True, detail=compose("clock-trusted"))
 
 
 def check_store(service: Service) -> None:

@@ -20,10 +20,11 @@ from server.errors import Conflict, NotFound, TooMany
 from server.log import log_file
 from server.origins import target
 from server.services.deliveries import Deliveries, delivery_of, destination
+from server.services.failures import SERIALIZER, failure
 from server.services.failures import JobFailed as JobFailed  # earlier versions pickled it as one of this module
-from server.services.failures import failure
 from server.services.job_rows import (
     APPLICATION,
+    DELIVERY,
     FINISHED,
     STATES,
     STATUSES,
@@ -35,6 +36,7 @@ from server.services.job_rows import (
 )
 from server.services.records import Delivery, Found, Job
 from server.services.results import Results
+from server.services.webhooks import messages_of
 from server.services.work import ReconstructionRequest, refuse_board
 from server.settings import ServiceSettings
 from server.storage.batches import BatchIndex, BatchRow
@@ -62,7 +64,10 @@ class Jobs:
         self._settings, self._store, self._engine, self._library = settings, store, engine, library
         self.events, self.index, self.batches = EventLog(engine), JobIndex(engine, WORKFLOW), BatchIndex(engine)
         self.client = DBOSClient(
-            system_database_url=settings.url, application_name=APPLICATION, retry_connection_errors=False
+            system_database_url=settings.url,
+            application_name=APPLICATION,
+            retry_connection_errors=False,
+            serializer=SERIALIZER,
         )
         self.deliveries, self.results = Deliveries(self.client), Results(store, settings)
         self.index.complete(self._requests)
@@ -173,12 +178,7 @@ class Jobs:
         return STATES[self._known(job_id, load=False).status]
 
     def find(
-        self,
-        *,
-        state: str | None = None,
-        capture: str | None = None,
-        session: str | None = None,
-        limit: int = 100,
+        self, *, state: str | None = None, capture: str | None = None, session: str | None = None, limit: int = 100
     ) -> list[Job]:
         """Returns jobs, newest first, ``limit`` at most. They can be restricted to one state, capture or session."""
         ids = None if capture is None and session is None else self.index.ids_of(capture, session)
@@ -258,6 +258,12 @@ class Jobs:
         done = self.index.newest_first(STATUSES["succeeded"])
         return [job_id for job_id in done if job_id not in there or not self._result(job_id).is_dir()]
 
+    def orphans(self) -> list[str]:
+        """Lists folders of results that no job of the database has made: the database is another one, or was lost."""
+        there = [job_id for job_id in self._store.ids("jobs") if self._result(job_id).is_dir()]
+        known = {job_id for at in range(0, len(there), 500) for job_id in self.index.known(there[at : at + 500])}
+        return [job_id for job_id in there if job_id not in known]
+
     def _result(self, job_id: str) -> Path:
         return self._store.folder("jobs", job_id) / "result"
 
@@ -310,6 +316,13 @@ class Jobs:
         self.events.remove([job_id])
         self.client.delete_workflow(job_id)
         self.index.remove(job_id)
+
+    def forget_messages(self, jobs: Collection[str]) -> None:
+        """Removes messages to webhooks about jobs, with addresses and secrets, whether they were delivered or not."""
+        for job_id in jobs:
+            query = {"name": DELIVERY, "workflow_id_prefix": messages_of(job_id), "load_output": False}
+            if rows := self.client.list_workflows(**query, load_input=False):
+                self.client.delete_workflows([row.workflow_id for row in rows])
 
     def _requests(self, jobs: list[str]) -> dict[str, JobRequest]:
         rows = self.client.list_workflows(workflow_ids=jobs, name=WORKFLOW, load_output=False)

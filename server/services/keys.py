@@ -22,17 +22,21 @@ from server.storage.database import api_keys, now_sql
 
 SCOPES = ("read", "capture", "submit", "erase", "admin")  # admin holds all the others
 LOCAL = "local"
+HAS_KEYS = "has-keys"
 
 
 class KeylessAddress(EigenheadError):
     """Reports that the service refuses to listen to the network without an API key."""
 
     def __init__(self, where: str, data: Path) -> None:
-        super().__init__(
-            f"refusing to listen on {where} without an API key: anybody there could fetch faces. "
-            f"Make one with `eigenhead keys add NAME --data {shlex.quote(str(data))}`, or listen on 127.0.0.1 without "
-            "a public URL"
-        )
+        super().__init__(compose("keyless-address", where=where, data=shlex.quote(str(data))))
+
+
+class KeysLost(EigenheadError):
+    """Reports a database without API keys beside a data folder whose service had some."""
+
+    def __init__(self, data: Path, place: str) -> None:
+        super().__init__(compose("keys-lost", data=shlex.quote(str(data)), place=place))
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,9 +118,23 @@ class Keys:
 
 
 def check_address(settings: ServiceSettings, keys: Keys) -> None:
-    """Raises KeylessAddress if the settings have the service listen to other machines and there is no API key."""
-    if not settings.is_private and not keys.any():
+    """Raises KeylessAddress if the settings have the service listen to other machines and there is no API key, and
+    KeysLost if there is none any more though nobody removed it."""
+    if keys.any():
+        note_keys(settings.data, keys)
+    elif not settings.is_private:
         raise KeylessAddress(settings.public_url or settings.host, settings.data)
+    elif (settings.data / HAS_KEYS).exists():
+        raise KeysLost(settings.data, settings.place)
+
+
+def note_keys(data: Path, keys: Keys) -> None:
+    """Notes in the data folder whether its service has API keys, so that a lost database does not open it to all."""
+    if not keys.any():
+        (data / HAS_KEYS).unlink(missing_ok=True)
+    elif not (data / HAS_KEYS).exists():
+        data.mkdir(parents=True, exist_ok=True)
+        (data / HAS_KEYS).touch()
 
 
 def _digest(secret: str) -> str:

@@ -21,7 +21,7 @@ from server.errors import Conflict, Refused
 from server.services.unclaimed import COLLECT_S, DAY_S, collect
 from server.settings import ServiceSettings
 from server.storage.object_places import open_objects
-from server.storage.objects import ObjectMissing, StoreDenied, StoreUnavailable
+from server.storage.objects import ObjectMissing, StoreDenied, StoreUnavailable, sha256_of
 from server.storage.records import FileEntry
 from server.storage.store import Store, StoredFile
 from server.storage.watched_objects import StoreTally, WatchedObjects
@@ -50,6 +50,7 @@ class Results:
         self._store, self._spare = store, settings.free_bytes
         self._objects = None if place is None else WatchedObjects(open_objects(place, settings))
         self._collected = float("-inf")
+        self.damaged = set[str]()
 
     @property
     def elsewhere(self) -> bool:
@@ -101,6 +102,16 @@ class Results:
             if self._objects is not None:
                 self._fetch(job_id, name, entry, path)
         return StoredFile(path, entry["sha256"])
+
+    def compare(self, job_id: str, files: Mapping[str, FileEntry]) -> None:
+        """Reads a job's files anew and notes those in ``damaged`` whose content is not what the job made."""
+        for name, entry in files.items():
+            path, said = self._path(job_id, name), f"{job_id}/{name}"
+            self.damaged.discard(said)
+            if path.is_file() and sha256_of(path) != entry["sha256"]:
+                os.utime(path)  # whoever sends it reads it again
+                log.error("a result is damaged", job_id=job_id, file=name)
+                self.damaged.add(said)
 
     def link(self, job_id: str, name: str) -> str | None:
         """Returns a signed address of a file of a result, for ``LINK_S`` seconds; None where the store has no such

@@ -1,9 +1,13 @@
 """Retention: removes old jobs, captures and caches by age, by count and by free space.
 
-It never touches what a queued or running job needs, nor files that the service did not make itself.
+It never touches what a queued or running job needs, nor files that the service did not make itself. It trusts the clock
+only as far as the last sweep and the machine's uptime bear it out: where the clock seems to have jumped, nothing is
+removed until somebody has looked (``STOPPED``).
 """
 
+import json
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -11,6 +15,7 @@ from pathlib import Path
 
 import structlog
 
+from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 from server.errors import NotFound
@@ -19,12 +24,14 @@ from server.services.job_rows import DELIVERY, FINISHED, STATUSES
 from server.services.service import Check, Service
 from server.services.stored_captures import collect_unclaimed, tend_captures
 from server.storage.database import database_identity
-from server.storage.folders import folder_bytes, newest
+from server.storage.folders import LAST_SWEEP, STOPPED, folder_bytes, newest
 from server.storage.job_index import JobQuery
 from server.storage.library import CaptureQuery
 
 LEFTOVER_S = 900.0  # a live upload or extraction touches its folder more often than that
 DAY_S = 86400.0
+BOOT = Path("/proc/sys/kernel/random/boot_id")
+MANY = 20  # records: fewer may all be of one day, and due on one
 ENDED = tuple(status for state in FINISHED for status in STATUSES[state])
 
 log = structlog.get_logger()
@@ -43,7 +50,9 @@ def clear_caches(service: Service) -> int:
 
 def sweep(service: Service) -> dict[str, int]:
     """Removes everything that the settings no longer keep, and what crashes left behind. Returns how many things of
-    each kind were removed. Results that are missing are noted for ``readiness``."""
+    each kind were removed: none while the clock is in doubt. Results that are missing are noted for ``readiness``."""
+    if not _trusts_clock(service):
+        return {}
     gone = {"leftovers": service.store.sweep(LEFTOVER_S), "uploads": service.uploads.sweep()}
     gone["jobs"] = _jobs(service)
     gone["captures"] = _captures(service)
@@ -60,6 +69,41 @@ def sweep(service: Service) -> dict[str, int]:
     if any(gone.values()):
         log.info("swept", **gone)
     return gone
+
+
+def _trusts_clock(service: Service) -> bool:
+    """Compares the clock with the last sweep's. Since then it may have gone a day further than the machine ran; after a
+    restart of the machine it may have gone further than anything is kept, unless half of all records, and ``MANY`` at
+    least, would go at once. Else ``STOPPED`` is written, and holds until somebody removes it."""
+    stopped, path = service.settings.data / STOPPED, service.settings.data / LAST_SWEEP
+    now, up, boot = time.time(), time.clock_gettime(time.CLOCK_BOOTTIME), BOOT.read_text().strip()
+    with suppress(FileNotFoundError, ValueError, KeyError, TypeError):
+        last = json.loads(path.read_bytes())
+        passed = now - last["at"]
+        if last["boot"] == boot:
+            doubt = passed - (up - last["up"]) > DAY_S
+        else:
+            doubt = passed > 0 and _removes_half(service, passed)
+        if doubt:
+            why = compose("retention-stopped", days=passed / DAY_S, file=str(stopped)).text
+            write_atomically(stopped, why.encode())
+            log.error("nothing is removed", reason=why)
+        elif last["boot"] != boot and passed < 0:  # a machine whose clock is not set yet
+            return not stopped.exists()
+    write_atomically(path, json.dumps({"at": now, "up": up, "boot": boot}).encode())
+    return not stopped.exists()
+
+
+def _removes_half(service: Service, passed_s: float) -> bool:
+    s = service.settings
+    ages: list[tuple[float | None, Iterable[str | None]]]
+    ages = [(s.keep_captures_days, (record.created for record in service.store.captures()))]
+    if s.keep_results_days is not None:
+        finished = (job for state in FINISHED for job in service.jobs.find(state=state, limit=100_000))
+        ages.append((s.keep_results_days, (job.finished or job.created for job in finished)))
+    kept = [(days, [*made]) for days, made in ages if days is not None and passed_s > days * DAY_S]
+    due = sum(_age_s(moment) > days * DAY_S for days, made in kept for moment in made)
+    return due >= MANY and 2 * due > sum(len(made) for _, made in kept)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,11 +254,22 @@ def _deliveries(service: Service) -> int:
 
 
 def _find_missing(service: Service) -> None:
-    """What readiness says of results that somebody else removed, or that a backup lacks."""
-    missing = service.jobs.without_result()
-    detail = (
-        compose("results-missing", count=len(missing), jobs=missing[:3]) if missing else compose("results-complete")
-    )
+    """What readiness says of results that somebody else removed or changed, or that a backup lacks. One job's files are
+    compared at each sweep, in turn."""
+    missing, done = service.jobs.without_result(), service.jobs.index.newest_first(STATUSES["succeeded"])
+    damaged = service.jobs.results.damaged
+    if done:
+        job_id = done[int(time.time() / service.settings.sweep_s) % len(done)]
+        with suppress(EigenheadError):  # removed, or missing
+            service.jobs.results.compare(job_id, service.jobs.files(job_id))
+    damaged.intersection_update({name for name in damaged if name.partition("/")[0] in done})
+    detail, orphans = compose("results-complete"), service.jobs.orphans()
+    if orphans:
+        detail = compose("results-orphaned", count=len(orphans), jobs=orphans[:3])
+    elif missing:
+        detail = compose("results-missing", count=len(missing), jobs=missing[:3])
+    elif damaged:
+        detail = compose("file-damaged", files=sorted(damaged)[:3])
     service.known["results"] = Check(ok=True, detail=detail)
 
 

@@ -81,7 +81,7 @@ class Threads:
                 raise Conflict("client-gone", compose("client-gone")) from None
             raise InvalidInput("check-too-long", compose("check-too-long", seconds=self._check_s)) from None
         except WorkFailed as failure:
-            if failure.kind not in ("out-of-memory", "crash"):  # native code may die where memory is refused
+            if failure.kind not in ("out-of-memory", "killed", "crash"):  # native code may die where memory is refused
                 raise
             raise InvalidInput("check-out-of-memory", compose("check-out-of-memory")) from failure
 

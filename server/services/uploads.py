@@ -5,11 +5,12 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 
 from rig.atomic_write import write_atomically
 from rig.messages.message import compose
-from server.errors import Conflict, NotFound, Refused, TooLarge
+from server.errors import Conflict, NotFound, TooLarge, TooMany
 from server.settings import ServiceSettings
 from server.storage.records import UPLOAD, UploadRecord
 from server.storage.store import Store, is_id, new_id
@@ -29,11 +30,15 @@ class ResumableUploads:
 
     def create(self, length: int, fields: dict[str, str], key: str) -> UploadRecord:
         """Makes an upload of ``length`` bytes and returns its record. ``fields`` describe the future capture, ``key``
-        is the id of the caller's API key. Raises TooLarge, and DiskFull if the disk cannot take it beside other
-        unfinished uploads."""
+        is the id of the caller's API key. Raises TooLarge, TooMany if the key has as many unfinished uploads as it may,
+        and DiskFull if the disk cannot take it beside other unfinished uploads."""
         if length > self._settings.body_bytes:
             raise too_large(self._settings)
-        self._store.reserve(2 * length + self._promised(), self._settings.free_bytes)
+        unfinished = [*self._unfinished()]
+        if (count := sum(record.key == key for record in unfinished)) >= self._settings.uploads_per_key:
+            raise TooMany("too-many-uploads", compose("too-many-uploads", count=count), retry_after_s=60)
+        promised = sum(record.length - self.offset(record) for record in unfinished)
+        self._store.reserve(2 * length + promised, self._settings.free_bytes)
         identity = new_id()
         folder = self._store.folder("uploads", identity)
         folder.mkdir(parents=True)
@@ -49,7 +54,7 @@ class ResumableUploads:
             raise NotFound(compose("thing-upload"), identity)
         with suppress(OSError, ValueError):
             path = self._store.folder("uploads", identity) / "upload.json"
-            record = UPLOAD.read(json.loads(path.read_bytes()))
+            record = _read(path, path.stat().st_mtime_ns)
             if record.expires > time.time():
                 return record
         raise NotFound(compose("thing-upload"), identity)
@@ -104,11 +109,15 @@ class ResumableUploads:
                     removed += 1
         return removed
 
-    def _promised(self) -> int:
-        """Bytes that unfinished uploads may still bring."""
-        total = 0
+    def _unfinished(self) -> Iterator[UploadRecord]:
         for identity in self._store.ids("uploads"):
-            with suppress(Refused, OSError):
+            with suppress(NotFound):
                 record = self.get(identity)
-                total += 0 if record.capture else record.length - self.offset(record)
-        return total
+                if record.capture is None and self.data(record).exists():
+                    yield record
+
+
+@lru_cache(maxsize=1 << 14)
+def _read(path: Path, _: int) -> UploadRecord:
+    """Reads a record once for each time (ns) at which it was written."""
+    return UPLOAD.read(json.loads(path.read_bytes()))

@@ -77,13 +77,8 @@ class Webhooks:
         ``enqueue`` is the job engine's function. ``delivered_to``: where the result lies, if it was
         delivered."""
         for hook_id in [*(hook.id for hook in self.all()), *([] if job_webhook is None else [OWN])]:
-            identity = f"hook-{hook_id}-{job_id}-{state}"
-            message: WebhookMessage = {
-                "webhook": hook_id,
-                "type": f"job.{state}",
-                "job_id": job_id,
-                "id": identity,
-            }
+            identity = f"{messages_of(job_id)}{hook_id}-{state}"
+            message: WebhookMessage = {"webhook": hook_id, "type": f"job.{state}", "job_id": job_id, "id": identity}
             if delivered_to is not None:
                 message["delivered_to"] = delivered_to
             if job_webhook is not None and hook_id == OWN:
@@ -141,6 +136,11 @@ class Webhooks:
                 .raise_for_status()
                 .status_code
             )
+
+
+def messages_of(job_id: str) -> str:
+    """Returns what the ids of all messages about a job begin with."""
+    return f"hook-{job_id}-"
 
 
 def _delivery(identity: str) -> EnqueueOptions:

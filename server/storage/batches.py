@@ -238,13 +238,18 @@ class BatchIndex:
         return len(failed)
 
     def forget_captures(self, captures: Collection[str]) -> None:
-        """Removes the ids of erased captures, and of their jobs, from the items of all batches."""
-        listed = list(captures)
+        """Removes the ids of erased captures, and of their jobs, from the items of all batches, and the label and the
+        place of batches that have no other captures: they may name the subject."""
+        listed, item = list(captures), batch_items.c
         with self._engine.begin() as connection:
             for start in range(0, len(listed), AT_ONCE):
-                those = batch_items.c.capture_id.in_(listed[start : start + AT_ONCE])
+                those = item.capture_id.in_(listed[start : start + AT_ONCE])
+                affected = [*connection.scalars(sa.select(item.batch_id).where(those).distinct())]
                 change = sa.update(batch_items).where(those)
                 connection.execute(change.values(capture_id=None, job_id=NONE, recalled=False))
+                others = sa.exists().where(item.batch_id == batches.c.id, item.capture_id.is_not(None))
+                change = sa.update(batches).where(batches.c.id.in_(affected), ~others)
+                connection.execute(change.values(label="", words="", deliver_to=None))
 
     def remove(self, identity: str) -> None:
         """Removes a batch and its items in one transaction. Jobs stay."""

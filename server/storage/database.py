@@ -6,6 +6,7 @@ agree on which worker is silent.
 
 import os
 import secrets
+import sqlite3
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -17,9 +18,11 @@ from sqlalchemy.exc import IntegrityError, InterfaceError, InternalError, Operat
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from rig.errors import EigenheadError
+from rig.messages.message import compose
 from server.settings import ServiceSettings
 
 CONNECT_S = 10  # a database that does not even refuse
+ENGINE_TABLES = ("workflow_status", "workflow_input", "workflow_output", "operation_outputs")
 SCRUB_TRIES, SCRUB_PAUSE_S = 20, 0.05
 AWAY = (OperationalError, InterfaceError, InternalError, PoolTimeout)
 """What is raised where the database does not answer. InternalError: PostgreSQL ended a transaction that was silent for
@@ -31,11 +34,10 @@ metadata = sa.MetaData()
 class DatabaseUnavailable(EigenheadError):
     """Reports that the database does not answer, or is damaged."""
 
-    def __init__(self, place: str, error: SQLAlchemyError) -> None:
+    def __init__(self, place: str, error: Exception) -> None:
         why = str(getattr(error, "orig", None) or error).strip().splitlines()[0]
-        super().__init__(
-            f"the job database at {place} cannot be used ({why}): start it, or mend EIGENHEAD_DATABASE_URL"
-        )
+        code = "database-away" if "://" in place else "database-damaged"  # without: SQLite in the data folder
+        super().__init__(compose(code, place=place, why=why))
 
 
 events = sa.Table(
@@ -193,6 +195,13 @@ identities = sa.Table(  # one row: what a store of results knows the database by
 )
 
 
+@event.listens_for(sa.Engine, "connect")
+def _delete_securely(connection: Any, record: Any) -> None:
+    """What is erased stands in no free page of SQLite: rows of the job engine, which connects by itself, included."""
+    if isinstance(connection, sqlite3.Connection):
+        connection.execute("PRAGMA secure_delete=ON")
+
+
 def open_database(settings: ServiceSettings) -> sa.Engine:
     """Opens the service's database, creates missing tables and columns, and returns the engine. Raises
     DatabaseUnavailable."""
@@ -210,7 +219,6 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
             connection.isolation_level = "IMMEDIATE"  # a writer that starts as a reader could not wait for its turn
             connection.execute("PRAGMA busy_timeout=30000")
             connection.execute("PRAGMA journal_mode=WAL")  # kept in the file: the job engine's connections read it too
-            connection.execute("PRAGMA secure_delete=ON")  # names of people who were erased stand in no free page
             connection.execute("PRAGMA synchronous=FULL")  # WAL's default loses the last commits with the power
     else:
         patience = {"connect_timeout": CONNECT_S}
@@ -218,9 +226,21 @@ def open_database(settings: ServiceSettings) -> sa.Engine:
     try:
         metadata.create_all(engine)
         _add_columns(engine)
-    except SQLAlchemyError as error:
+    except (SQLAlchemyError, sqlite3.Error) as error:
         raise DatabaseUnavailable(settings.place, error) from error
     return engine
+
+
+def check_pages(engine: sa.Engine, place: str) -> None:
+    """Raises DatabaseUnavailable for an SQLite file whose pages are damaged, the job engine's tables included."""
+    if engine.dialect.name == "sqlite":
+        try:
+            with engine.connect() as connection:
+                said = connection.scalar(sa.text("PRAGMA quick_check(1)"))
+        except SQLAlchemyError as error:
+            raise DatabaseUnavailable(place, error) from error
+        if said != "ok":
+            raise DatabaseUnavailable(place, ValueError(said))
 
 
 def _add_columns(engine: sa.Engine) -> None:
@@ -244,7 +264,8 @@ def scrub(engine: sa.Engine) -> None:
     """Overwrites what deleted rows left in the database's files, names of people included. Pages that another
     connection is reading stay until the next call."""
     if engine.dialect.name != "sqlite":
-        tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index))
+        tables = ", ".join(table.name for table in (capture_index, capture_tags, session_index, job_index, batches))
+        tables += "".join(f", dbos.{name}" for name in ENGINE_TABLES)
         with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.execute(sa.text(f"VACUUM {tables}"))
         return

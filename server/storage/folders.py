@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 
+LAST_SWEEP, STOPPED = "last-sweep.json", "retention-stopped.txt"  # in the data folder: see server.services.retention
+
 
 def move_durably(folder: Path, target: Path) -> None:
     """Renames a folder whose files have reached the disk, and makes the rename itself durable. Raises OSError if

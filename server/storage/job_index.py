@@ -192,10 +192,11 @@ class JobIndex:
 
 
 def engine_jobs(engine: sa.Engine) -> sa.TableClause:
-    """Returns the job engine's table of workflows, with those of its columns that are read here."""
+    """Returns the job engine's table of workflows, with those of its columns that are used here."""
     text, number = sa.Text(), sa.BigInteger()
-    names = {"workflow_uuid": text, "status": text, "name": text, "queue_name": text}
+    names = {"workflow_uuid": text, "status": text, "name": text, "queue_name": text, "executor_id": text}
     names |= {"created_at": number, "started_at_epoch_ms": number, "completed_at": number, "priority": number}
+    names |= {"updated_at": number, "owner_xid": text}
     columns = [sa.column(name, kind) for name, kind in names.items()]
     return sa.table("workflow_status", *columns, schema=None if engine.dialect.name == "sqlite" else "dbos")
 

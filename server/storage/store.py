@@ -9,6 +9,8 @@
     <data>/incoming/<id>/                                what is being received; swept after a crash
     <data>/trash/                                        what is being deleted
     <data>/set-aside/                                    damaged records, moved here and reported
+    <data>/last-sweep.json  retention-stopped.txt         what retention knows of the clock
+    <data>/has-keys                                      see server.services.keys
 
 A folder appears under its final name in one rename, after everything in it reached the disk. What is in the data folder
 and is not named above was put there by somebody else: it is never read and never deleted.
@@ -25,6 +27,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -36,6 +39,7 @@ from rig.messages.message import Message, compose
 from server.errors import DiskFull, NotFound
 from server.storage.capture_blobs import CaptureBlobs
 from server.storage.folders import move_durably, newest, sync_folder
+from server.storage.objects import sha256_of
 from server.storage.records import (
     CALIBRATION,
     CAPTURE,
@@ -75,6 +79,16 @@ class StoredFile:
 
     path: Path
     sha256: str
+
+    def is_intact(self) -> bool:
+        """Tells whether the file has this content. It is read once, and again when its time, size or inode changes."""
+        said = self.path.stat()
+        return _digest(self.path, said.st_mtime_ns, said.st_size, said.st_ino) == self.sha256
+
+
+@lru_cache(maxsize=1 << 16)
+def _digest(path: Path, *_: int) -> str:
+    return sha256_of(path)
 
 
 class RecordIndex(Protocol):
@@ -281,10 +295,20 @@ class Store:
         with self._change(compose("thing-capture"), identity):
             self.remove(self.folder("captures", identity))
             self.remove(self.cache_of(identity))
+            for path in (self.data / "set-aside").glob(f"captures-{identity}-*"):
+                self.remove(path)
+            for upload in self.ids("uploads"):  # its record names label and session for two days
+                if identity in self._upload_text(upload):
+                    self.remove(self.folder("uploads", upload))
             if self._index is not None:
                 self._index.drop_capture(identity)
         if self.blobs is not None:  # it may have been stored again since
             self.blobs.release(identity, later=later)
+
+    def _upload_text(self, identity: str) -> str:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            return (self.folder("uploads", identity) / "upload.json").read_text(encoding="utf-8")
+        return ""
 
     def cache_of(self, identity: str) -> Path:
         """Returns the folder in which silhouettes, thumbnails and the like of a capture are cached."""

@@ -48,7 +48,7 @@ Report = Progress  # as the task of a reconstruction calls it
 
 class WorkFailed(EigenheadError):
     """Reports that work in a child process failed. ``kind`` is the name of an error class of this project, or
-    "disk-full", "out-of-memory", "crash" or "bug". A bug has a ``trace`` for the log."""
+    "disk-full", "out-of-memory", "killed" (by signal 9), "crash" or "bug". A bug has a ``trace`` for the log."""
 
     def __init__(
         self, kind: str, message: Message | str, faults: Iterable[Message | str] = (), trace: str = ""
@@ -102,7 +102,7 @@ class Child:
         report, name=value)`` there. ``work`` must be a module's function, since only its name is sent.
 
         The returned function raises Cancelled within a second after ``cancelled()`` returned True; InputError or
-        WorkFailed if ``work`` raised; and WorkFailed of the kind "crash" if the child died.
+        WorkFailed if ``work`` raised; and WorkFailed of the kind "killed" or "crash" if the child died.
         """
 
         def call(*arguments: P.args, **named: P.kwargs) -> T:
@@ -118,7 +118,8 @@ class Child:
         except (EOFError, OSError) as error:
             code = self._kill()
             how = compose("ended-by-signal", number=-code) if code < 0 else compose("ended-with-status", status=code)
-            raise WorkFailed("crash", compose("work-crashed", how=how)) from error
+            kind = "killed" if code == -signal.SIGKILL else "crash"
+            raise WorkFailed(kind, compose("work-crashed", how=how)) from error
         except BaseException:
             if self._connection is not None and not self._idle:
                 self._kill()

@@ -5,10 +5,11 @@ import io
 import mimetypes
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import structlog
 from fastapi import Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 
@@ -29,17 +30,20 @@ TYPES = {
 BLOCK_BYTES = 1 << 20
 RANGE = re.compile(r"^bytes=(\d{1,18})?-(\d{1,18})?$")
 
+log = structlog.get_logger()
+
 
 def send_file(request: Request, file: StoredFile) -> Response:
     """Returns the response that carries a file: status 200, 206 for one byte range, or 304 if the client has it
     already.
 
-    Raises a 416 problem for a range beyond the file, and 404 if the file is missing. Other forms of the Range header
-    are ignored, as RFC 9110 allows.
+    Raises a 416 problem for a range beyond the file, 404 if the file is missing, and 500 if its content is not what was
+    stored. Other forms of the Range header are ignored, as RFC 9110 allows.
     """
     path, etag = file.path, f'"{file.sha256}"'
     if not path.is_file():
         raise Problem(404, "not-found", compose("file-gone"))
+    _refuse_damaged([file])
     headers = {"ETag": etag, "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
     if _is_at_client(request, etag):
         return Response(status_code=304, headers=headers)
@@ -53,8 +57,10 @@ def send_archive(
     """Returns the response that carries the named files below ``folder`` as one uncompressed .zip, or 304 if the client
     has it already. The .zip holds no times, so that equal files give equal bytes.
 
-    ``name`` is the file name that a browser suggests. With None the page's link decides.
+    ``name`` is the file name that a browser suggests. With None the page's link decides. Raises a 500 problem that
+    names every file whose content is not what was stored.
     """
+    _refuse_damaged([StoredFile(folder / name, file["sha256"]) for name, file in files.items()])
     digest = hashlib.sha256("\n".join(f"{name} {file['sha256']}" for name, file in files.items()).encode()).hexdigest()
     headers = {"ETag": f'"{digest}"', "Cache-Control": "private, no-cache", "X-Content-Type-Options": "nosniff"}
     headers["Content-Disposition"] = "attachment" if name is None else f'attachment; filename="{name}"'
@@ -62,6 +68,13 @@ def send_archive(
         return Response(status_code=304, headers=headers)
     blocks = () if request.method == "HEAD" else _zipped(folder, list(files))
     return StreamingResponse(blocks, headers=headers, media_type="application/zip")  # its length is not known yet
+
+
+def _refuse_damaged(files: Sequence[StoredFile]) -> None:
+    damaged = [file.path.name for file in files if not file.is_intact()]
+    if damaged:
+        log.error("files are damaged", files=[str(file.path) for file in files if file.path.name in damaged])
+        raise Problem(500, "file-damaged", compose("file-damaged", files=damaged))
 
 
 def _is_at_client(request: Request, etag: str) -> bool:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Literal, cast
 
 import structlog
-from dbos import DBOS
+from dbos import DBOS, PortableWorkflowError
 
 from rig.messages.message import compose
 from server.errors import Refused
 from server.services.deliveries import DELIVER, MANIFEST, MANIFEST_FORMAT, delivery_id, place_of
-from server.services.failures import JobFailed
+from server.services.failures import JobFailed, restored
 from server.services.job_rows import request_of
 from server.services.results import Results
 from server.services.webhooks import Webhooks
@@ -53,10 +53,12 @@ class Deliverer:
                 try:
                     if send(wanted):
                         deliverer.announce(wanted, "delivered")
-                except JobFailed as error:
-                    log.warning("delivery failed", kind=error.kind, detail=error.detail.text)
+                except (JobFailed, PortableWorkflowError) as error:
+                    if (failed := restored(error)) is None:
+                        raise
+                    log.warning("delivery failed", kind=failed.kind, detail=failed.detail.text)
                     deliverer.announce(wanted, "undelivered")
-                    raise
+                    raise failed from error
 
         del deliver_result  # known to the engine by name
 

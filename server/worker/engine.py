@@ -1,17 +1,22 @@
-"""Configures the job engine (DBOS) for the worker, and takes jobs of dead workers back.
+"""Configures the job engine (DBOS) for the worker, decides which workers are dead, and takes their jobs back.
 
-DBOS's public resume_workflow is not used for that: it takes a job from whoever has it by now, revives a cancelled one,
-and forgets how many workers the job took down. ``DBOS._recover_pending_workflows``, which DBOS itself calls when it
-starts, changes only rows that still belong to the named workers ("executors" in DBOS). A test checks that this private
-function still exists in this form.
+The jobs of dead workers are put back into their queues by one statement on the engine's table, before a new worker
+takes its first job: so an interrupted job keeps its place. The engine's own ways do not serve: resume_workflow takes a
+job from whoever has it by now, revives a cancelled one and forgets how many workers the job took down; its recovery is
+private, and begins only when jobs are taken already.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection
 
-from dbos import DBOS, DBOSConfig
+import sqlalchemy as sa
+from dbos import DBOSConfig
 
+from server.processes import process_identity, process_started
+from server.services.failures import SERIALIZER
 from server.services.job_rows import APPLICATION, APPLICATION_VERSION
 from server.settings import ServiceSettings
+from server.storage.database import now_sql, workers
+from server.storage.job_index import RUNNING, engine_jobs
 
 
 def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
@@ -24,10 +29,38 @@ def engine_config(settings: ServiceSettings, executor_id: str) -> DBOSConfig:
         "enable_otlp": False,
         "log_level": "WARNING",
         "notification_listener_polling_interval_sec": 1.0,
+        "serializer": SERIALIZER,
     }
 
 
-def take_over(executors: Sequence[str]) -> list[str]:
-    """Puts the running workflows of the named workers back into their queues. Workflows that another worker has taken
-    meanwhile are left alone. Returns the ids of those put back."""
-    return [handle.get_workflow_id() for handle in DBOS._recover_pending_workflows([*executors])]
+def dead_workers(engine: sa.Engine, silent_s: float, except_id: str = "") -> list[str]:
+    """Lists the ids of dead workers: those that stopped, whose process on this machine is gone, or that sent no
+    heartbeat for ``silent_s`` seconds. ``except_id`` is never listed."""
+    machine = process_identity()[0]
+    with engine.connect() as connection:
+        silent = (workers.c.seen < now_sql(connection) - silent_s).label("silent")
+        rows = connection.execute(sa.select(workers, silent).where(workers.c.id != except_id)).all()
+    return [
+        row.id
+        for row in rows
+        if row.stopped is not None
+        or row.silent
+        or (row.machine == machine and process_started(row.pid) != row.pid_started)
+    ]
+
+
+def take_over(engine: sa.Engine, dead: Collection[str]) -> list[str]:
+    """Puts the running workflows of dead workers, and of those that have no row any more, back into their queues.
+    Workflows that another worker has taken meanwhile are left alone. Returns the ids of those put back."""
+    job = engine_jobs(engine)
+    with engine.connect() as connection:
+        holders = {*connection.scalars(sa.select(job.c.executor_id).where(job.c.status == RUNNING).distinct())}
+        known = {*connection.scalars(sa.select(workers.c.id))}  # asked second: a worker that begins now is no stray
+    gone = {*dead, *holders - known} & holders
+    if not gone:
+        return []
+    back = {"status": "ENQUEUED", "owner_xid": None, "started_at_epoch_ms": None}
+    change = sa.update(job).where(job.c.status == RUNNING, job.c.executor_id.in_(gone))
+    with engine.begin() as connection:
+        changed = change.values(**back, updated_at=sa.cast(now_sql(connection) * 1000, sa.BigInteger))
+        return [*connection.scalars(changed.returning(job.c.workflow_uuid))]

@@ -1,10 +1,12 @@
 """What a finished job's files are: sizes and hashes, and the warnings in its report."""
 
-import hashlib
 import json
+from contextlib import suppress
 from pathlib import Path
 
-from rig.messages.message import MessageDocument
+from rig.atomic_write import write_atomically
+from rig.messages.message import Message, MessageDocument
+from server.storage.objects import sha256_of
 from server.storage.records import FileEntry
 
 
@@ -16,11 +18,17 @@ def warnings_of(report: Path) -> list[MessageDocument]:
         return []
 
 
+def add_warning(report: Path, warning: Message) -> None:
+    """Adds a warning to a report.json; does nothing where another kind of work wrote none."""
+    with suppress(FileNotFoundError):
+        document = json.loads(report.read_bytes())
+        document["warnings"] = [*document["warnings"], warning.document()]
+        write_atomically(report, json.dumps(document, indent=1, ensure_ascii=False).encode())
+
+
 def described(folder: Path) -> dict[str, FileEntry]:
     """Returns size and SHA-256 of every file below ``folder``, by its relative name."""
     files: dict[str, FileEntry] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": digest}
+        files[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
     return files

@@ -12,25 +12,27 @@ worker, so several workers may do this at once.
 
 import os
 import platform
+import resource
 import secrets
 import shutil
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
 from typing import Concatenate
 
 import sqlalchemy as sa
 import structlog
-from dbos import DBOS, WorkflowStatus
+from dbos import DBOS, PortableWorkflowError
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
-from pipeline.settings import settings_from_document
+from pipeline.settings import PHOTO_LEVELS, settings_from_document
 from rig.errors import Cancelled, InputError
 from rig.messages.message import compose
 from rig.progress import Progress
@@ -38,8 +40,8 @@ from server.errors import UNWRITABLE, unusable_input
 from server.problem_types import type_of_failure
 from server.processes import process_identity
 from server.services import calibrations
-from server.services.deliveries import DELIVER, DELIVERIES_QUEUE, enqueue_delivery
-from server.services.failures import JobFailed
+from server.services.deliveries import DELIVERIES_QUEUE, enqueue_delivery
+from server.services.failures import JobFailed, restored
 from server.services.job_rows import DELIVERY, WORKFLOW
 from server.services.results import Results
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
@@ -48,12 +50,7 @@ from server.storage.capture_blobs import open_capture_blobs
 from server.storage.database import now_sql, open_database, workers
 from server.storage.events import EventLog
 from server.storage.folders import move_durably
-from server.storage.records import (
-    CalibrationOutcome,
-    FileEntry,
-    JobRequest,
-    WebhookMessage,
-)
+from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, WebhookMessage
 from server.storage.store import Store
 from server.tasks.calibrate import calibrate_folder, expected, forget_scene
 from server.tasks.child import DISK_FULL, ChildProcessPool, WorkerContext, WorkFailed, function_at
@@ -62,11 +59,10 @@ from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.stage_durations import StageDurations
 from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
-from server.worker.engine import engine_config, take_over
-from server.worker.heartbeat import dead_workers
+from server.worker.engine import dead_workers, engine_config, take_over
 from server.worker.outcome import Outcomes
 from server.worker.pauses import insist, pause
-from server.worker.result_files import described
+from server.worker.result_files import add_warning, described
 
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
 
@@ -97,11 +93,13 @@ class Worker:
     def start(self) -> None:
         """Writes the first heartbeat, starts the job engine and begins to take jobs. Returns at once; the jobs run in
         threads."""
+        DBOS.migrate(system_database_url=self.settings.url)
         DBOS(config=engine_config(self.settings, self.id))
         self._register()
         self._deliverer.register()
         DBOS.listen_queues([self.settings.queue, WEBHOOKS_QUEUE, DELIVERIES_QUEUE])
         self._beat()  # before the first job: a worker without a heartbeat row would have nobody to notice its death
+        self._take_over()  # before the first job, too: an interrupted one goes on before the next begins
         DBOS.launch()
         limit = self.settings.concurrency
         DBOS.register_queue(
@@ -153,10 +151,12 @@ class Worker:
                 try:
                     ingest(job_id, request)
                     files = publish(job_id, fit(job_id, request))
-                except JobFailed as error:
-                    log.warning("job failed", kind=error.kind, detail=error.detail.text)
-                    worker.outcomes.publish(job_id, "failed", request.get("webhook"), failure=error.kind)
-                    raise
+                except (JobFailed, PortableWorkflowError) as error:
+                    if (failed := restored(error)) is None:
+                        raise
+                    log.warning("job failed", kind=failed.kind, detail=failed.detail.text)
+                    worker.outcomes.publish(job_id, "failed", request.get("webhook"), failure=failed.kind)
+                    raise failed from error
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
                     worker.results.discard(job_id)
                     raise
@@ -204,34 +204,58 @@ class Worker:
         """
         name = f"attempt-{secrets.token_hex(6)}"
         folder = self.store.folder("jobs", job_id) / name
-        settings = request.get("settings") or {}
         try:
-            folder.mkdir(parents=True)
-            chosen = settings_from_document(settings)
-            progress = JobProgress(self._durations.of(chosen))
-            meter = ProgressMeter(self.events, job_id, progress, max(EVERY_S, self.settings.poll_s))
-
-            def cancelled() -> bool:
-                meter.tick()  # asked many times a second, also where a stage reports nothing
-                return not self._states.runs(job_id)
-
-            meter.report("read", 0.0)  # a fresh child loads for seconds before it says so itself
-            with self._captures.files(job_id, request["capture_id"]) as files, self._children.one() as child:
-                child.remote(self._work, report=meter.report, cancelled=cancelled)(
-                    capture=str(files),
-                    result=str(folder),
-                    cache=str(self.store.cache_of(request["capture_id"])),
-                    model=request.get("model"),
-                    settings=settings,
-                )
-            if self._work is reconstruct_capture:  # how long another work takes says nothing of this one
-                self._durations.learn(chosen, progress.finish())
+            self._fit_in_memory(job_id, request, folder)
         except BaseException as error:
             shutil.rmtree(folder, ignore_errors=True)
             if isinstance(error, Cancelled):
                 log.info("job cancelled")  # here: the engine ends a cancelled workflow before its own handlers run
             raise self._failure(error) from error
         return name
+
+    def _fit_in_memory(self, job_id: str, request: JobRequest, folder: Path) -> None:
+        """Runs a job's work; once more where its child was killed with signal 9, as the system does where memory is
+        short; and then at the level photo, which report.json tells. Raises JobFailed if that is killed, too."""
+        settings = request.get("settings") or {}
+        tries = [settings, settings]
+        if settings.get("detail") in PHOTO_LEVELS and settings.get("detail") != "photo":
+            tries.append({**settings, "detail": "photo"})
+        for count, chosen in enumerate(tries, 1):
+            folder.mkdir(parents=True)
+            try:
+                self._run_work(job_id, request, folder, chosen)
+            except WorkFailed as error:
+                if error.kind != "killed":
+                    raise
+                log.warning("work was killed", times=count, of=len(tries))
+                shutil.rmtree(folder, ignore_errors=True)
+            else:
+                if chosen is not settings:
+                    add_warning(folder / "report.json", compose("level-lowered"))
+                return
+        gb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
+        raise JobFailed("out-of-memory", compose("killed-for-memory", count=len(tries), gb=gb))
+
+    def _run_work(self, job_id: str, request: JobRequest, folder: Path, settings: Mapping[str, object]) -> None:
+        chosen = settings_from_document(settings)
+        progress = JobProgress(self._durations.of(chosen))
+        meter = ProgressMeter(self.events, job_id, progress, max(EVERY_S, self.settings.poll_s))
+
+        def cancelled() -> bool:
+            meter.tick()  # asked many times a second, also where a stage reports nothing
+            return not self._states.runs(job_id)
+
+        meter.report("read", 0.0)  # a fresh child loads for seconds before it says so itself
+        with self._captures.files(job_id, request["capture_id"]) as files, self._children.one() as child:
+            child.remote(self._work, report=meter.report, cancelled=cancelled)(
+                capture=str(files),
+                result=str(folder),
+                cache=str(self.store.cache_of(request["capture_id"])),
+                model=request.get("model"),
+                settings={**settings},
+            )
+        if self._work is reconstruct_capture:  # how long another work takes says nothing of this one
+            self._durations.learn(chosen, progress.finish())
 
     def calibrate(self, identity: str) -> CalibrationOutcome:
         """Computes one calibration in a child process and returns its outcome. The result is written under a temporary
@@ -310,7 +334,9 @@ class Worker:
         while not self._stop.wait(self.settings.heartbeat_s):
             try:
                 self._beat()
-                self._reap()
+                self._take_over()
+                for job_id in self.outcomes.publish_set_aside():
+                    log.warning("job set aside", job=job_id)
             except Exception as error:  # the database may be away for a while; the worker outlasts it
                 log.error("heartbeat failed", error=str(error)[:300])
 
@@ -325,29 +351,15 @@ class Worker:
                 row |= {"version": version("eigenhead"), "started": now_sql(connection)}
                 connection.execute(sa.insert(workers).values(**row, **seen))
 
-    def _reap(self) -> None:
-        """Puts the jobs of dead workers back. Idempotent, and safe for any number of reapers at once."""
+    def _take_over(self) -> None:
+        """Puts the jobs of dead workers back. Idempotent, and safe for any number of workers at once."""
         dead = dead_workers(self.engine, self.settings.silent_s, except_id=self.id)
-        running = self._running()
-        known = self._known_workers()  # asked second: a worker that begins in between is no stray
-        executors = {row.executor_id for row in running if row.executor_id is not None}
-        gone = [*dead, *sorted(executors - known)]
-        if gone:
-            for job_id in take_over(gone):
-                log.warning("job taken over", job=job_id)
-        for job_id in self.outcomes.publish_set_aside():
-            log.warning("job set aside", job=job_id)
+        for job_id in take_over(self.engine, dead):
+            log.warning("job taken over", job=job_id)
+            self.events.append(job_id, {"state": "queued", "stage": "queued", "progress": 0.0, "eta_s": None})
         with self.engine.begin() as connection:
             old = sa.and_(workers.c.id.in_(dead), workers.c.seen < now_sql(connection) - FORGET_S)
             connection.execute(sa.delete(workers).where(old))
-
-    def _known_workers(self) -> set[str]:
-        with self.engine.connect() as connection:
-            return set(connection.scalars(sa.select(workers.c.id)))
-
-    def _running(self) -> list[WorkflowStatus]:
-        names = [WORKFLOW, DELIVERY, DELIVER, calibrations.WORKFLOW]
-        return DBOS.list_workflows(name=names, status="PENDING", load_input=False, load_output=False)
 
 
 class _StateWatch:

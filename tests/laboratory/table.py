@@ -114,7 +114,6 @@ EXPERIMENTS = {
 
 BENCHMARKS = {
     "attacks": Record("benchmarks.attacks:run", "Attacks a service over loopback, and says what held."),
-    "batch_kills": Record("benchmarks.batch_kills:run", "Counts what SIGKILLs leave of a batch."),
     "capture_leaks": Record("benchmarks.capture_leaks:run", "Takes many captures, and measures what grows."),
     "captures": Record("benchmarks.captures:run", "Measures errors of the shared captures at every level of detail."),
     "console_timings": Record("benchmarks.console_timings:run", "Times the console's pages in Chromium."),

@@ -30,11 +30,7 @@ def camera(lens: Distortion, pose: RigidTransform = POSE) -> Camera:
 def test_projection_is_opencv_s(lens: Distortion) -> None:
     ours = camera(lens)
     expected, _ = cv2.projectPoints(
-        POINTS,
-        vector_from_rotation(POSE.rotation),
-        POSE.translation,
-        ours.intrinsics.matrix(),
-        lens.opencv(),
+        POINTS, vector_from_rotation(POSE.rotation), POSE.translation, ours.intrinsics.matrix(), lens.opencv()
     )
     np.testing.assert_allclose(ours.project(POINTS), expected[:, 0], atol=1e-8)
 

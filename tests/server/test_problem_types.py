@@ -46,7 +46,7 @@ def test_every_error_that_may_end_a_job_has_its_type() -> None:
     assert found - FAILURE_TYPES.keys() == set()
     assert FAILURE_TYPES.keys() - found == {
         *("EigenheadError", "ShotFailed"),
-        *("bug", "crash", "disk-full", "out-of-memory"),
+        *("bug", "crash", "disk-full", "killed", "out-of-memory"),
     }
 
 

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from server.processes import process_identity, process_started, python_command, 
 from server.tasks.child import Child, WorkerContext
 from server.tasks.egl import try_egl
 from tests.support.hostile_folder import hostile_folder
-from tests.support.services import ROOT
+from tests.support.services import ROOT, await_true
 
 
 @pytest.fixture
@@ -80,13 +79,6 @@ def test_a_process_ends_with_the_one_that_started_it() -> None:
     await_true(lambda: process_started(child) == 0)
     orphan = subprocess.run([sys.executable, "-c", CHILD.format(parent=1)], cwd=ROOT, timeout=20, check=False)
     assert orphan.returncode == 1
-
-
-def await_true(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_a_child_has_the_variables_that_it_was_given() -> None:

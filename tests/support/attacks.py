@@ -135,15 +135,16 @@ class Witness:
 def memory_mb(service: RunningService) -> float:
     """Resident memory of the service's process and all below it (MB)."""
     assert service.process is not None
-    return sum(_resident_mb(pid) for pid in _tree(service.process.pid))
+    return sum(_resident_mb(pid) for pid in process_tree(service.process.pid))
 
 
-def _tree(pid: int) -> list[int]:
+def process_tree(pid: int) -> list[int]:
+    """A process and all below it."""
     below: list[int] = []
     with suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():
             below += [int(child) for child in (task / "children").read_text().split()]
-    return [pid, *(each for child in below for each in _tree(child))]
+    return [pid, *(each for child in below for each in process_tree(child))]
 
 
 def _resident_mb(pid: int) -> float:

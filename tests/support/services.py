@@ -8,10 +8,11 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -117,6 +118,13 @@ def running_service(
         running.remove(service)
 
 
+@contextmanager
+def served_client(data: Path, **settings: Any) -> Iterator[tuple[RunningService, httpx.Client]]:
+    """A running service, and a client of it."""
+    with running_service(data, **settings) as service, httpx.Client(base_url=service.url, timeout=120) as client:
+        yield service, client
+
+
 def worker_pids(service: RunningService) -> list[int]:
     """Worker processes of a service's data folder, told by their environment."""
     found = []
@@ -144,6 +152,13 @@ def await_state(client: httpx.Client, job: str, states: tuple[str, ...], timeout
         if document["state"] in states:
             return document
         assert time.monotonic() < deadline, document
+        time.sleep(0.05)
+
+
+def await_true(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"not true within {timeout_s:.0f} s"
         time.sleep(0.05)
 
 

@@ -45,11 +45,18 @@ TEMPLATES = {
     "job-without-result": "The job is {state:word}; it has no result.",
     "job-active": "The job is queued or running; cancel it first.",
     "too-many-jobs": "{count} jobs are queued or running for this key, which is the most; wait for one to end.",
+    "too-many-uploads": "{count} uploads of this key are unfinished, which is the most; end or discard one.",
     "capture-missing": "Its pictures are neither in the data folder nor in the store of captures: restore them from a "
     "backup, or remove the capture.",
     "result-missing": "Its result is not in the data folder any more: restore it from a backup, or restart the job.",
+    "file-damaged": "Changed on the disk since the job made them, or cut: {files}. Restore them from a backup, or "
+    "restart the job.",
     "worker-starting": "The worker is being started.",
     "no-worker": "No worker serves the queue {queue}: start one with `eigenhead worker --queue {queue_name}`.",
+    "killed-for-memory": "The system ended the job's process {count} times with signal 9, as it does where memory is "
+    "short; it had up to {gb:.1f} GB. Give the worker more memory, or run fewer jobs at once.",
+    "level-lowered": "The system ended the job's process twice, as it does where memory is short: this head is made at "
+    "the level photo.",
     "worker-died": "The job took its worker down with it again and again; the worker's log says why.",
     "job-failed-unforeseen": "The job failed in a way that nobody foresaw; the log says more.",
     "rig-not-calibrated": "no calibration: calibrate the rig and put the calibration to use",
@@ -71,11 +78,14 @@ TEMPLATES = {
     "no-worker-alive": "none alive: start one with `eigenhead worker`",
     "check-starting": "being started; ask again in a few seconds",
     "rig-described": "{kind:word}, {count} cameras",
+    "clock-trusted": "the clock is trusted",
+    "retention-stopped": "The clock has gone {days:.0f} days since the last sweep, which the machine's uptime, or what would be removed, does not bear out: nothing is removed. Set the clock right, then remove {file}.",
     "records-damaged": "{count} damaged records lie in set-aside: {names}",
     "no-record-damaged": "none damaged",
     "store-answers": "{place} answers",
     "store-none": "captures and results lie in the data folder",
     "results-missing": "{count} jobs have no result folder any more: {jobs}",
+    "results-orphaned": "{count} results are of no job in the database, which was lost or is another: {jobs}; restore it",
     "results-complete": "all there",
     "capture-in-use": "Jobs that are queued or running need this capture; cancel them first.",
     "job-named": "job {job}",
@@ -245,4 +255,8 @@ TEMPLATES = {
     "no-result-folder": "has no report.json that says what it was made of: name the folder that eigenhead reconstruct wrote",
     "result-of-other-file": "was made of another {file} than this capture has",
     "captures-of-one-rig": "the captures must be of one rig, calibrated once",
+    "keyless-address": "refusing to listen on {where} without an API key: anybody there could fetch faces. Make one with `eigenhead keys add NAME --data {data}`, or listen on 127.0.0.1 without a public URL",
+    "keys-lost": "refusing to start without an API key: the service of {data} had some, and the database at {place} has none. Restore that database, or make a key with `eigenhead keys add NAME --data {data}`",
+    "database-away": "the job database at {place} cannot be used ({why}): start it, or mend EIGENHEAD_DATABASE_URL",
+    "database-damaged": "the job database at {place} cannot be used ({why}): keep the file, restore a copy of it, and see `eigenhead doctor`",
 }

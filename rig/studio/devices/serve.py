@@ -250,23 +250,23 @@ class StudioDevices:
         with ThreadPoolExecutor(2) as pool:
             films = [film for films in pool.map(self._films_of, self.names) for film in films.items()]
         # The empty studio comes back with every subject that leaves: its films are kept, theirs are not.
-        self._films = {look: film for look, film in self._films.items() if not look.seated} | dict(films)
+        self._films = {lighting: film for lighting, film in self._films.items() if not lighting.seated} | dict(films)
         for name in self.names:
             self.streams.show(name, self._films[self._look(name)])
 
     def _films_of(self, camera: str) -> dict[_Look, Film]:
         """The films of one camera with the lamps off and on."""
         lightings = [self._look(camera, lamps) for lamps in (0, (1 << LIGHTS) - 1)]
-        if all(look in self._films for look in lightings):
-            return {look: self._films[look] for look in lightings}
+        if all(lighting in self._films for lighting in lightings):
+            return {lighting: self._films[lighting] for lighting in lightings}
         live = _TAKES_LEAST if self.present else self._takes  # clean plates are taken of the empty studio alone
         now_s = time.monotonic() - self._started_s
         takes = [self._sources[self.present](camera, now_s + i) for i in range(live + _TAKES_LEAST)]
         films: dict[_Look, Film] = {}
-        for look in lightings:
-            rng = np.random.default_rng(zlib.crc32(repr(look).encode()))
-            jpegs = tuple(_develop(take, look, rng) for take in takes)
-            films[look] = Film(jpegs[:live], jpegs[live:])
+        for lighting in lightings:
+            rng = np.random.default_rng(zlib.crc32(repr(lighting).encode()))
+            jpegs = tuple(_develop(take, lighting, rng) for take in takes)
+            films[lighting] = Film(jpegs[:live], jpegs[live:])
         return films
 
     def _answer(self, method: str, path: str, query: Mapping[str, str]) -> tuple[int, str]:
@@ -321,13 +321,13 @@ def serve_scene(
     )
 
 
-def _develop(image: ImageRgb, look: _Look, rng: np.random.Generator) -> bytes:
+def _develop(image: ImageRgb, lighting: _Look, rng: np.random.Generator) -> bytes:
     """A JPEG file of ``image`` with less light and a bump."""
-    if look.bump_px:
-        image = _bumped(image, look.bump_px)
-    if look.light < 1:
+    if lighting.bump_px:
+        image = _bumped(image, lighting.bump_px)
+    if lighting.light < 1:
         # the read noise of the sensor, one value, does not go with the light
-        dim = image * np.float32(look.light) + rng.standard_normal(image.shape, np.float32)
+        dim = image * np.float32(lighting.light) + rng.standard_normal(image.shape, np.float32)
         image = np.clip(np.round(dim), 0, 255).astype(np.uint8)
     done, data = cv2.imencode(".jpg", image[:, :, ::-1], _JPEG)
     assert done

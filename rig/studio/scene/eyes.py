@@ -182,7 +182,7 @@ def eye_centres(mesh: Mesh, landmarks: Landmarks, gaze: Float[np.ndarray, " 3"])
         near = np.linalg.norm(lids.vertices - centre, axis=1) < PATCH_MM
         points = lids.vertices[np.intersect1d(np.flatnonzero(near), np.unique(lids.faces))]
         places = [centre - (0.0, 0.0, back) for back in np.arange(0.0, BACK_MM, STEP_MM)]
-        out[side] = next((place for place in places if _has_room(Eye(place, gaze, WHITE), points)), places[-1])
+        out[side] = next((position for position in places if _has_room(Eye(position, gaze, WHITE), points)), places[-1])
     return out
 
 

@@ -106,9 +106,11 @@ def outer_radius(points: Float[np.ndarray, "v 3"], *, open_ears: bool) -> Float[
     elevation = np.degrees(np.arcsin(points[:, 1] / length))
     row = (90.0 - elevation) / (90.0 - LOWEST_DEG) * (ROWS - 1)
     column = np.arctan2(points[:, 0], points[:, 2]) / (2 * np.pi) * COLUMNS
-    kept = row < ROWS - 0.5
+    inside = row < ROWS - 0.5
     radius = np.zeros((ROWS, COLUMNS), np.float32)
-    np.maximum.at(radius, (np.rint(row[kept]).astype(int), np.rint(column[kept]).astype(int) % COLUMNS), length[kept])
+    np.maximum.at(
+        radius, (np.rint(row[inside]).astype(int), np.rint(column[inside]).astype(int) % COLUMNS), length[inside]
+    )
     margin = COLUMNS // 4
     wrapped = np.concatenate([radius[:, -margin:], radius, radius[:, :margin]], axis=1)
     while (wrapped == 0).any():
@@ -126,11 +128,11 @@ def _inside_hairline(
 ) -> Float[np.ndarray, "r c"]:
     """Height above the hairline, mm; positive under hair."""
     line = HAIRLINE_OVER_EARS if style.over_ears else HAIRLINE
-    place = (surface - body.ears) / body.unit
-    front = np.clip((place[:, :, 2] - 35.0) / 40.0, 0.0, 1.0)
-    height = np.interp(place[:, :, 2], line[:, 0], line[:, 1]) - style.fringe_mm * front
+    relative = (surface - body.ears) / body.unit
+    front = np.clip((relative[:, :, 2] - 35.0) / 40.0, 0.0, 1.0)
+    height = np.interp(relative[:, :, 2], line[:, 0], line[:, 1]) - style.fringe_mm * front
     ragged = 2.5 * around(rng, ROWS, COLUMNS, 20, 44)
-    return (place[:, :, 1] - height + ragged) * body.unit
+    return (relative[:, :, 1] - height + ragged) * body.unit
 
 
 def grow_strands(

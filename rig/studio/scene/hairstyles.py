@@ -20,24 +20,26 @@ Change = Callable[[Look], Look]
 
 
 def _hair(**changes: float | bool) -> Change:
-    return lambda look: replace(look, hair=replace(look.hair or HairStyle(), **changes))
+    return lambda appearance: replace(appearance, hair=replace(appearance.hair or HairStyle(), **changes))
 
 
-def _beard(look: Look) -> Look:
-    tone = (look.hair or HairStyle()).tone
-    return replace(look, beard=HairStyle(thickness_mm=13.0, curl_mm=5.0, strands=3500, strand_mm=10.0, stray_mm=1.2,
-                                         tone=tone))  # fmt: skip
+def _beard(appearance: Look) -> Look:
+    tone = (appearance.hair or HairStyle()).tone
+    beard = HairStyle(thickness_mm=13.0, curl_mm=5.0, strands=3500, strand_mm=10.0, stray_mm=1.2, tone=tone)
+    return replace(appearance, beard=beard)
 
 
-def _cap(look: Look) -> Look:
+def _cap(appearance: Look) -> Look:
     under = (
-        replace(look.hair, thickness_mm=7.0, fringe_mm=0.0, lumps=0.1, strands=800, stray_mm=0.6) if look.hair else None
+        replace(appearance.hair, thickness_mm=7.0, fringe_mm=0.0, lumps=0.1, strands=800, stray_mm=0.6)
+        if appearance.hair
+        else None
     )
-    return replace(look, hair=under, cap=CAP_TONE)
+    return replace(appearance, hair=under, cap=CAP_TONE)
 
 
 def _tight(cap: TightCap) -> Change:
-    return lambda look: replace(look, hair=None, cap=None, tight_cap=cap)
+    return lambda appearance: replace(appearance, hair=None, cap=None, tight_cap=cap)
 
 
 HAIRSTYLES: Mapping[str, Change] = MappingProxyType({
@@ -48,21 +50,21 @@ HAIRSTYLES: Mapping[str, Change] = MappingProxyType({
     "fringe": _hair(thickness_mm=13.0, over_ears=True, fringe_mm=30.0, lumps=0.12),
     "bun": _hair(thickness_mm=6.0, over_ears=False, fringe_mm=0.0, lumps=0.08, strands=1800, bun_mm=33.0),
     "beard": _beard,
-    "bald": lambda look: replace(look, hair=None),
+    "bald": lambda appearance: replace(appearance, hair=None),
     "cap": _cap,
     "swim-cap": _tight(SWIM_CAP),
     "wig-cap": _tight(WIG_CAP),
-    "glasses": lambda look: replace(look, glasses=True),
+    "glasses": lambda appearance: replace(appearance, glasses=True),
 })  # fmt: skip
 """What each name changes of a look. Caps and glasses count as clothes in the truth, a beard as hair. Glasses are rims
 without panes: the pipeline asks studios for that."""
 
 
-def restyled(look: Look, names: Sequence[str]) -> Look:
+def restyled(appearance: Look, names: Sequence[str]) -> Look:
     """Returns the look with the named changes of ``HAIRSTYLES`` applied one after the other. Raises InputError for an
     unknown name."""
     if unknown := [name for name in names if name not in HAIRSTYLES]:
         raise InputError("hair", [compose("none-of", value=name, known=[*HAIRSTYLES]) for name in unknown])
     for name in names:
-        look = HAIRSTYLES[name](look)
-    return look
+        appearance = HAIRSTYLES[name](appearance)
+    return appearance

@@ -74,15 +74,15 @@ def irradiance(
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
     rig = Rig(tuple(_lamp_camera(i, direction, centre, radius) for i, direction in enumerate(directions)))
     depth = renderer.depth(rig, vertices, faces)
-    found = [np.zeros((len(points), 3)) for points, _ in receivers]
+    irradiance = [np.zeros((len(points), 3)) for points, _ in receivers]
     for camera, direction, colour in zip(rig, directions, sent, strict=True):
         image = depth[camera.name]
-        for light, (points, normals) in zip(found, receivers, strict=True):
+        for light, (points, normals) in zip(irradiance, receivers, strict=True):
             cosine = normals @ direction
             facing = np.flatnonzero(cosine > 0)
             reached = _reached(camera, image, points[facing] + 1.5 * normals[facing])
             light[facing] += (cosine[facing] * reached)[:, None] * colour
-    return found
+    return irradiance
 
 
 def _lamp_camera(
@@ -99,11 +99,11 @@ def _reached(
 ) -> Float[np.ndarray, " n"]:
     """Share of the four nearest pixels of the depth map, weighted bilinearly, that the point is not behind."""
     k = camera.intrinsics
-    seen = camera.camera_from_world.apply(points)
-    x, y = np.clip(lens_image(seen, k.values()), 0, (k.width - 1.001, k.height - 1.001)).T
+    points_camera = camera.camera_from_world.apply(points)
+    x, y = np.clip(lens_image(points_camera, k.values()), 0, (k.width - 1.001, k.height - 1.001)).T
     left, top = x.astype(int), y.astype(int)
     across, down = x - left, y - top
-    limit = seen[:, 2] - BIAS_MM
+    limit = points_camera[:, 2] - BIAS_MM
     share = np.zeros(len(points))
     for dy, wy in ((0, 1 - down), (1, down)):
         for dx, wx in ((0, 1 - across), (1, across)):

@@ -89,9 +89,11 @@ def _envelope(points: Float[np.ndarray, "n 3"], unit: float, length_mm: float) -
     angle = np.arctan2(-points[:, 0], -points[:, 2])
     row = np.rint((TOP_MM * unit - points[:, 1]) / length_mm * (ROWS - 1)).astype(int)
     column = np.rint((angle + limit) / (2 * limit) * (COLUMNS - 1)).astype(int)
-    kept = (row >= 0) & (row < ROWS) & (column >= 0) & (column < COLUMNS)
+    inside = (row >= 0) & (row < ROWS) & (column >= 0) & (column < COLUMNS)
     radius = np.zeros((ROWS, COLUMNS), np.float32)
-    np.maximum.at(radius, (row[kept], column[kept]), np.hypot(points[kept, 0], points[kept, 2]).astype(np.float32))
+    np.maximum.at(
+        radius, (row[inside], column[inside]), np.hypot(points[inside, 0], points[inside, 2]).astype(np.float32)
+    )
     return np.asarray(cv2.morphologyEx(radius, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), np.float32)
 
 

@@ -125,8 +125,8 @@ def _eye(
     )  # 0 at the inner end of the brow, 1 outside
     arch = outer[1] + lift * (1.0 + 1.2 * along * (1 - along) * 1.25 - 0.2 * along)
     width = 4.4 - 2.8 * np.clip(along, 0, 1)
-    there = _smoothstep(-0.06, 0.06, along) * _smoothstep(1.06, 0.94, along) * (z > outer[2] - 18)
-    brow = there * _smoothstep(1.0, 0.4, np.abs(y - arch) / width)
+    inside = _smoothstep(-0.06, 0.06, along) * _smoothstep(1.06, 0.94, along) * (z > outer[2] - 18)
+    brow = inside * _smoothstep(1.0, 0.4, np.abs(y - arch) / width)
     _mix(paint, 0.85 * brow, BROW)
     paint[:, 3] += 3.0 * brow
     if eyeballs:

@@ -44,12 +44,12 @@ def scattered(
         scattering_mm: standard deviation over which each channel spreads.
     """
     stiffness, mass = _laplacian(vertices, faces)
-    found = irradiance.copy()
+    scattered = irradiance.copy()
     for channel, spread_mm in enumerate(scattering_mm):
         if spread_mm > 0.0:
             matrix = sparse.csc_array(sparse.diags_array(mass) + 0.5 * spread_mm**2 * stiffness)
-            found[:, channel] = splu(matrix).solve(mass * irradiance[:, channel])
-    return found
+            scattered[:, channel] = splu(matrix).solve(mass * irradiance[:, channel])
+    return scattered
 
 
 def _laplacian(
@@ -214,7 +214,7 @@ def random_pose(
 def dress(
     renderer: Renderer,
     subject: Subject,
-    look: Look,
+    appearance: Look,
     world_from_head: Similarity,
     *,
     clothes: bool,
@@ -225,28 +225,28 @@ def dress(
     hair_rng, cloth_rng, noise_rng, strand_rng, skin_rng, eye_rng, cap_rng = rng.spawn(7)
     head, body = subject.mesh, anatomy(subject.mesh.vertices, subject.landmarks)
     worn = shirt(head, body, cloth_rng) if clothes else None
-    hairs = _hairs(head, body, look, worn, hair_rng)
-    seen = replace(subject, mesh=opened(head, body.landmarks)) if subject.eyes else subject
-    pieces = [_skin(seen, body, look, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
+    hairs = _hairs(head, body, appearance, worn, hair_rng)
+    pierced = replace(subject, mesh=opened(head, body.landmarks)) if subject.eyes else subject
+    pieces = [_skin(pierced, body, appearance, worn is not None, skin_rng)]  # a shirt hides the cut through the neck
     pieces += [_hair_piece(hair, style) for hair, style in hairs]
     if worn:
-        grain = CLOTH if look.texture else NO_GRAIN
-        pieces.append(Piece("clothes", *worn, worn[0], _even(worn[0], look.cloth), grain, False))
-    pieces += _headwear(head, body, look, hairs[0][0] if look.hair else None)
+        grain = CLOTH if appearance.texture else NO_GRAIN
+        pieces.append(Piece("clothes", *worn, worn[0], _even(worn[0], appearance.cloth), grain, False))
+    pieces += _headwear(head, body, appearance, hairs[0][0] if appearance.hair else None)
     pieces += [_eye_piece(surface(eye, eye_rng)) for eye in subject.eyes.values()]
-    if look.tight_cap:
-        pieces.append(_tight_cap(head, body, look.tight_cap, cap_rng))
+    if appearance.tight_cap:
+        pieces.append(_tight_cap(head, body, appearance.tight_cap, cap_rng))
     placed = [(world_from_head.apply(piece.vertices), piece.faces) for piece in pieces]
     normals = [vertex_normals(*piece) for piece in placed]
     solid = _joined(placed)
-    close_up = None if subject.relief is None else _relieved(pieces[0], seen.mesh, subject.relief, world_from_head)
+    close_up = None if subject.relief is None else _relieved(pieces[0], pierced.mesh, subject.relief, world_from_head)
     lit = [(v, n) for (v, _), n in zip(placed, normals, strict=True)]
     lit += [] if close_up is None else [(close_up.vertices, close_up.normals)]
     light = irradiance(renderer, lit, solid, lamps)
-    if max(look.scattering_mm) > 0.0:
-        light[0] = scattered(*placed[0], light[0], look.scattering_mm)
+    if max(appearance.scattering_mm) > 0.0:
+        light[0] = scattered(*placed[0], light[0], appearance.scattering_mm)
         if close_up is not None:
-            light[-1] = scattered(close_up.vertices, close_up.faces, light[-1], look.scattering_mm)
+            light[-1] = scattered(close_up.vertices, close_up.faces, light[-1], appearance.scattering_mm)
     parts = [
         Part(vertices, faces, normal, piece.places, piece.paint, lit, piece.grain, piece.one_sided, piece.oil)
         for piece, (vertices, faces), normal, lit in zip(pieces, placed, normals, light[: len(pieces)], strict=True)
@@ -265,7 +265,7 @@ def dress(
         name: Mesh(*_joined([mesh for mesh, one in zip(placed, shown, strict=True) if one == name]))
         for name in dict.fromkeys(("head", *shown))
     }
-    bare = parts[0] if seen is subject else _uncut(parts[0], head)
+    bare = parts[0] if pierced is subject else _uncut(parts[0], head)
     return Dressed(bare, skin, tuple(parts[1:] + strands), gallery, solid, surfaces)
 
 
@@ -285,18 +285,24 @@ def _uncut(skin: Part, head: Mesh) -> Part:
     )
 
 
-def _skin(subject: Subject, body: Anatomy, look: Look, one_sided: bool, rng: np.random.Generator) -> Piece:
+def _skin(subject: Subject, body: Anatomy, appearance: Look, one_sided: bool, rng: np.random.Generator) -> Piece:
     head = subject.mesh
-    if not look.texture:
+    if not appearance.texture:
         return Piece(
-            "head", head.vertices, head.faces, head.vertices, _even(head.vertices, look.skin), NO_GRAIN, one_sided
+            "head", head.vertices, head.faces, head.vertices, _even(head.vertices, appearance.skin), NO_GRAIN, one_sided
         )
     paint = skin_paint(
-        head.vertices, body, look.skin, look.stubble, rng, closed=subject.closed, eyeballs=bool(subject.eyes)
+        head.vertices,
+        body,
+        appearance.skin,
+        appearance.stubble,
+        rng,
+        closed=subject.closed,
+        eyeballs=bool(subject.eyes),
     )
-    paint[:, 3] = np.maximum(paint[:, 3] - (1.0 - look.pores), 0.0)  # brows and stubble keep what they add
-    grain = replace(SKIN, freckles=look.pores * look.freckles)
-    oil = look.oil * oily_zones(head.vertices, body) if look.oil > 0.0 else None
+    paint[:, 3] = np.maximum(paint[:, 3] - (1.0 - appearance.pores), 0.0)  # brows and stubble keep what they add
+    grain = replace(SKIN, freckles=appearance.pores * appearance.freckles)
+    oil = appearance.oil * oily_zones(head.vertices, body) if appearance.oil > 0.0 else None
     return Piece("head", head.vertices, head.faces, head.vertices, paint, grain, one_sided, oil)
 
 
@@ -320,23 +326,23 @@ def _relieved(piece: Piece, head: Mesh, relief: SkinRelief, world_from_head: Sim
 def _hairs(
     head: Mesh,
     body: Anatomy,
-    look: Look,
+    appearance: Look,
     worn: tuple[Float[np.ndarray, "_ 3"], np.ndarray] | None,
     rng: np.random.Generator,
 ) -> list[tuple[Hair, HairStyle]]:
     """All surfaces of hair, that of the scalp first."""
-    found: list[tuple[Hair, HairStyle]] = []
-    if look.hair:
-        scalp = grow(head.vertices, body, look.hair, rng)
-        found.append((scalp, look.hair))
-        if look.hair.hanging_mm:
+    styles: list[tuple[Hair, HairStyle]] = []
+    if appearance.hair:
+        scalp = grow(head.vertices, body, appearance.hair, rng)
+        styles.append((scalp, appearance.hair))
+        if appearance.hair.hanging_mm:
             solid = np.concatenate([head.vertices, worn[0]]) if worn else head.vertices
-            found.append((hang(scalp, solid, body, look.hair, rng), look.hair))
-        if look.hair.bun_mm:
-            found.append((knot(scalp, body, look.hair, rng), look.hair))
-    if look.beard:
-        found.append((grow_beard(head, body, look.beard, rng), look.beard))
-    return found
+            styles.append((hang(scalp, solid, body, appearance.hair, rng), appearance.hair))
+        if appearance.hair.bun_mm:
+            styles.append((knot(scalp, body, appearance.hair, rng), appearance.hair))
+    if appearance.beard:
+        styles.append((grow_beard(head, body, appearance.beard, rng), appearance.beard))
+    return styles
 
 
 def _eye_piece(eye: EyeSurface) -> Piece:
@@ -349,16 +355,16 @@ def _hair_piece(hair: Hair, style: HairStyle) -> Piece:
     return Piece("hair", hair.shell, hair.shell_faces, hair.shell_points, paint, HAIR, hair.one_sided)
 
 
-def _headwear(head: Mesh, body: Anatomy, look: Look, scalp: Hair | None) -> list[Piece]:
-    found = []
-    if look.cap:
+def _headwear(head: Mesh, body: Anatomy, appearance: Look, scalp: Hair | None) -> list[Piece]:
+    pieces = []
+    if appearance.cap:
         surface = cap(head.vertices, scalp.shell if scalp else None, body)
-        grain = CLOTH if look.texture else NO_GRAIN
-        found.append(Piece("clothes", *surface, surface[0], _even(surface[0], look.cap), grain, False))
-    if look.glasses:
+        grain = CLOTH if appearance.texture else NO_GRAIN
+        pieces.append(Piece("clothes", *surface, surface[0], _even(surface[0], appearance.cap), grain, False))
+    if appearance.glasses:
         surface = glasses(head.vertices, body)
-        found.append(Piece("clothes", *surface, surface[0], _even(surface[0], FRAME_TONE), FRAME, False))
-    return found
+        pieces.append(Piece("clothes", *surface, surface[0], _even(surface[0], FRAME_TONE), FRAME, False))
+    return pieces
 
 
 def _tight_cap(head: Mesh, body: Anatomy, worn: TightCap, rng: np.random.Generator) -> Piece:

@@ -46,5 +46,5 @@ def lay_cap(
 
 def above_edge_mm(vertices: Float[np.ndarray, "v 3"], body: Anatomy) -> Float[np.ndarray, " v"]:
     """Returns how far above the edge of a cap each vertex of a head lies (mm); negative where the cap ends lower."""
-    place = (vertices - body.ears) / body.unit
-    return (place[:, 1] - np.interp(place[:, 2], EDGE[:, 0], EDGE[:, 1])) * body.unit
+    relative = (vertices - body.ears) / body.unit
+    return (relative[:, 1] - np.interp(relative[:, 2], EDGE[:, 0], EDGE[:, 1])) * body.unit

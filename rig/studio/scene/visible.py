@@ -52,16 +52,14 @@ def visible_points(
     views = np.zeros(len(points), np.uint8)
     for camera in rig:
         views += sees(camera, depth[camera.name], points, normals)
-    kept = views >= VIEWS_LEAST
-    return VisiblePoints(points[kept].astype(np.float32), normals[kept].astype(np.float32), part[kept], views[kept])
+    visible = views >= VIEWS_LEAST
+    return VisiblePoints(
+        points[visible].astype(np.float32), normals[visible].astype(np.float32), part[visible], views[visible]
+    )
 
 
 def part_masks(
-    rig: Rig,
-    surfaces: Mapping[str, Mesh],
-    masks: Mapping[str, Bool[np.ndarray, "_ _"]],
-    *,
-    renderer: Renderer,
+    rig: Rig, surfaces: Mapping[str, Mesh], masks: Mapping[str, Bool[np.ndarray, "_ _"]], *, renderer: Renderer
 ) -> dict[str, UInt8[np.ndarray, "_ _"]]:
     """Returns what every pixel shows, by camera, in the codes of bust.ply: 1 skin, 2 hair, 3 clothes; 0 outside the
     ``masks``.
@@ -70,13 +68,13 @@ def part_masks(
     """
     depth = {name: renderer.depth(rig, mesh.vertices, mesh.faces) for name, mesh in surfaces.items()}
     codes = np.array([1 + PARTS.index(name) for name in surfaces], np.uint8)
-    found = {}
+    parts = {}
     for camera in rig.names:
         stack = np.stack([depth[name][camera] for name in surfaces])
         nearest = codes[stack.argmin(axis=0)]
         nearest[~np.isfinite(stack).any(axis=0)] = 1 + PARTS.index("hair")
-        found[camera] = np.where(masks[camera], nearest, np.uint8(0))
-    return found
+        parts[camera] = np.where(masks[camera], nearest, np.uint8(0))
+    return parts
 
 
 def sample_surface(
@@ -97,10 +95,7 @@ def sample_surface(
 
 
 def sees(
-    camera: Camera,
-    depth: Float[np.ndarray, "h w"],
-    points: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
+    camera: Camera, depth: Float[np.ndarray, "h w"], points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
 ) -> np.ndarray:
     """Tells which points of a surface a camera sees. ``depth`` is the surface's depth map in the camera (z, mm; inf
     where there is nothing).

@@ -113,8 +113,8 @@ def failed_jobs(service: Service, batch: str) -> list[FailedJob]:
     """Returns the newest ``FAILED_SHOWN`` failed jobs of a batch."""
 
     def make() -> list[FailedJob]:
-        found = service.jobs.page(JobQuery("", STATUSES["failed"], batch=batch), FAILED_SHOWN).items
-        listed = listed_jobs(service, found)
+        failed = service.jobs.page(JobQuery("", STATUSES["failed"], batch=batch), FAILED_SHOWN).items
+        listed = listed_jobs(service, failed)
         return [
             {"id": one.job.id, "capture": one.capture, "why": documents_of(error.errors or (error.detail,))}
             for one in listed

@@ -33,10 +33,10 @@ class Shots:
         self.board: Mapping[str, object] = {}
         self.taken: list[tuple[str, Corners]] = []
 
-    def add(self, board: Mapping[str, object], capture: str, found: Corners) -> None:
+    def add(self, board: Mapping[str, object], capture: str, corners: Corners) -> None:
         """Adds a shot: the id of its capture, and the corners found in each camera's picture."""
         with self._lock:
-            self.board, self.taken = board, [*self.taken, (capture, found)]
+            self.board, self.taken = board, [*self.taken, (capture, corners)]
 
     def check(self, board: Mapping[str, object]) -> None:
         """Raises Conflict if the shots collected so far show a different board."""
@@ -116,7 +116,7 @@ def calibration_state(service: Service) -> CalibrationState:
     """Returns what the page shows: calibrations, rig, and the shots of the board so far."""
     rig = service.rig.describe()
     names = [camera.name for camera in rig.cameras]
-    lines = summary(names, [found for _, found in shots.taken])
+    lines = summary(names, [corners for _, corners in shots.taken])
     return {
         "calibrations": [calibration_line(c) for c in known_calibrations(service, 1.0) if c.id not in removals],
         "rig": {
@@ -131,13 +131,13 @@ def calibration_state(service: Service) -> CalibrationState:
     }
 
 
-def calibration_line(found: Calibration) -> Mapping[str, object]:
+def calibration_line(calibration: Calibration) -> Mapping[str, object]:
     """Returns a calibration as plain values; ``missing``, ``warnings`` and ``error`` hold messages."""
-    messages = {"missing": documents_of(found.missing), "warnings": documents_of(found.warnings)}
+    messages = {"missing": documents_of(calibration.missing), "warnings": documents_of(calibration.warnings)}
     return {
-        **asdict(replace(found, missing=(), warnings=(), error=None)),
+        **asdict(replace(calibration, missing=(), warnings=(), error=None)),
         **messages,
-        "error": shown_failure(found.error),
+        "error": shown_failure(calibration.error),
     }
 
 
@@ -167,15 +167,15 @@ def shoot(page: Page, event: BoardForm) -> Message:
     identity = service.captures.take(CaptureMetadata(label=LABEL), board=True).id
     files = service.store.capture_files(identity)
     with service.children.one() as child:
-        found = child.remote(detect_shot)(files=str(files), board=board)
-    seen = sum(bool(corners) for corners in found.values())
-    if not seen:
+        corners_of = child.remote(detect_shot)(files=str(files), board=board)
+    cameras_with_board = sum(bool(corners) for corners in corners_of.values())
+    if not cameras_with_board:
         service.store.remove_capture(identity, later=True)
         detail = compose("board-not-seen")
         raise InvalidInput("no-board", detail)
-    shots.add(board, identity, found)
+    shots.add(board, identity, corners_of)
     shared.forget("calibration page")
-    return compose("board-shot-taken", number=len(shots.taken), seen=seen, all=len(found))
+    return compose("board-shot-taken", number=len(shots.taken), seen=cameras_with_board, all=len(corners_of))
 
 
 def take_back(page: Page, event: object) -> None:
@@ -213,8 +213,8 @@ def use(page: Page, event: UseForm) -> Message:
 def remove(page: Page, event: Chosen) -> None:
     """Removes a calibration after the time to undo that has passed. Raises NotFound."""
     service, identity = page.service, event["id"]
-    found = service.calibrations.get(identity)
-    title = compose("calibration-named", name=found.label or identity[-6:])
+    calibration = service.calibrations.get(identity)
+    title = compose("calibration-named", name=calibration.label or identity[-6:])
     remove_later(identity, lambda: service.calibrations.remove(identity), title, "capture")
 
 

@@ -8,13 +8,7 @@ from starlette.responses import RedirectResponse
 
 from pipeline.head_model.model_names import list_models
 from rig.messages.message import Message, compose
-from server.console.capture_lines import (
-    CaptureLine,
-    SessionLine,
-    capture_line,
-    jobs_of,
-    sessions_list,
-)
+from server.console.capture_lines import CaptureLine, SessionLine, capture_line, jobs_of, sessions_list
 from server.console.identity import permit
 from server.console.page import Action, Chosen, Page, remove_all_later, remove_later, shared, show
 from server.console.removal import removals
@@ -95,16 +89,16 @@ def captures_state(service: Service, requested: Mapping[str, str | None]) -> Cap
     query = CaptureQuery(
         requested["find"] or "", requested["session"], requested["verdict"], tag=requested["tag"], order=order
     )
-    found = service.captures.page(query, SHOWN, requested["after"])
-    records = [record for record in found.items if record.id not in removals]
+    matching = service.captures.page(query, SHOWN, requested["after"])
+    records = [record for record in matching.items if record.id not in removals]
     chosen = [record for record in service.captures.of([requested["capture"] or ""]) if record.id not in removals]
     jobs = jobs_of(service, [record.id for record in (*records, *chosen)])
     lines = [capture_line(record, jobs[record.id]) for record in records]
     return {
         "captures": lines,
         "chosen": capture_line(chosen[0], jobs[chosen[0].id]) if chosen else next(iter(lines), None),
-        "next": found.next,
-        "total": found.total - (len(found.items) - len(records)),
+        "next": matching.next,
+        "total": matching.total - (len(matching.items) - len(records)),
         "sessions": sessions_list(service, requested["session"]),
         "tags": shared.get("tags", 1.0, service.captures.tags),
         "models": shared.get("models", 30.0, lambda: list(list_models())),
@@ -146,9 +140,9 @@ def edit(page: Page, event: EditForm) -> None:
 
 def new_session(page: Page, event: SessionForm) -> Message:
     """Makes a session. Raises InputError for invalid texts."""
-    made = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
+    session = page.service.sessions.add(event.get("label", ""), event.get("consent", ""))
     forget_captures()
-    return compose("session-begun", name=made.label or made.id[-6:])
+    return compose("session-begun", name=session.label or session.id[-6:])
 
 
 def edit_consent(page: Page, event: SessionEditForm) -> None:

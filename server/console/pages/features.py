@@ -192,8 +192,8 @@ class FeaturesPage(Page, component="features.js"):
 
 def captures_to_pick(service: Service) -> list[CaptureChoice]:
     """Returns the newest ``CHOICES`` captures that show a head."""
-    found = service.captures.page(CaptureQuery(board=False), CHOICES)
-    return [choice_of(record) for record in found.items if record.id not in removals]
+    captures = service.captures.page(CaptureQuery(board=False), CHOICES)
+    return [choice_of(record) for record in captures.items if record.id not in removals]
 
 
 def choice_of(record: CaptureRecord) -> CaptureChoice:
@@ -226,8 +226,8 @@ class Landmarks:
     def _load(self, service: Service) -> None:
         try:
             with service.children.one() as child:
-                found = child.remote(mean_landmarks)(model="default", names=list(NAMES))
-            self.found = {name: np.array(point) for name, point in found.items()}
+                means = child.remote(mean_landmarks)(model="default", names=list(NAMES))
+            self.found = {name: np.array(point) for name, point in means.items()}
         finally:
             self._asked.release()
 
@@ -253,10 +253,10 @@ def suggest(page: FeaturesPage, event: object) -> Message:
     """Suggests all seven points in every view that shows the face. Suggestions are neither saved nor used before
     somebody accepts them. Raises InvalidInput if no face is certain, and what ``found_faces`` raises."""
     picked = page.of_capture()
-    found = found_faces(page.service, picked.capture)["suggested"]
-    if not found:
+    suggested = found_faces(page.service, picked.capture)["suggested"]
+    if not suggested:
         raise InvalidInput("no-subject", compose("nothing-suggested"))
-    picked.suggested = open_suggestions(found, picked.points)
+    picked.suggested = open_suggestions(suggested, picked.points)
     return compose("points-suggested", count=sum(len(views) for views in picked.suggested.values()))
 
 

@@ -18,7 +18,6 @@ from server.console.removal import removals
 from server.console.shown_messages import shown_failure
 from server.errors import Conflict, InvalidInput
 from server.services.bulk import each
-from server.services.documents import JobLine
 from server.services.job_rows import FINISHED, STATUSES
 from server.services.records import Job
 from server.services.retention import ENDED
@@ -26,6 +25,7 @@ from server.services.service import Service
 from server.services.work import ReconstructionRequest
 from server.storage.events import JobEvent
 from server.storage.job_index import JobOrder, JobQuery
+from server.storage.records import JsonObject
 
 SHOWN = 50  # jobs of a page, and of those that wait before them
 SOUGHT_MOST = 1000  # queued jobs among which a search looks for the next ones
@@ -69,18 +69,11 @@ class JobDetail(TypedDict):
     pictures: bool
 
 
-class ShownJob(JobLine):
-    """Holds a job as the list shows it, with the label and time of its capture."""
-
-    capture: str
-    captured: str | None
-
-
 class JobsState(TypedDict):
     """Holds one page of the list of jobs. The first page begins with those that run and wait. ``waiting``: how many
     more wait."""
 
-    jobs: list[ShownJob]
+    jobs: list[JsonObject]
     counts: dict[str, int]
     waiting: int
     next: str | None
@@ -91,7 +84,7 @@ class JobsState(TypedDict):
 class JobsShown(JobsState):
     """Holds what the page shows. ``job``: the selected job, which may be on another page of the list."""
 
-    job: ShownJob | None
+    job: JsonObject | None
     detail: JobDetail | None
 
 
@@ -173,9 +166,9 @@ def active_jobs(service: Service, sought: str, batch: str | None, *, running: bo
     """Returns the jobs that run and those that begin next, ``SHOWN`` at most, and how many more wait. ``running``:
     include those that run."""
     query = JobQuery(sought, ACTIVE if running else STATUSES["queued"], batch=batch)
-    found = service.jobs.page(query, SOUGHT_MOST)
-    jobs = sorted(found.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
-    return jobs[:SHOWN], found.total - min(SHOWN, len(jobs))
+    matching = service.jobs.page(query, SOUGHT_MOST)
+    jobs = sorted(matching.items, key=lambda job: (job.state != "running", job.queue_position or 0, job.id))
+    return jobs[:SHOWN], matching.total - min(SHOWN, len(jobs))
 
 
 def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
@@ -190,14 +183,14 @@ def listed_jobs(service: Service, jobs: Iterable[Job]) -> list[ListedJob]:
     return found
 
 
-def job_line(listed: ListedJob) -> ShownJob:
-    """Converts a job to an entry of the page's list."""
+def job_line(listed: ListedJob) -> JsonObject:
+    """Converts a job to an entry of the page's list: its fields, with the label and time of its capture."""
     job, notice = listed.job, listed.job.notice
     line = asdict(replace(job, error=None, notice=None, files={}))
     line |= {"error": shown_failure(job.error), "notice": None if notice is None else notice.text}
     line |= {"notice_message": None if notice is None else notice.document()}
     del line["files"]
-    return cast(ShownJob, {**line, "capture": listed.capture, "captured": listed.captured})
+    return {**line, "capture": listed.capture, "captured": listed.captured}
 
 
 def job_detail(service: Service, job_id: str) -> JobDetail:

@@ -123,14 +123,14 @@ def heads_of_subject(service: Service, head: ResultLine) -> list[ResultLine]:
 
 def result_lines(service: Service, jobs: Iterable[Job]) -> list[ResultLine]:
     """Converts jobs that have a result to entries of the page's list, with the capture and the subject of each."""
-    found = []
+    files = []
     for listed in listed_jobs(service, jobs):
         subject = ""
         if listed.session:
             with suppress(NotFound):
                 subject = service.store.session(listed.session).label
-        found.append(result_line(listed, subject))
-    return found
+        files.append(result_line(listed, subject))
+    return files
 
 
 def result_line(listed: ListedJob, subject: str) -> ResultLine:

@@ -116,10 +116,10 @@ class RigPage(Page, component="rig.js"):
 
 def job_strip(service: Service, identity: str | None) -> JobStrip | None:
     """Returns what the page shows of a job; None if there is none or it is being removed."""
-    found = service.jobs.of([identity]) if identity is not None and identity not in removals else []
-    if not found:
+    jobs = service.jobs.of([identity]) if identity is not None and identity not in removals else []
+    if not jobs:
         return None
-    job = found[0]
+    job = jobs[0]
     detail = shown_detail(job.error.detail) if job.error is not None else job.notice
     return {
         "id": job.id,
@@ -172,14 +172,14 @@ def rig_state(service: Service) -> RigShown:
     }
 
 
-def plates_shown(kept: list[PlatesVersion]) -> PlatesShown | None:
+def plates_shown(versions: list[PlatesVersion]) -> PlatesShown | None:
     """Returns what the page shows of the clean plates, from their versions, newest first. Returns None if no version is
     in use, as in the simulated studio."""
-    in_use = next((version for version in kept if version.in_use), None)
+    in_use = next((version for version in versions if version.in_use), None)
     if in_use is None:
         return None
-    before = next((version for version in kept if not version.in_use and not version.refused), None)
-    refused = kept[0] if kept[0].refused and not kept[0].in_use else None
+    before = next((version for version in versions if not version.in_use and not version.refused), None)
+    refused = versions[0] if versions[0].refused and not versions[0].in_use else None
     return {"taken": in_use.taken, "before": _plates_line(before), "refused": _plates_line(refused)}
 
 
@@ -195,12 +195,12 @@ def calibration_in_use(service: Service) -> InUse | None:
     if service.calibrations.in_use() is None:
         return None
     known: list[Calibration] = shared.get("calibrations", 2.0, service.calibrations.find)
-    for found in known:
-        if found.in_use:
+    for camera in known:
+        if camera.in_use:
             return {
-                "label": found.label,
-                "created": found.created,
-                "rms_px": cast(float | None, found.figures.get("rms_px")),
+                "label": camera.label,
+                "created": camera.created,
+                "rms_px": cast(float | None, camera.figures.get("rms_px")),
             }
     return None
 

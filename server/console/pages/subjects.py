@@ -38,12 +38,14 @@ class SubjectsPage(Page, component="subjects.js"):
 def subjects_state(service: Service, requested: Mapping[str, str | None]) -> SubjectsState:
     """Returns one page of the subjects that match a search and a tag, in the requested order."""
     order = cast(SubjectOrder, requested["sort"] if requested["sort"] in get_args(SubjectOrder) else "-created")
-    found = service.sessions.subjects(requested["find"] or "", order, SHOWN, requested["after"], tag=requested["tag"])
+    subjects = service.sessions.subjects(
+        requested["find"] or "", order, SHOWN, requested["after"], tag=requested["tag"]
+    )
     return {
-        "subjects": [asdict(subject) for subject in found.items],
+        "subjects": [asdict(subject) for subject in subjects.items],
         "tags": shared.get("tags", 1.0, service.captures.tags),
-        "next": found.next,
-        "total": found.total,
+        "next": subjects.next,
+        "total": subjects.total,
     }
 
 

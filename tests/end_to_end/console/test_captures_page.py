@@ -1,7 +1,6 @@
 """Captures in a real browser: archives, sessions, and two pages that show the same."""
 
 import base64
-import time
 from pathlib import Path
 
 import httpx
@@ -10,7 +9,14 @@ from playwright.sync_api import Browser, Page, expect
 
 from rig.formats.captures.archive import pack_folder
 from tests.support.browser import keep_screenshots, violations, visit
-from tests.support.services import RunningService, packed_capture, running_service, small_capture, uploaded_capture
+from tests.support.services import (
+    RunningService,
+    await_true,
+    packed_capture,
+    running_service,
+    small_capture,
+    uploaded_capture,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -66,10 +72,7 @@ def test_two_pages_agree_and_a_removal_is_taken_back_or_for_good(
         expect(page.locator(".row-button")).to_have_count(2, timeout=5000)
     here.locator("#remove").click()
     here.locator("#remove-pictures").click()
-    deadline = time.monotonic() + 30
-    while len(httpx.get(service.url + "/v1/captures").json()["captures"]) == 2:
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
+    await_true(lambda: len(httpx.get(service.url + "/v1/captures").json()["captures"]) != 2)
     here.locator("#reconstruct").click()
     here.wait_for_url("**/result/*", timeout=30_000)  # its head opens by itself
     jobs = two.go("/jobs")

@@ -4,12 +4,15 @@ The service is the tests' one without a worker, at 1,024 open files, systemd's d
 asks for /healthz and, with another key, for a list, twenty times a second (``tests.support.attacks``).
 """
 
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +34,7 @@ from tests.support.attacks import (
     silent_connections,
     spoiled_capture,
 )
-from tests.support.services import RunningService, packed, running_service, small_capture, upload
+from tests.support.services import ROOT, RunningService, packed, running_service, small_capture, upload
 
 FILES, CONNECTIONS, MEGABYTES = 1024, 1100, 98
 HEALTHZ_S, SLOWER, MEMORY_MB = 1.0, 3.0, 300.0  # the worst answer, the median beside a calm one, and what comes on top
@@ -62,7 +65,11 @@ def run() -> dict[str, Any]:
     """Runs all attacks. Returns the figures and a line for each attack."""
     with tempfile.TemporaryDirectory(prefix="eigenhead-attacks-") as name:
         folder = Path(name)
-        with running_service(folder / "data", worker=False) as service:
+        allowed: dict[str, Any] = {
+            "webhook_origins": '["https://*"]',
+            "deliver_prefixes": f'["file://{folder}/heads/"]',
+        }
+        with running_service(folder / "data", worker=False, **allowed) as service:
             open_to_all = http_status(service, "POST", "/v1/keys", {"name": "mine", "scopes": ["admin"]})
             rows = [Seen("first key over HTTP", "403", str(open_to_all), open_to_all == 403)]
             attacker, other = add_keys(service, "read,capture", "read,capture")
@@ -72,6 +79,7 @@ def run() -> dict[str, Any]:
                 time.sleep(3.0)
             field = Field(service, attacker, other, calm, folder)
             rows += [attack(field) for attack in ATTACKS]
+    rows += [ask_test(name, where) for name, where in TESTS.items()]
     lines = [
         f"{'held' if row.held else 'FAILS'}  {row.attack}: expected {row.expected}; seen {row.seen}" for row in rows
     ]
@@ -185,6 +193,64 @@ def frame_the_console(field: Field) -> Seen:
     )
 
 
+def call_inside(field: Field) -> Seen:
+    """Webhooks and deliveries of a real capture's job, to this machine, its network and the cloud's metadata."""
+    with client(field.service, field.attacker) as http:
+        capture = upload(http, packed(small_capture(field.folder / "inside"))).json()["id"]
+    places = [
+        {"webhook": {"url": f"https://{host}/"}} for host in ("127.0.0.1", "169.254.169.254", "[::1]", "10.0.0.1")
+    ]
+    places += [{"deliver_to": url} for url in ("file:///etc/", "s3://other/", f"file://{field.folder}/heads/../")]
+    key = add_keys(field.service, "submit")[0]
+    seen = [http_status(field.service, "POST", "/v1/jobs", {"capture_id": capture, **at}, key) for at in places]
+    return Seen("webhooks and deliveries to the inside", "4xx each", f"{seen}", all(400 <= s < 500 for s in seen))
+
+
+def send_hostile_files(field: Field) -> Seen:
+    """Camera files of other programs and feature points that are deep, huge, cyclic, or lie about their size."""
+    deep, many = b"[" * 200_000, b"&a [" + b"*a, " * 50_000
+    bombs = b"a: &a [x,x,x]\nb: &b [*a,*a,*a]\n" + b"".join(b"c%d: [*b,*b]\n" % n for n in range(2000))
+    files = {"cameras.yaml": (b"%YAML:1.0\n" + many, bombs), "transforms.json": (deep, b'{"frames": 1e999}')}
+    files |= {"cameras.bin": (b"\xff" * 64, bytes(4096)), "cameras.toml": (b"a = " + deep, b"[a.b]\n" * 9999)}
+    files |= {"scale.json": (deep, b'{"mm": NaN}'), "features.json": (deep, b'{"points": ' + b"9" * 9999 + b"}")}
+    slowest, statuses = 0.0, list[int]()
+    for number, (name, data) in enumerate((name, data) for name, some in files.items() for data in some):
+        change = partial(replace_cameras, name=name, data=data)
+        with client(field.service, field.attacker) as http:
+            began = time.monotonic()
+            archive = spoiled_capture(field.folder / f"hostile{number}", change)
+            statuses.append(upload(http, archive).status_code)
+            slowest = max(slowest, time.monotonic() - began)
+    seen, held = f"{sorted(set(statuses))}, {slowest:.1f} s at worst", all(400 <= s < 500 for s in statuses)
+    return Seen(f"{len(statuses)} hostile files of cameras and points", "4xx each in 10 s", seen, held and slowest < 10)
+
+
+def replace_cameras(folder: Path, name: str, data: bytes) -> None:
+    if "features" not in name:
+        (folder / "cameras.json").unlink()
+    (folder / name).write_bytes(data)
+
+
+def ask_much(field: Field) -> Seen:
+    def attack() -> None:
+        with client(field.service, field.attacker) as http, ThreadPoolExecutor(100) as pool:
+            statuses.extend(pool.map(lambda _: http.get("/v1/jobs").status_code, range(2000)))
+
+    statuses = list[int]()
+    row = others_under(field, "2,000 small requests, 100 at once", attack)
+    # one processor serves all: the others wait their turn, as the list does
+    held = {*statuses} == {200} and "0 failures" in row.seen
+    return Seen(row.attack, "200 each, no failure", f"{sorted(set(statuses))}, {row.seen}", held)
+
+
+def ask_test(name: str, where: str) -> Seen:
+    """Runs a test that holds a promise on a real service of its own."""
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "slow or not slow", *where.split()]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
+    seen = done.stdout.strip().splitlines()[-1] if done.stdout.strip() else done.stderr[-200:]
+    return Seen(name, "its test passes", seen, done.returncode == 0)
+
+
 def client(service: RunningService, key: str, timeout_s: float = 60.0) -> httpx.Client:
     return httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {key}"}, timeout=timeout_s)
 
@@ -206,4 +272,21 @@ ATTACKS = (
     give_up_uploads,
     erase_with_capture_scope,
     frame_the_console,
+    call_inside,
+    send_hostile_files,
+    ask_much,
 )
+AT = "tests/server"
+TESTS = {
+    "a clock that jumps by 60 days, or goes back": f"{AT}/services/test_retention.py -k clock",
+    "a result changed or cut on the disk": f"{AT}/services/test_retention.py -k somebody_changed",
+    "values of an erased subject": f"{AT}/services/test_erasure.py -k brought",
+    "work killed with signal 9": f"{AT}/worker/test_worker.py -k kills",
+    "a tus upload cut, and many open": f"{AT}/http/test_tus.py {AT}/services/test_uploads.py",
+    "a database gone, emptied, damaged": f"{AT}/http/test_serve.py -k lost_database",
+    "code in a row of the job database": f"{AT}/services/test_failures.py",
+    "jobs of dead workers": f"{AT}/worker/test_engine.py {AT}/http/test_job_ends.py",
+    "a data folder that is read only": f"{AT}/wire/test_problems.py",
+    "a disk that is full in every stage": f"{AT}/http/test_hostile.py -k full_disk",
+    "units, containers and pods": "tests/test_deploy.py",
+}

@@ -140,11 +140,7 @@ def test_a_planted_head_is_found_within_its_intervals(model: HeadModel) -> None:
               covariance=np.diag([spread**2] * count + [1e-8] * 7))  # fmt: skip
     start = model.vertices(fit.coefficients)
     found = refine_to_surface(
-        fit,
-        model,
-        head_points(truth, faces, rng),
-        eigenheads=count,
-        deviation_mm=vertex_deviation_mm(model, fit),
+        fit, model, head_points(truth, faces, rng), eigenheads=count, deviation_mm=vertex_deviation_mm(model, fit)
     )
     normals = vertex_normals(truth, faces)
     before, after = (np.abs(((at - truth) * normals).sum(axis=1)) for at in (start, found.vertices))

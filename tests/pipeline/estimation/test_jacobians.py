@@ -13,16 +13,8 @@ import pytest
 
 from calibration.adjustment.corner_term import CornerTerm
 from calibration.adjustment.lens_prior import AspectTerm
-from calibration.adjustment.state import (
-    PER_CAMERA as PER_BUNDLE_CAMERA,
-)
-from calibration.adjustment.state import (
-    PER_SHOT,
-    BundleState,
-    Observations,
-    moved_state,
-    observations,
-)
+from calibration.adjustment.state import PER_CAMERA as PER_BUNDLE_CAMERA
+from calibration.adjustment.state import PER_SHOT, BundleState, Observations, moved_state, observations
 from calibration.silhouette_refinement.tangency_term import PackedTangencies, TangencyTerm
 from pipeline.contour_fit.head_problem import FeatureTerm, apply_step
 from pipeline.contour_fit.landmark_term import LandmarkTerm, observe_landmarks

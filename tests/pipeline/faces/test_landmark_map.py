@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.applications.model_building.sources.imports import import_model
-from pipeline.faces.landmark_map import (
-    CARRIED_MM,
-    LandmarkMap,
-    NoLandmarkMap,
-    built_in_map,
-    faces_digest,
-    landmark_map,
-)
+from pipeline.faces.landmark_map import CARRIED_MM, LandmarkMap, NoLandmarkMap, built_in_map, faces_digest, landmark_map
 from pipeline.faces.points import point_table
 from pipeline.head_model.model import HeadModel, assemble, load_model
 from pipeline.head_model.model_file import read_parts

@@ -193,13 +193,7 @@ def test_no_photograph_no_map(rig):
     subject = egg_head()
     assert subject.face_region is not None
     assert not classify_parts(
-        {},
-        {},
-        rig,
-        subject.mesh,
-        subject.face_region,
-        subject.landmarks,
-        report=lambda stage, share: None,
+        {}, {}, rig, subject.mesh, subject.face_region, subject.landmarks, report=lambda stage, share: None
     )
 
 

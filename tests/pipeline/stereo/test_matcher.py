@@ -91,12 +91,7 @@ def test_planes_are_taken_over_as_by_the_loops(matchers: tuple[Matcher, Matcher]
         mine = planes(room)
         black = np.indices(mine.depth.shape).sum(axis=0) % 2 == 0
         for parity, tried in ((0, ~black), (1, black)):
-            matcher.propagate(
-                mine,
-                parity,
-                (1, 3),
-                0.1,
-            )
+            matcher.propagate(mine, parity, (1, 3), 0.1)
             mine.fresh[tried] = False
         found.append(mine)
     by_loops, by_shaders = found

@@ -41,10 +41,7 @@ def test_places_are_found_where_the_bounds_slope_otherwise_than_the_surface(monk
     crops = make_crops(images, silhouettes, rig, pixel_mm=PIXEL_MM, at_world=np.zeros(3))
     cameras = [crop.levels[0].camera for crop in crops]
     matching = Matching(
-        stack_crops(crops, 0),
-        choose_neighbours(cameras, np.zeros(3)),
-        square_pattern(2),
-        CONTRAST_LEVELS,
+        stack_crops(crops, 0), choose_neighbours(cameras, np.zeros(3)), square_pattern(2), CONTRAST_LEVELS
     )
     true = [true_depth(camera) for camera in cameras]
     ranges = []

@@ -56,12 +56,7 @@ def shots() -> dict[float, tuple[Rig, dict[str, np.ndarray], dict[str, Silhouett
 
 @pytest.mark.parametrize(
     ("taken", "written", "finding"),
-    [
-        (0.0, 0.0, None),
-        (-0.3, -0.3, None),
-        (0.0, -0.3, "pictures-undistorted"),
-        (-0.3, 0.0, "pictures-distorted"),
-    ],
+    [(0.0, 0.0, None), (-0.3, -0.3, None), (0.0, -0.3, "pictures-undistorted"), (-0.3, 0.0, "pictures-distorted")],
 )
 def test_coefficients_that_are_not_the_pictures_are_named(
     shots, taken: float, written: float, finding: str | None

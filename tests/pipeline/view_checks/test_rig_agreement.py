@@ -132,10 +132,7 @@ def test_one_camera_far_from_its_place_is_named_and_no_good_one(seen):
 
 @pytest.mark.parametrize(
     ("change", "word"),
-    [
-        (lambda mask: mask[:, ::-1], "flipped left to right"),
-        (lambda mask: mask[::-1, ::-1], "turned by 180 degrees"),
-    ],
+    [(lambda mask: mask[:, ::-1], "flipped left to right"), (lambda mask: mask[::-1, ::-1], "turned by 180 degrees")],
 )
 def test_pictures_that_are_all_turned_alike_are_named(seen, change, word):
     rig, masks, _ = seen

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from rig.drivers.base import (
-    upright,
-)
+from rig.drivers.base import upright
 
 
 @pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])

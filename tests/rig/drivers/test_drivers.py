@@ -12,13 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.drivers.base import (
-    CameraLost,
-    CameraNotFound,
-    Driver,
-    DriverMissing,
-    GrabTimeout,
-)
+from rig.drivers.base import CameraLost, CameraNotFound, Driver, DriverMissing, GrabTimeout
 from rig.drivers.opencv import VideoCaptureDriver
 from rig.drivers.registry import driver_for
 from rig.drivers.simulated import SimulatedDriver

@@ -8,10 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.drivers.base import (
-    Arrival,
-    DriverError,
-)
+from rig.drivers.base import Arrival, DriverError
 from rig.drivers.feed import CameraFeed
 from rig.drivers.registry import driver_for
 from rig.drivers.simulated import SimulatedDriver

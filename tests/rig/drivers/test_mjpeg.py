@@ -11,11 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.drivers.base import (
-    CameraLost,
-    CameraNotFound,
-    GrabTimeout,
-)
+from rig.drivers.base import CameraLost, CameraNotFound, GrabTimeout
 from rig.drivers.registry import driver_for
 from rig.formats.rig_toml import CameraConfig
 from tests.support.frames import grab_frame

@@ -33,8 +33,6 @@ RAW = {
     "server/cli/refine.py": 2,
     "server/cli/studio.py": 1,
     "server/cli/verify.py": 4,
-    "server/services/keys.py": 1,
-    "server/storage/database.py": 1,
     "server/tasks/ingest.py": 2,
     "server/tasks/photographs.py": 3,
     "server/tasks/simulate.py": 1,

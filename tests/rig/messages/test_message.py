@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 
 from rig.errors import EigenheadError, InputError
-from rig.messages.message import (
-    Message,
-    compose,
-    documents_of,
-    message_of,
-    read_message,
-    texts_of,
-    verbatim,
-)
+from rig.messages.message import Message, compose, documents_of, message_of, read_message, texts_of, verbatim
 
 MOVED = compose("camera-moved", finding=compose("camera-misplaced", camera="cam03"))
 
@@ -46,8 +38,7 @@ def test_the_text_is_the_templates() -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "parameters"),
-    [("no-json-object", {"more": 1}), ("camera-gain", {"camera": "cam00"}), ("camera-gain", {})],
+    ("code", "parameters"), [("no-json-object", {"more": 1}), ("camera-gain", {"camera": "cam00"}), ("camera-gain", {})]
 )
 def test_parameters_are_those_of_the_template(code: str, parameters: dict[str, str]) -> None:
     with pytest.raises((AssertionError, KeyError)):

@@ -14,8 +14,8 @@ from server.tasks.child import WorkFailed
 ORIGIN = Origin("", "", "", "")
 
 
-def crash(how: str, **number: int) -> WorkFailed:
-    return WorkFailed("crash", compose("work-crashed", how=compose(how, **number)))
+def crash(how: str, kind: str = "crash", **number: int) -> WorkFailed:
+    return WorkFailed(kind, compose("work-crashed", how=compose(how, **number)))
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ def crash(how: str, **number: int) -> WorkFailed:
     [
         (InputError("capture", [compose("settings-no-table")]), ORIGIN, "input", "is no table of settings"),
         (Cancelled(), ORIGIN, "refused", "cancelled"),
-        (crash("ended-by-signal", number=9), ORIGIN, "crash", "fewer --workers"),
+        (crash("ended-by-signal", "killed", number=9), ORIGIN, "crash", "fewer --workers"),
         (crash("ended-by-signal", number=11), ORIGIN, "crash", "signal 11"),
         (crash("ended-with-status", status=9), ORIGIN, "crash", "status 9"),
         (WorkFailed("out-of-memory", compose("out-of-memory")), ORIGIN, "out-of-memory", "fewer --workers"),

@@ -15,7 +15,7 @@ from server.batch.folder import ShareTaken
 from server.batch.shards import Shard
 from tests.support.pinned_batch import Silent, everything_in, pinned_capture, pinned_captures, run_pinned
 from tests.support.pinned_work import LOG, SECONDS
-from tests.support.services import ROOT
+from tests.support.services import ROOT, await_true
 
 COMMAND = [sys.executable, "-m", "tests.support.pinned_batch"]
 
@@ -121,10 +121,7 @@ def test_shares_side_by_side_begin_nothing_twice_and_a_share_has_one_process(tmp
 
 
 def await_lock(lock: Path) -> None:
-    deadline = time.monotonic() + 60
-    while not lock.exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    await_true(lambda: lock.exists(), 60)
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from server.batch import run as batch_run
 from server.cli.main import app
 from tests.support.pinned_batch import everything_in, pinned_capture, pinned_captures
 from tests.support.pinned_work import LOG, SECONDS, work
-from tests.support.services import ROOT
+from tests.support.services import ROOT, await_true
 from tests.support.small_studio import small_studio_captures
 
 
@@ -137,10 +137,7 @@ def test_a_scheduler_and_ctrl_c_end_it_and_leave_nothing(shots: Path, tmp_path: 
     command = [sys.executable, "-c", script, "batch", str(shots), "--out", str(out), "--workers", "2"]
     environment = os.environ | {SECONDS: "60", LOG: str(log)}
     with subprocess.Popen(command, cwd=ROOT, env=environment, stderr=subprocess.PIPE) as running:
-        deadline = time.monotonic() + 60
-        while not log.exists() or log.read_text().count("begins") < 2:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        await_true(lambda: not (not log.exists() or log.read_text().count("begins") < 2), 60)
         children = [int(line.split()[3]) for line in log.read_text().splitlines()]
         running.send_signal(number)
         assert running.wait(45) == 130

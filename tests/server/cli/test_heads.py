@@ -4,7 +4,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from rig.errors import EigenheadError
 from server.cli import reconstruct_local
 from server.cli.answers import SpoilsCapture
 from server.cli.main import app
-from tests.support.services import ROOT, small_capture
+from tests.support.services import ROOT, await_true, small_capture
 
 
 @pytest.mark.parametrize("as_json", [False, True])
@@ -165,10 +164,7 @@ def test_a_scheduler_ends_a_reconstruction_and_nothing_is_left(tmp_path: Path) -
     small_capture(tmp_path / "shot")
     command = [sys.executable, "-c", script, "reconstruct", str(tmp_path / "shot"), "--out", str(tmp_path / "head")]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as running:
-        deadline = time.monotonic() + 60
-        while not list(tmp_path.rglob("begun")):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        await_true(lambda: list(tmp_path.rglob("begun")), 60)
         running.send_signal(signal.SIGTERM)
         assert running.wait(45) == 130
     assert [path.name for path in tmp_path.iterdir()] == ["shot"]

@@ -20,12 +20,7 @@ from server.services.batches import ITEM_STATES
 from server.services.job_rows import FINISHED
 from server.services.storage_use import KINDS
 from server.storage.batches import BatchState
-from tests.support.console_words import (
-    CONSOLE,
-    Component,
-    component,
-    german,
-)
+from tests.support.console_words import CONSOLE, Component, component, german
 
 SCRIPTS = [path for path in sorted(CONSOLE.rglob("*.js")) if path.name not in ("de.js", "messages_de.js")]
 CHECKS = ("cheirality", "held-out shots", "scale", "frame", "determined", "known layout", "lens stability")

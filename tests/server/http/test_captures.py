@@ -144,25 +144,6 @@ def test_labels_and_sessions_can_be_put_right(http: httpx.Client, archive: bytes
     assert (alone["session"], alone["expression"]) == (None, "smile")
 
 
-def test_erasing_a_session_leaves_nothing_of_it(service: RunningService, http: httpx.Client, archive: bytes) -> None:
-    session = http.post("/v1/sessions", json={"label": "Subject 7", "consent": "signed 2024-05-01"}).json()["id"]
-    captures = [upload(http, archive, session=session, label="zebra").json()["id"] for _ in range(2)]
-    jobs = [job["id"] for job in http.post(f"/v1/sessions/{session}/jobs", json={}).json()["jobs"]]
-    assert len(jobs) == 2
-    await_state(http, jobs[0], ("running", "succeeded"))
-    assert http.get(f"/v1/sessions/{session}").json()["captures"] == sorted(captures, reverse=True)
-    for capture in captures:
-        (service.data / "cache/captures" / capture / "small").mkdir(parents=True)
-        (service.data / "cache/captures" / capture / "small/cam00.jpg").write_bytes(b"a face")
-    assert http.delete(f"/v1/sessions/{session}").status_code == 204
-    gone = [session, *captures, *jobs]
-    assert not [path for path in stored(service) if any(identity in path for identity in gone)]
-    for kind, ids in (("sessions", [session]), ("captures", captures), ("jobs", jobs)):
-        assert [http.get(f"/v1/{kind}/{identity}").status_code for identity in ids] == [404] * len(ids)
-    database = b"".join(path.read_bytes() for path in service.data.glob("eigenhead.sqlite*"))
-    assert b"Subject 7" not in database
-
-
 def test_a_resumable_upload_goes_on_after_a_break(http: httpx.Client, archive: bytes) -> None:
     tus = {"Tus-Resumable": "1.0.0"}
     created = http.post("/v1/uploads", headers=tus | {"Upload-Length": str(len(archive))})

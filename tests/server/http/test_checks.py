@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.support.attacks import add_keys, jpeg_with_metadata, png_of_chunks, spoiled_capture
-from tests.support.services import RunningService, packed, running_service, small_capture, upload
+from tests.support.services import RunningService, await_true, packed, running_service, small_capture, upload
 
 CHUNKS = 4_000_000  # of a PNG: half a minute and more of one process
 CHECK_S = 12.0
@@ -99,10 +99,7 @@ def test_a_client_who_goes_in_the_midst_of_a_body_is_no_fault_of_the_service(
     with socket.create_connection(("127.0.0.1", service.port)) as sock:
         sock.sendall(head.encode() + b"Content-Length: 1000\r\n\r\n" + bytes(100))
         time.sleep(0.3)
-    deadline = time.monotonic() + 10
-    while "method=PATCH" not in service.log.read_text():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    await_true(lambda: "method=PATCH" in service.log.read_text(), 10)
     (line,) = (line for line in service.log.read_text().splitlines() if "method=PATCH" in line)
     assert "status=409" in line
     assert "unforeseen" not in service.log.read_text()

@@ -4,20 +4,24 @@ that is full."""
 import errno
 import json
 import os
+import re
 import shutil
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from rig.formats.captures.archive import pack_folder
 from tests.rig.formats.captures.test_archive import HOSTILE
+from tests.support.attacks import process_tree
 from tests.support.disks import small_disk
-from tests.support.services import RunningService, await_state, running_service, small_capture
+from tests.support.services import RunningService, await_state, packed, running_service, served_client, small_capture
 
 MEMORY_MOST = 1 << 30
 
@@ -62,6 +66,10 @@ def writes(name: str, data: bytes) -> Callable[[Path], None]:
     return spoil
 
 
+def points(text: str) -> Callable[[Path], None]:
+    return writes("features.json", b'{"format": "eigenhead-features/1", "points": {%s}}' % text.encode())
+
+
 def removes(name: str) -> Callable[[Path], None]:
     return lambda folder: (folder / name).unlink()
 
@@ -101,10 +109,7 @@ SPOILT: dict[str, tuple[Callable[[Path], None], str]] = {
     "huge focal length": (cameras(of_first("intrinsics.fx", 1e300)), "finite number"),
     "negative focal length": (cameras(of_first("intrinsics.fx", -1.0)), "positive"),
     "text for a number": (cameras(of_first("intrinsics.cx", "middle")), "finite number"),
-    "mirrored rotation": (
-        cameras(of_first("camera_from_world.rotation", [[1, 0, 0], [0, 1, 0], [0, 0, -1]])),
-        "mirrored",
-    ),
+    "mirrored rotation": (cameras(of_first("camera_from_world.rotation", np.diag([1, 1, -1]).tolist())), "mirrored"),
     "no rotation at all": (cameras(of_first("camera_from_world.rotation", [[0, 0, 0]] * 3)), "orthonormal"),
     "no translation": (cameras(of_first("camera_from_world.translation", None)), "translation"),
     "name with a path": (cameras(of_first("name", "../../etc/passwd")), "may hold only"),
@@ -127,32 +132,17 @@ SPOILT: dict[str, tuple[Callable[[Path], None], str]] = {
     "two images of a camera": (writes("images/cam00.jpg", png_claiming(24, 24)), "which one is meant"),
     "missing image": (removes("images/cam02.png"), "images/cam02.png is missing"),
     "missing plate": (removes("background/cam01.png"), "background/cam01.png is missing"),
-    "features of no camera": (
-        writes("features.json", b'{"format": "eigenhead-features/1", "points": {"a": {"camX": [1, 2]}}}'),
-        "does not have",
-    ),
-    "features outside": (
-        writes("features.json", b'{"format": "eigenhead-features/1", "points": {"a": {"cam00": [900, 2]}}}'),
-        "outside the image",
-    ),
-    "features of NaN": (
-        writes("features.json", b'{"format": "eigenhead-features/1", "points": {"a": {"cam00": [NaN, 2]}}}'),
-        "finite pixels",
-    ),
+    "features of no camera": (points('"a": {"camX": [1, 2]}'), "does not have"),
+    "features outside": (points('"a": {"cam00": [900, 2]}'), "outside the image"),
+    "features of NaN": (points('"a": {"cam00": [NaN, 2]}'), "finite pixels"),
     "features that are no object": (writes("features.json", b"[]"), "no object"),
     "every camera at one place": (cameras(of_each("camera_from_world.translation", [0, 0, 1000])), "at one place"),
     "translations in metres": (cameras(in_metres), "look like metres"),
     "a lens of k1 = 50": (cameras(of_first("distortion.k1", 50)), "lens is absurd"),
     "an image without a camera": (writes("images/foo.png", png_claiming(24, 24)), "images/foo.png has no camera"),
     "an image turned": (writes("images/cam00.png", png_claiming(24, 30)), "24 x 30"),
-    "features in one view": (
-        writes("features.json", b'{"format": "eigenhead-features/1", "points": {"pronasale": {"cam00": [1, 2]}}}'),
-        "in one view only",
-    ),
-    "features of a third eye": (
-        writes("features.json", b'{"format": "eigenhead-features/1", "points": {"third_eye": {"cam00": [1, 2]}}}'),
-        "is no landmark",
-    ),
+    "features in one view": (points('"pronasale": {"cam00": [1, 2]}'), "in one view only"),
+    "features of a third eye": (points('"third_eye": {"cam00": [1, 2]}'), "is no landmark"),
     "features on a line": (writes("features.json", features_on_a_line()), "lie on one line"),
     "pictures that are their plates": (copies("background", "images"), "its own clean plate"),
 }  # fmt: skip
@@ -165,33 +155,24 @@ def bodies(tmp_path: Path) -> Iterator[tuple[str, bytes, str]]:
     for number, (case, (spoil, word)) in enumerate(SPOILT.items()):
         folder = small_capture(tmp_path / f"spoilt{number}")
         spoil(folder)
-        pack_folder(folder, folder.with_suffix(".tar"))
-        yield case, folder.with_suffix(".tar").read_bytes(), word
+        yield case, packed(folder), word
 
 
 def peak_memory(service: RunningService) -> int:
     """The largest peak of the service's processes, bytes."""
     assert service.process is not None
-    pids, peak = {service.process.pid}, 0
-    for folder in sorted(Path("/proc").glob("[0-9]*"), key=lambda path: int(path.name)):
-        try:
-            status = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines() if ":" in line)
-        except OSError:
-            continue
-        if int(folder.name) in pids or int(status["PPid"]) in pids:
-            pids.add(int(folder.name))
-            peak = max(peak, int(status.get("VmHWM", "0 kB").split()[0]) * 1024)
-    return peak
+    peaks = [0]
+    for pid in process_tree(service.process.pid):
+        with suppress(OSError):  # it has ended
+            peaks += map(int, re.findall(r"VmHWM:\s+(\d+)", Path(f"/proc/{pid}/status").read_text()))
+    return max(peaks) * 1024
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_eighty_hostile_uploads(tmp_path: Path) -> None:
-    with (
-        running_service(tmp_path / "data", worker=False) as service,
-        httpx.Client(base_url=service.url, timeout=120) as client,
-    ):
+    with served_client(tmp_path / "data", worker=False) as (service, client):
         kinds = ("captures", "incoming", "uploads", "trash")
 
         def disk() -> dict[str, int]:
@@ -234,9 +215,7 @@ def fill(disk: Path, leave: int) -> Path:
 @pytest.mark.timeout(300)
 def test_a_full_disk_is_said_and_survived(tmp_path: Path) -> None:
     """During an upload, a fit and the writing of a result; afterwards everything is listed, deletable, and works."""
-    folder = small_capture(tmp_path / "capture", size=200)
-    pack_folder(folder, tmp_path / "capture.tar")
-    data = (tmp_path / "capture.tar").read_bytes()
+    data = packed(small_capture(tmp_path / "capture", size=200))
     with (
         small_disk(tmp_path / "disk", 48) as disk,
         running_service(disk / "data", free_bytes="0", tiny_s="1.5", tiny_bytes=str(6 << 20)) as service,

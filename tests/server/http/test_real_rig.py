@@ -20,7 +20,7 @@ from server.services.rigs.opening import open_rig
 from server.settings import ServiceSettings
 from tests.rig.acquisition.test_session import flat_rig
 from tests.support.board_pictures import BoardPictures
-from tests.support.services import running_service
+from tests.support.services import running_service, served_client
 from tests.support.shared_data import shared
 from tests.support.textured_studio import NAMES, FlatStudio
 
@@ -39,10 +39,7 @@ def studio(tmp_path: Path) -> Iterator[StudioDevices]:
 
 def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_path: Path) -> None:
     rig_file = str(studio.folder / "rig.toml")
-    with (
-        running_service(tmp_path / "data", worker=False, rig=rig_file) as service,
-        httpx.Client(base_url=service.url, timeout=60) as client,
-    ):
+    with served_client(tmp_path / "data", worker=False, rig=rig_file) as (_, client):
         state = client.get("/v1/rig").json()
         assert (state["kind"], state["calibration"], len(state["cameras"])) == ("real", "own", 11)
         made = client.post("/v1/captures", json={"label": "first", "expression": "neutral"})
@@ -104,10 +101,7 @@ def test_captures_come_from_the_cameras_of_rig_toml(studio: StudioDevices, tmp_p
 
 
 def test_lamps_settings_and_a_moving_preview_over_http(studio: StudioDevices, tmp_path: Path) -> None:
-    with (
-        running_service(tmp_path / "data", worker=False, rig=str(studio.folder / "rig.toml")) as service,
-        httpx.Client(base_url=service.url, timeout=60) as client,
-    ):
+    with served_client(tmp_path / "data", worker=False, rig=str(studio.folder / "rig.toml")) as (_, client):
         studio.seat(False)  # five takes in turn, each with noise of its own
         assert client.get("/v1/rig/lights").json() == {"outputs": [0, 1]}
         with client.stream("GET", "/v1/rig/cameras/cam03/preview.mjpg", params={"seconds": 1.6}) as stream:

@@ -1,12 +1,13 @@
 """What a removal leaves, what an erasure takes, and that consent comes first."""
 
+import base64
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
 
-from tests.support.services import RunningService, await_state, packed_capture, running_service
+from tests.support.services import RunningService, await_state, packed_capture, running_service, served_client
 
 
 @pytest.fixture(scope="module")
@@ -19,6 +20,48 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService
 def client(service: RunningService) -> Iterator[httpx.Client]:
     with httpx.Client(base_url=service.url, timeout=30) as client:
         yield client
+
+
+HOOK = "http://127.0.0.1:9"  # nobody answers there, so that its messages wait
+
+
+def test_nothing_that_the_subject_brought_is_left(tmp_path: Path) -> None:
+    """In database, files, caches and logs: what was typed, where webhooks were called, and with which secret."""
+    secret = base64.b64encode(b"of quast, of thirty-two bytes or so").decode()
+    who, ink, profile, smirk, tag, head, tus, run = (f"quast{number}-brought" for number in range(8))
+    brought = [who, ink, profile, smirk, tag, head, tus, run, f"{HOOK}/quast", secret]
+    with served_client(tmp_path / "data", webhook_origins=f'["{HOOK}"]') as (service, client):
+        session = client.post("/v1/sessions", json={"label": who, "consent": ink}).json()["id"]
+        fields = {"session": session, "label": profile, "expression": smirk, "tags": tag}
+        captures = [upload(client, tmp_path, seed, **fields).json()["id"] for seed in (5, 6)]
+        captures.append(upload_in_pieces(client, packed_capture(tmp_path, 7).read_bytes(), session=session, label=tus))
+        hook = {"url": f"{HOOK}/quast", "secret": f"whsec_{secret}"}
+        wanted = {"capture_id": captures[0], "name": head, "webhook": hook}
+        job = client.post("/v1/jobs", json=wanted).json()["id"]
+        batch = client.post("/v1/batches", json={"captures": captures, "label": run}).json()["id"]
+        await_state(client, job, ("succeeded",))
+        (service.data / "captures" / captures[1] / "record.json").write_text("{")
+        assert client.get(f"/v1/captures/{captures[1]}").status_code == 404, "it is set aside now"
+        assert traces(service, brought) == {*brought}
+        assert client.delete(f"/v1/sessions/{session}").status_code == 204
+        assert client.get(f"/v1/batches/{batch}").json()["label"] == ""
+        assert traces(service, brought) == set()
+        assert not [path for path in service.data.rglob("*") if any(each in path.name for each in (*captures, job))]
+
+
+def upload_in_pieces(client: httpx.Client, archive: bytes, **fields: str) -> str:
+    """Uploads an archive by tus. Returns the id of its capture."""
+    named = ",".join(f"{name} {base64.b64encode(text.encode()).decode()}" for name, text in fields.items())
+    headers = {"Tus-Resumable": "1.0.0", "Upload-Length": str(len(archive)), "Upload-Metadata": named}
+    headers |= {"Content-Type": "application/offset+octet-stream", "Upload-Offset": "0"}
+    place = client.post("/v1/uploads", headers=headers).headers["location"]
+    return client.patch(place, headers=headers, content=archive).headers["location"].rpartition("/")[2]
+
+
+def traces(service: RunningService, values: list[str]) -> set[str]:
+    """Those of the values that a file below the data folder holds, or the service's log."""
+    files = [service.log, *(path for path in service.data.rglob("*") if path.is_file())]
+    return {value for path in files for value in values if value.encode() in path.read_bytes()}
 
 
 def upload(client: httpx.Client, folder: Path, seed: int, **fields: str) -> httpx.Response:

@@ -86,15 +86,6 @@ def test_only_a_hash_is_stored(keys: Keys, tmp_path: Path) -> None:
     assert secret not in str(rows)
 
 
-def test_admin_may_all_and_others_what_they_hold() -> None:
-    assert [Caller("k", frozenset({"read"})).may(scope) for scope in ("read", "submit", "admin")] == [
-        True,
-        False,
-        False,
-    ]
-    assert all(Caller("k", frozenset({"admin"})).may(scope) for scope in ("read", "capture", "submit", "admin"))
-
-
 def test_the_network_needs_a_key_and_the_refusal_names_the_place(keys: Keys, tmp_path: Path) -> None:
     check_address(ServiceSettings(data=tmp_path), keys)
     with pytest.raises(KeylessAddress, match=r"^refusing to listen on 0\.0\.0\.0 without an API key"):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from server.errors import Conflict, DiskFull, NotFound, TooLarge
+from server.errors import Conflict, DiskFull, NotFound, TooLarge, TooMany
 from server.services.uploads import ResumableUploads, too_large
 from server.settings import ServiceSettings
 from server.storage.store import Store, new_id
@@ -45,6 +45,15 @@ def test_it_may_be_as_large_as_the_limit_and_no_larger(store: Store) -> None:
     with pytest.raises(TooLarge, match="400 bytes") as refused:
         some.create(401, {}, "key")
     assert refused.value.kind == too_large(ServiceSettings(data=store.data)).kind == "upload-too-large"
+
+
+def test_a_key_has_so_many_unfinished_uploads_and_no_more(store: Store) -> None:
+    some = uploads(store, uploads_per_key=2)
+    first, _, _ = (some.create(10, {}, key) for key in ("a", "a", "b"))
+    with pytest.raises(TooMany, match="2 uploads of this key"):
+        some.create(10, {}, "a")
+    some.save(replace(first, capture=new_id()))
+    assert some.create(10, {}, "a")
 
 
 def test_room_is_kept_for_what_others_were_promised(store: Store) -> None:

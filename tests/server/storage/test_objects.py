@@ -14,12 +14,7 @@ import pytest
 from server.errors import DiskFull, InvalidInput
 from server.settings import ServiceSettings
 from server.storage.object_places import key_faults, locate, open_objects
-from server.storage.objects import (
-    ObjectMissing,
-    ObjectStore,
-    StoreDenied,
-    StoreUnavailable,
-)
+from server.storage.objects import ObjectMissing, ObjectStore, StoreDenied, StoreUnavailable
 from server.wire.problems import problem_from
 from tests.support.object_server import Network, client_of, with_keys
 from tests.support.services import ROOT

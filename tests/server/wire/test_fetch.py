@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.support.services import RunningService, await_state, packed_capture, running_service
+from tests.support.services import RunningService, await_state, await_true, packed_capture, running_service
 
 
 class Store:
@@ -141,10 +141,7 @@ def test_a_jobs_own_webhook_name_and_log(service: RunningService, store: Store) 
         job = client.post("/v1/jobs", json=wanted | {"webhook": {"url": store.url + "/hook", "secret": secret}}).json()
         assert job["name"] == "Anna, fine"
         assert await_state(client, job["id"], ("succeeded",))["name"] == "Anna, fine"
-        deadline = time.monotonic() + 30
-        while not store.received:
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+        await_true(lambda: store.received, 30)
         headers, body = store.received[0]
         assert headers["webhook-signature"].startswith("v1,")
         assert job["id"] in body.decode()

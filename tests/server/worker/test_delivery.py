@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from tests.support.object_server import KEYS, Network, client_of, network_before
 from tests.support.services import (
     RunningService,
     await_state,
+    await_true,
     packed_capture,
     running_service,
     uploaded_capture,
@@ -121,13 +122,6 @@ def awaited(client: httpx.Client, job: str, state: str, timeout_s: float = 60.0)
     return document
 
 
-def until(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 def delivered(bucket: Any, job: str, below: str = "heads/") -> dict[str, bytes]:
     prefix = f"{below}{job}/"
     listed = bucket.list_objects_v2(Bucket="studio-out", Prefix=prefix).get("Contents", ())
@@ -143,7 +137,7 @@ def test_a_result_is_delivered_and_the_webhook_says_where(
     document = awaited(client, job, "delivered")
     place = f"s3://studio-out/heads/study 4/{job}/"
     assert document["delivery"] == {"to": place, "state": "delivered", "error": None}
-    until(lambda: hook.of(job, "job.delivered"))
+    await_true(lambda: hook.of(job, "job.delivered"))
     assert hook.of(job, "job.delivered") == [{"job_id": job, "delivered_to": place}]
     assert hook.of(job, "job.succeeded") == [{"job_id": job}]
     files = delivered(bucket, job, "heads/study 4/")
@@ -169,7 +163,7 @@ def test_a_delivery_waits_for_the_store_and_other_jobs_go_on(
     way.fail(fault, 10_000, "PUT")
     job = submitted(client, capture, "s3://studio-out/heads/")
     await_state(client, job, ("succeeded",))
-    until(lambda: ("PUT", f"/studio-out/heads/{job}/head.glb") in way.seen)
+    await_true(lambda: ("PUT", f"/studio-out/heads/{job}/head.glb") in way.seen)
     other = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
     assert await_state(client, other, ("succeeded",))["delivery"] is None
     assert client.get(f"/v1/jobs/{job}").json()["delivery"]["state"] == "delivering"
@@ -186,7 +180,7 @@ def test_a_killed_worker_leaves_a_delivery_that_another_ends(
 ) -> None:
     way.fail("503", 10_000, "PUT", "cam00")
     job = submitted(client, capture, "s3://studio-out/heads/", webhook={"url": hook.url})
-    until(lambda: any(job in path and "cam00" in path for method, path in way.seen if method == "PUT"))
+    await_true(lambda: any(job in path and "cam00" in path for method, path in way.seen if method == "PUT"))
     for pid in worker_pids(service):
         os.kill(pid, signal.SIGKILL)
     assert "delivery.json" not in delivered(bucket, job)
@@ -195,7 +189,7 @@ def test_a_killed_worker_leaves_a_delivery_that_another_ends(
     files = delivered(bucket, job)
     del files["delivery.json"]
     assert {name: len(data) for name, data in files.items()} == {n: f["bytes"] for n, f in document["files"].items()}
-    until(lambda: hook.of(job, "job.delivered"))
+    await_true(lambda: hook.of(job, "job.delivered"))
     assert len([path for method, path in way.seen if method == "PUT" and path.endswith(f"{job}/head.glb")]) == 1
 
 
@@ -207,7 +201,7 @@ def test_what_the_store_refuses_fails_and_is_delivered_elsewhere(
     assert document["state"] == "succeeded"
     assert document["delivery"]["error"]["type"] == "urn:eigenhead:problem:store-denied"
     assert "NoSuchBucket" in document["delivery"]["error"]["detail"]
-    until(lambda: hook.of(job, "job.undelivered"))
+    await_true(lambda: hook.of(job, "job.undelivered"))
     nas = service.data.parent / "nas"
     again = client.post(f"/v1/jobs/{job}/delivery", json={"to": f"file://{nas}/heads"})
     assert again.status_code == 202, again.text
@@ -221,21 +215,21 @@ def test_a_job_that_is_removed_meanwhile_is_not_delivered(
 ) -> None:
     way.fail("503", 10_000, "PUT")
     job = submitted(client, capture, "s3://studio-out/heads/")
-    until(lambda: any(job in path for _, path in way.seen))
+    await_true(lambda: any(job in path for _, path in way.seen))
     await_state(client, job, ("succeeded",))
     assert client.delete(f"/v1/jobs/{job}").status_code == 204
     way.heal()
     other = submitted(client, capture, "s3://studio-out/heads/")
     awaited(client, other, "delivered")
     time.sleep(1.5)  # the first pause of one that waits
-    until(lambda: not delivered(bucket, job))  # a file that was on its way is taken back
+    await_true(lambda: not delivered(bucket, job))  # a file that was on its way is taken back
 
 
 def test_a_batch_delivers_each_of_its_results(client: httpx.Client, capture: str, bucket: Any) -> None:
     wanted = {"captures": [capture], "deliver_to": "s3://studio-out/heads/batch/"}
     batch = client.post("/v1/batches", json=wanted).json()
     assert batch["deliver_to"] == "s3://studio-out/heads/batch/"
-    until(lambda: client.get("/v1/jobs", params={"batch": batch["id"]}).json()["total"])
+    await_true(lambda: client.get("/v1/jobs", params={"batch": batch["id"]}).json()["total"])
     (job,) = client.get("/v1/jobs", params={"batch": batch["id"]}).json()["jobs"]
     awaited(client, job["id"], "delivered")
     assert {*delivered(bucket, job["id"], "heads/batch/")} == NAMES | {"delivery.json"}

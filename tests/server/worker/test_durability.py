@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,21 @@ import sqlalchemy as sa
 from psycopg.errors import LockNotAvailable
 from sqlalchemy.exc import OperationalError
 
-from rig.formats.captures.archive import pack_folder
 from server.settings import ServiceSettings
+from tests.support.attacks import process_tree
 from tests.support.postgres import running_postgres
-from tests.support.services import ROOT, RunningService, await_state, running_service, small_capture, worker_pids
+from tests.support.services import (
+    ROOT,
+    RunningService,
+    await_state,
+    await_true,
+    packed,
+    running_service,
+    served_client,
+    small_capture,
+    uploaded_capture,
+    worker_pids,
+)
 
 NIGHTLY = pytest.mark.nightly
 
@@ -34,14 +45,6 @@ def database(kind: str) -> Iterator[dict[str, Any]]:
         return
     with running_postgres() as url:
         yield {"database_url": url}
-
-
-def make_capture(service: RunningService, folder: Path) -> str:
-    pack_folder(small_capture(folder), folder.with_suffix(".tar"))
-    with folder.with_suffix(".tar").open("rb") as stream:
-        response = httpx.post(service.url + "/v1/captures/uploads", files={"file": stream}, timeout=60)
-    assert response.status_code == 201, response.text
-    return response.json()["id"]
 
 
 def submit(service: RunningService, capture: str, number: int, settings: dict[str, Any] | None = None) -> str:
@@ -68,13 +71,13 @@ def submit(service: RunningService, capture: str, number: int, settings: dict[st
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
 @pytest.mark.parametrize(("total", "kills"), [(12, 4), pytest.param(100, 30, marks=NIGHTLY)])
 def test_jobs_survive_kills(kind: str, total: int, kills: int, tmp_path: Path) -> None:
-    """Every third kill takes the service, the others its workers."""
+    """In turn a worker, the child that does its work, the service, and PostgreSQL, which then restarts itself."""
     rng = random.Random(20240501)
     with (
         database(kind) as settings,
         running_service(tmp_path / "data", silent_s="5", tiny_s="0.3", jobs_per_key="1000", **settings) as service,
     ):
-        capture = make_capture(service, tmp_path / "capture")
+        capture = uploaded_capture(service, tmp_path)
         jobs = [submit(service, capture, 0)]
         with httpx.Client(base_url=service.url) as client:
             undisturbed = await_state(client, jobs[0], ("succeeded",), 60)["files"]
@@ -83,18 +86,21 @@ def test_jobs_survive_kills(kind: str, total: int, kills: int, tmp_path: Path) -
             time.sleep(rng.uniform(0.2, 2.0))
             if number < total // 2:
                 jobs.append(submit(service, capture, total // 2 + number))
-            if number % 3 == 2:
+            if number % 4 == 2:
                 service.kill()
                 service.start()
+            elif number % 4 == 3 and settings:
+                kill_a_session(settings["database_url"])
             else:
                 for pid in worker_pids(service):
-                    os.kill(pid, signal.SIGKILL)
+                    for victim in children_of(pid) if number % 4 == 1 else [pid]:
+                        os.kill(victim, signal.SIGKILL)
         jobs += [submit(service, capture, number) for number in range(total // 2 + kills, total)]
         assert len(set(jobs)) == total
         with httpx.Client(base_url=service.url, timeout=30) as client:
-            for job in jobs:
-                done = await_state(client, job, ("succeeded", "failed", "cancelled"), 240)
-                assert (done["state"], done["files"]) == ("succeeded", undisturbed)
+            ended = [await_state(client, job, ("succeeded", "failed", "cancelled"), 240) for job in jobs]
+            assert [(job["state"], job["files"]) for job in ended] == [("succeeded", undisturbed)] * total
+            assert [job["finished"] for job in ended] == sorted(job["finished"] for job in ended), "places are kept"
             listed = client.get("/v1/jobs", params={"limit": 1000}).json()["jobs"]
         assert sorted(job["id"] for job in listed) == sorted(jobs)
         heads = {
@@ -112,11 +118,9 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
     """Reconstructions of a simulated shot, SIGKILLs into one that runs: every second one takes the service, too.
     report.json tells times of its own; every other file is the undisturbed one."""
     rng = random.Random(4)
-    with (
-        running_service(
-            tmp_path / "data", work="server.tasks.reconstruct:reconstruct_capture", silent_s="5"
-        ) as service,
-        httpx.Client(base_url=service.url, timeout=120) as client,
+    with served_client(tmp_path / "data", work="server.tasks.reconstruct:reconstruct_capture", silent_s="5") as (
+        service,
+        client,
     ):
         capture = client.post("/v1/captures", json={"seed": 1}).json()["id"]
         settings = {"detail": "span", "outputs": {"surface": "head"}}
@@ -138,6 +142,24 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
         assert [files_of(job) for job in ended] == [undisturbed] * total
 
 
+def children_of(worker: int) -> list[int]:
+    """Processes below a worker that do jobs' work: not what the tests start them with."""
+    found = []
+    for pid in process_tree(worker)[1:]:
+        with suppress(OSError):  # it has ended
+            found += [pid] if b"tasks.child" in Path(f"/proc/{pid}/cmdline").read_bytes() else []
+    return found
+
+
+def kill_a_session(url: str) -> None:
+    """SIGKILL of one of PostgreSQL's processes: the server then ends all of them and recovers from its log."""
+    engine = sa.create_engine(ServiceSettings(database_url=url).url)
+    with suppress(OperationalError), engine.connect() as connection:  # this one ends, too
+        mine = "datname IS NOT NULL AND pid != pg_backend_pid()"
+        os.kill(connection.scalar(sa.text(f"SELECT pid FROM pg_stat_activity WHERE {mine} LIMIT 1")), signal.SIGKILL)
+    engine.dispose()
+
+
 def files_of(job: dict[str, Any]) -> dict[str, str]:
     """sha256 of a job's files, without what tells how long it took."""
     return {name: file["sha256"] for name, file in job["files"].items() if name != "report.json"}
@@ -145,10 +167,7 @@ def files_of(job: dict[str, Any]) -> dict[str, str]:
 
 def await_running(client: httpx.Client, jobs: list[str]) -> None:
     """Until one of the jobs runs."""
-    deadline = time.monotonic() + 60
-    while all(client.get(f"/v1/jobs/{job}").json()["state"] != "running" for job in jobs):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    await_true(lambda: not all(client.get(f"/v1/jobs/{job}").json()["state"] != "running" for job in jobs), 60)
 
 
 @contextmanager
@@ -219,7 +238,7 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
         running_service(tmp_path / "data", worker=False, tiny_s="3", **settings) as service,
         httpx.Client(base_url=service.url, timeout=30) as client,
     ):
-        capture = make_capture(service, tmp_path / "capture")
+        capture = uploaded_capture(service, tmp_path)
         with pinned_worker(service) as first:
             job = submit(service, capture, 0)
             await_state(client, job, ("running",))
@@ -241,9 +260,7 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
 def test_killed_uploads_and_restarts_keep_what_was_accepted(tmp_path: Path) -> None:
     """The service is killed while uploads run; every accepted capture is there afterwards, whole, and no other."""
     with running_service(tmp_path / "data", worker=False) as service:
-        folder = small_capture(tmp_path / "capture")
-        pack_folder(folder, tmp_path / "capture.tar")
-        data, accepted, rng = (tmp_path / "capture.tar").read_bytes(), [], random.Random(1)
+        data, accepted, rng = packed(small_capture(tmp_path / "capture")), [], random.Random(1)
         for _ in range(6):
             killer = subprocess.Popen(["sleep", str(rng.uniform(0.05, 1.0))])
             while killer.poll() is None:
@@ -266,7 +283,7 @@ def test_killed_uploads_and_restarts_keep_what_was_accepted(tmp_path: Path) -> N
 
 def test_a_damaged_record_is_set_aside_and_reported_and_strangers_files_stay(tmp_path: Path) -> None:
     with running_service(tmp_path / "data", worker=False, sweep_s="0.2") as service:
-        kept, damaged = (make_capture(service, tmp_path / name) for name in ("one", "two"))
+        kept, damaged = (uploaded_capture(service, tmp_path, seed) for seed in (1, 2))
         (service.data / "captures" / damaged / "record.json").write_text('{"format": "eigenhead-capt')
         (service.data / "captures" / "mine").mkdir()
         (service.data / "captures" / "mine" / "notes.txt").write_text("not yours")

@@ -4,7 +4,7 @@ erased is gone with every version; a store that is away holds jobs up and makes 
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from tests.support.object_server import KEYS, Network, client_of, network_before
 from tests.support.services import (
     RunningService,
     await_state,
+    await_true,
     packed,
     running_service,
     small_capture,
@@ -83,13 +84,6 @@ def listed(bucket: Any, job: str) -> set[str]:
     return {entry["Key"].removeprefix(f"of/{job}/") for entry in found}
 
 
-def until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-
-
 def age(folder: Path) -> None:
     """Makes files look unused for an hour."""
     for path in folder.rglob("*"):
@@ -105,10 +99,7 @@ def test_a_result_goes_from_the_data_folder_and_comes_back(
     assert {*files} == NAMES == listed(bucket, job)
     folder = service.data / "jobs" / job / "result"
     age(folder)
-    deadline = time.monotonic() + 30
-    while any(path.is_file() for path in folder.rglob("*")):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    await_true(lambda: not any(path.is_file() for path in folder.rglob("*")), 30)
     assert client.get(f"/v1/jobs/{job}").json()["notice"] is None
     for fault in ("503", "torn"):
         way.fail(fault, 1000, "GET")
@@ -144,12 +135,12 @@ def test_a_capture_goes_from_the_data_folder_and_comes_back(
         os.utime(folder, (time.time() - 7200, time.time() - 7200))
         return not [*folder.glob("images/*.png")]
 
-    until(gone)
+    await_true(gone)
     way.fail("torn", 1000, "GET")
     assert client.get(f"/v1/captures/{capture}/images/cam00").status_code == 503
     way.heal()
     assert client.get(f"/v1/captures/{capture}/images/cam00").content == pictures["cam00.png"]
-    until(gone)
+    await_true(gone)
     await_state(client, submitted(client, capture), ("succeeded",))
     assert {path.name: path.read_bytes() for path in (folder / "images").iterdir()} == pictures
     assert client.delete(f"/v1/captures/{again}").status_code == 204
@@ -159,7 +150,7 @@ def test_a_capture_goes_from_the_data_folder_and_comes_back(
     assert client.delete(f"/v1/captures/{capture}", params={"erase": True}).status_code == 503
     way.heal()
     assert client.delete(f"/v1/captures/{capture}", params={"erase": True}).status_code == 204
-    until(lambda: not versions())  # a sweep that was storing the capture again takes that back
+    await_true(lambda: not versions())  # a sweep that was storing the capture again takes that back
 
 
 def test_a_capture_is_taken_while_the_store_is_away(
@@ -170,7 +161,7 @@ def test_a_capture_is_taken_while_the_store_is_away(
     assert answer.status_code == 201
     way.heal()
     record = (tmp_path / "late" / "cameras.json").read_bytes()
-    until(
+    await_true(
         lambda: hashlib.sha256(record).hexdigest() in str(bucket.list_objects_v2(Bucket="results", Prefix="captures/"))
     )
 
@@ -178,10 +169,7 @@ def test_a_capture_is_taken_while_the_store_is_away(
 def test_a_job_waits_for_the_store_and_goes_on(client: httpx.Client, capture: str, bucket: Any, way: Network) -> None:
     way.fail("503", 10_000, "PUT")
     job = submitted(client, capture)
-    deadline = time.monotonic() + 60
-    while not any(job in path for method, path in way.seen if method == "PUT"):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    await_true(lambda: any(job in path for method, path in way.seen if method == "PUT"), 60)
     assert client.get(f"/v1/jobs/{job}").json()["state"] == "running"
     way.heal()
     await_state(client, job, ("succeeded",), 60)
@@ -218,18 +206,18 @@ def figures(client: httpx.Client) -> dict[str, float]:
 
 def test_metrics_and_readiness_say_whether_the_store_answers(client: httpx.Client, way: Network) -> None:
     up, away = 'eigenhead_store_up{store="results"}', 'operation="list",outcome="unavailable"'
-    until(lambda: figures(client)[up] == 1.0)
+    await_true(lambda: figures(client)[up] == 1.0)
     assert (
         client.get("/readyz").json()["checks"]["store"]["detail"] == "s3://results/captures/, s3://results/of/ answers"
     )
     way.fail("503", 10_000)
-    until(lambda: figures(client)[up] == 0.0)
+    await_true(lambda: figures(client)[up] == 0.0)
     answer = client.get("/readyz")
     assert "s3://results/of/none/" in answer.json()["checks"]["store"]["detail"]
     assert answer.json()["checks"]["store"]["ok"], "captures and jobs are taken, and wait"
     assert figures(client)[f"eigenhead_store_operations{{{away}}}"] >= 1
     way.heal()
-    until(lambda: figures(client)[up] == 1.0)
+    await_true(lambda: figures(client)[up] == 1.0)
     assert figures(client)['eigenhead_store_seconds{operation="list"}'] > 0
 
 
@@ -238,7 +226,7 @@ def test_what_no_job_claims_goes_and_what_one_claims_stays(client: httpx.Client,
     await_state(client, job, ("succeeded",))
     for key in (f"of/{stray}/head.ply", f"of/{stray}/overlays/cam00.png", "of/somebody's own/head.ply"):
         bucket.put_object(Bucket="results", Key=key, Body=b"a head")
-    until(lambda: not listed(bucket, stray))
+    await_true(lambda: not listed(bucket, stray))
     assert listed(bucket, job) == NAMES
     assert listed(bucket, "somebody's own") == {"head.ply"}
 

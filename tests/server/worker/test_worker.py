@@ -136,6 +136,7 @@ def test_a_fit_is_published_once_whoever_publishes_it(worker: Worker, capture: s
         ("fail", "invalid-capture", ["cam00 sees nobody", "cam01 sees nobody"]),
         ("crash", "work-crashed", []),
         ("bug", "internal-error", []),
+        ("killed", "out-of-memory", []),
     ],
 )
 def test_work_that_fails_is_told_by_its_kind_and_leaves_nothing(
@@ -148,13 +149,14 @@ def test_work_that_fails_is_told_by_its_kind_and_leaves_nothing(
     assert list(worker.store.folder("jobs", JOB).iterdir()) == []
 
 
-def test_a_cancelled_job_stops_also_where_it_does_not_listen(worker: Worker, capture: str, engine: Engine) -> None:
+@pytest.mark.parametrize(("mode", "warnings"), [("killed once", []), ("killed below photo", ["level-lowered"])])
+def test_work_that_the_system_kills_is_done_again_and_with_less(
+    worker: Worker, capture: str, mode: str, warnings: list[str]
+) -> None:
     worker.ingest(JOB, request(capture))
-    engine.status = "CANCELLED"
-    for mode in ("long", "deaf"):  # 120 s each, did nothing stop them
-        with pytest.raises(Cancelled):
-            worker.fit(JOB, request(capture, mode))
-    assert list(worker.store.folder("jobs", JOB).iterdir()) == []
+    worker.publish(JOB, worker.fit(JOB, request(capture, mode)))
+    report = worker.store.folder("jobs", JOB) / "result" / "report.json"
+    assert [warning["code"] for warning in warnings_of(report)[2:]] == warnings
 
 
 def test_the_last_event_names_cameras_that_moved(worker: Worker, capture: str) -> None:

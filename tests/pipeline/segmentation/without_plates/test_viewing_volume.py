@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.segmentation.without_plates.viewing_volume import (
-    ask_other_views,
-    reachable,
-    viewing_ball,
-    viewing_volume,
-)
+from pipeline.segmentation.without_plates.viewing_volume import ask_other_views, reachable, viewing_ball, viewing_volume
 from rig.camera import Camera, Intrinsics
 from rig.geometry import look_at
 from rig.rig import Rig
