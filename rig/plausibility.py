@@ -15,9 +15,8 @@ ONE_PLACE_MM = 1e-3  # spread of camera centres below which all count as one poi
 LEAST_SPREAD_MM = 20.0  # of the camera centres; a rig of two metres whose file is in metres has 2
 LENS_GROWTH_LEAST, LENS_GROWTH_MOST = 0.4, 1.5  # distorted / undistorted radius: 0.6 for a barrel lens of 100 degrees
 LENS_LOST_MOST = 0.1  # share of the picture's middle that the lens model maps no ray to
-MIDDLE = (
-    0.6  # of width and height: where boards are shown and subjects stand; beyond it a good calibration may fold over
-)
+MIDDLE = 0.6  # of width and height: where boards are shown and subjects stand; beyond it a good calibration may fold
+# over
 FOCAL_LEAST = 0.15  # of the picture's width; 0.26 is a fisheye of 220 degrees, a pinhole of 0.15 sees 147
 FRAME_LEAST_MM = 100.0  # longer side of what the pictures show where the cameras look: half a head
 FRAME_USUAL_MM = 600.0  # the simulated studio's arrangements have 556 to 559

@@ -31,9 +31,8 @@ LENS = 5  # unknowns of a lens: f, k1, k2, cx, cy
 LENS_FROM_NINE = np.zeros((9, LENS))
 """fx fy cx cy k1 k2 p1 p2 k3 from f k1 k2 cx cy: one focal length is both."""
 LENS_FROM_NINE[[0, 1, 4, 5, 2, 3], [0, 0, 1, 2, 3, 4]] = 1.0
-CENTRE_SHARE = (
-    0.01  # of the width: how far principal points lie from the middle, standard deviation; 0.8 % in the studio
-)
+CENTRE_SHARE = 0.01  # of the width: how far principal points lie from the middle, standard deviation; 0.8 % in the
+# studio
 NOISE_LEAST_PX = 0.1  # of a keypoint: what cameras with few points would otherwise claim
 BEND = (0.05, 0.02)  # standard deviations of k1 and k2 about those of the one lens that stands for all
 OUTLIER_SIGMAS = 4.0

@@ -56,9 +56,8 @@ def in_guessed_frame(rig: Rig, front: str | None) -> Rig:
 
 
 JOINED_LEAST = 0.5  # share of the views; where fewer join, there are two scenes or none
-MISFIT_MOST = (
-    3.0  # of one lens for all; 1 where there is one, and to 2 where keypoints have more outliers than a Gaussian
-)
+MISFIT_MOST = 3.0  # of one lens for all; 1 where there is one, and to 2 where keypoints have more outliers than a
+# Gaussian
 LOOSE_PX = 1.0  # at the subject; a camera that is known no better than this is said so
 
 

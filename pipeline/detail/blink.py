@@ -27,10 +27,8 @@ MIN_POINTS = 200
 GAIN = 0.97  # of the misfit of open lids that half closed ones must stay under: 0.89 and 0.94 of closed ones, 1.03 and
 # more of open ones
 SHUT = 0.5  # lids that far down over an eye that shows nothing are closed ...
-OPEN = (
-    1.25  # ... and so are others, unless half closed ones fit that much worse: 1.03 and 1.16 on a real scan, whose lids
-)
-# are closed another way than the model's; 1.32 to 1.86 on open eyes of the studio
+OPEN = 1.25  # ... and so are others, unless half closed ones fit that much worse: 1.03 and 1.16 on a real scan, whose
+# lids are closed another way than the model's; 1.32 to 1.86 on open eyes of the studio
 
 
 def blinks_of(model: HeadModel) -> dict[str, int]:

@@ -23,10 +23,8 @@ from rig.rig import Rig
 
 SIDES = ("right", "left")
 MARGIN_MM = 2.0  # beyond the corners of the eye
-BRIDGE_HEIGHT, BRIDGE_RAISED = (
-    0.36,
-    0.05,
-)  # half height and middle of the bridge, by the fissure's length: up to the fold
+BRIDGE_HEIGHT, BRIDGE_RAISED = 0.36, 0.05  # half height and middle of the bridge, by the fissure's length: up to the
+# fold
 SHOWN_LENGTH, SHOWN_HEIGHT = 0.5, 0.3  # where an open eye is looked for, by its length: a fit may be 4 mm off; no brow
 SKIN_BELOW, SKIN_SIZE = 0.75, 0.25  # where skin is looked at, by the fissure's length
 VIEWS, MIN_FACING = 5, 0.6  # the most frontal cameras

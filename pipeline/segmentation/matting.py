@@ -38,9 +38,8 @@ COARSE_ALPHA_SIGMA = 1.0  # standard deviation of alpha at which the coarse mask
 LINEAR = (255 * linear_from_srgb(np.arange(257) / 255.0)).astype(np.float32)  # by code, one more to interpolate to
 
 
-SHADE = (
-    0.08  # standard deviation of the subject's brightness at the rim, of full alpha: surfaces darken as they turn away
-)
+SHADE = 0.08  # standard deviation of the subject's brightness at the rim, of full alpha: surfaces darken as they turn
+# away
 
 
 WIDE_PX = 2.5  # sigma of that window

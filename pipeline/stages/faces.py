@@ -10,6 +10,7 @@ from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import SubjectFaces, find_subject
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Staged
+from pipeline.view_checks.one_moment import judge_moments
 from rig.capture import Capture
 
 
@@ -33,8 +34,9 @@ def find_faces(context: ReconstructionContext, capture: Capture) -> Staged[Faces
     subject = find_subject(  # the networks end with it: 60 MB that no later stage needs
         capture.images, context.rig, load_networks(), report=lambda share: context.progress("faces", share)
     )
+    warnings = judge_moments(subject, context.rig)
     if subject.matched is None:
         return Staged(Faces(subject))
     openings = eye_openings(subject.matched, context.rig)
     closed = frozenset(side for side, opening in openings.items() if opening < MIN_HALF_OPENING)
-    return Staged(Faces(subject, openings, find_irises(subject.matched, capture.images, context.rig, closed)))
+    return Staged(Faces(subject, openings, find_irises(subject.matched, capture.images, context.rig, closed)), warnings)

@@ -27,9 +27,8 @@ STEPS = 128  # along a ray through the subject
 SLACK_PX = 1.0  # of the least size: a mask may be that narrow
 MIN_ROOM_MM = 4.0
 BOUND_BLUR_PX = 1.0  # of the least size: the hull has creases that the subject does not have
-LOOSE_HULL_MM = (
-    30.0  # of a hull's front before the fitted head: 5 to 15 for cameras around a head, 100 for three in front
-)
+LOOSE_HULL_MM = 30.0  # of a hull's front before the fitted head: 5 to 15 for cameras around a head, 100 for three in
+# front
 STEEPEST = 3.0  # slope against the image plane: 72 degrees
 
 

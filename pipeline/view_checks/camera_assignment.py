@@ -32,17 +32,13 @@ from rig.rig import Rig
 
 MIN_NOISE_PX, MAX_NOISE_PX = 0.5, 1.5  # of one tangency: what masks leave, and what exchanges may not hide in
 ROBUST_SIGMAS = 3.0
-INSET_PX = (
-    2.0  # hair that one camera resolves and the other does not: misses of 2.4 px become 0.9 (three quarters: half)
-)
-CUT_OFF_MISFIT = (
-    0.3  # of a tangent that the border hides: neither for nor against, between right (0.03) and wrong (0.7)
-)
+INSET_PX = 2.0  # hair that one camera resolves and the other does not: misses of 2.4 px become 0.9 (three quarters:
+# half)
+CUT_OFF_MISFIT = 0.3  # of a tangent that the border hides: neither for nor against, between right (0.03) and wrong
+# (0.7)
 SUSPECT_MISFIT = 0.2  # mean over a camera's tangents above which the search is worth its 0.05 s
-FITTING_MISFIT = (
-    0.28  # mean over all tangents of a camera that holds its own picture: at most 0.25 in 72 exchanges among
-)
-# 3 to 11 cameras; two knocked cameras whose pictures are tried on each other keep 0.34 and more
+FITTING_MISFIT = 0.28  # mean over all tangents of a camera that holds its own picture: at most 0.25 in 72 exchanges
+# among 3 to 11 cameras; two knocked cameras whose pictures are tried on each other keep 0.34 and more
 NAMED_GAIN = 1.5  # tangents that an exchange explains before it is named: of three cameras that share three at most
 REPAIRED_GAIN = 4.0  # and before it is believed without asking: five planes, met by chance once in 10,000
 MIN_CAMERAS = 3

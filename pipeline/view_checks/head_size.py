@@ -58,10 +58,7 @@ def head_diameter_mm(silhouettes: Mapping[str, Silhouette], rig: Rig, face: Face
 
 
 def _diameters_mm(
-    solid: Mapping[str, Bool[np.ndarray, "_ _"]],
-    rig: Rig,
-    up_world: Float[np.ndarray, " 3"],
-    face: FaceEvidence | None,
+    solid: Mapping[str, Bool[np.ndarray, "_ _"]], rig: Rig, up_world: Float[np.ndarray, " 3"], face: FaceEvidence | None
 ) -> list[float]:
     """Returns the head's diameter (mm) in each view whose disc lies where the others, or the face, say that the head
     is; none if these are less than ``MIN_MEETING`` of the views that show a crown."""

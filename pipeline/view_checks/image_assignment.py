@@ -35,9 +35,8 @@ from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
-PLATE_SEEN = (
-    0.6  # share of a picture that its plate explains, below which other plates are tried; 0.6 to 0.8 in good ones
-)
+PLATE_SEEN = 0.6  # share of a picture that its plate explains, below which other plates are tried; 0.6 to 0.8 in good
+# ones
 PLATE_GAIN = 1.3  # how many times as much of each picture the other plates must explain; another's explains 0 to 0.5
 PLATE_COLUMNS = 64
 PLATE_TOLERANCE = 0.06  # of log level: 2 % of light drift, vignetting, and noise averaged over 16 x 16 pixels

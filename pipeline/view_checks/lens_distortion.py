@@ -19,17 +19,14 @@ from jaxtyping import Float
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.scene_tracks import SceneTracks, find_tracks, misses_px
 from pipeline.warnings import ReportWarning
-from rig.camera import Camera, Distortion
+from rig.camera import Distortion
 from rig.image import ImageRgb
 from rig.messages.message import compose
 from rig.rig import Rig
 
-MIN_VIEWS, MAX_VIEWS, MIN_TRACKS = (
-    3,
-    12,
-    60,
-)  # 12 views take 3 s of one core; three views of a head share 39 points, and
-# 475 in pairs: a k1 of -0.20 that was lost is -0.193 +- 0.052, coefficients that were left are -0.11 +- 0.24 of theirs
+MIN_VIEWS, MAX_VIEWS, MIN_TRACKS = 3, 12, 60  # 12 views take 3 s of one core; three views of a head share 39 points,
+# and 475 in pairs: a k1 of -0.20 that was lost is -0.193 +- 0.052, coefficients that were left are -0.11 +- 0.24 of
+# theirs
 MIN_EFFECT = 1e-3  # of the picture's width, at the subject's farthest pixels: less does not matter to a head
 ROBUST_PX = 1.0  # of a miss (Geman and McClure)
 SHARES = np.linspace(-0.5, 1.5, 9)
@@ -38,11 +35,8 @@ MIN_SIGMAS = 5.0  # of a radial coefficient from 0: 11 in scan-a at -0.2; right 
 MIN_SHARE_SIGMAS = 3.5  # of the share from 1, for it must also be near 0: 3.8 to 12 in five captures of undistorted
 # pictures, at most 1 in right ones
 SHIFTS = np.linspace(-1.5, 1.5, 7)
-MIN_SHIFT_PX, MIN_SHIFT_SIGMAS = (
-    0.35,
-    5.0,
-)  # half a pixel is COLMAP's corner, one is MATLAB's count; scan-a as it is has
-# 0.00 +- 0.04, a simulated capture of half the size -0.05 +- 0.12
+MIN_SHIFT_PX, MIN_SHIFT_SIGMAS = 0.35, 5.0  # half a pixel is COLMAP's corner, one is MATLAB's count; scan-a as it is
+# has 0.00 +- 0.04, a simulated capture of half the size -0.05 +- 0.12
 MAX_SHARE, NEAR_SIGMAS = 0.3, 3.0  # of the coefficients, of pictures without distortion: -0.56 +- 0.21 in one
 
 
@@ -129,11 +123,8 @@ def estimate(tracks: SceneTracks, read: Callable[[float], Rig], values: Sequence
 
 
 def _with(rig: Rig, lens: Callable[[Distortion], Distortion]) -> Rig:
-    def read(camera: Camera) -> Camera:
-        k = camera.intrinsics
-        return replace(camera, intrinsics=replace(k, distortion=lens(k.distortion)))
-
-    return Rig(tuple(map(read, rig)))
+    lenses = [replace(camera.intrinsics, distortion=lens(camera.intrinsics.distortion)) for camera in rig]
+    return Rig(tuple(replace(camera, intrinsics=k) for camera, k in zip(rig, lenses, strict=True)))
 
 
 def _times(lens: Distortion, share: float) -> Distortion:

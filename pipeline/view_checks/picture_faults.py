@@ -24,10 +24,8 @@ MIN_TURNED = 0.5  # share of a picture that its turned plate explains: 0.65 to 0
 TURNED_GAIN = 1.5  # ... and how many times what the plate explains as it is: 1.7 to 4, and 0.95 at most of right ones
 FINE_PX, COARSE_PX = 1.0, 2.0  # blurs between which a picture's fine detail lies: noise of single pixels is below
 DETAIL_QUANTILE = 0.9  # of the subject's pixels: eyes, hair and clothes, not flat skin
-MAX_BLURRED = (
-    0.45  # of the median view's detail: 0.39 at a blur of 3 px, 0.28 in motion over 60; 0.57 and more in sharp
-)
-# views of six captures, from face to back
+MAX_BLURRED = 0.45  # of the median view's detail: 0.39 at a blur of 3 px, 0.28 in motion over 60; 0.57 and more in
+# sharp views of six captures, from face to back
 INSET_PX = 4.0  # inside the outline, of which a loose mask shows the backdrop
 OTHER_EXPOSURE = 1.8  # between plate and shot: up to one stop is levelled
 MIN_LIGHT, MAX_LIGHT = 0.002, 0.98  # neither black nor burnt out

@@ -1,18 +1,19 @@
 """Checks whether these cameras took the pictures, from silhouettes and calibration, before the fit.
 
 If most cameras contradict the others, other interpretations are tried: all pictures reflected about their principal
-points, as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 if they
-are square; poses written in another convention (``rig.plausibility``), which a rig whose cameras stand on a sphere
-around the world's origin does not reveal by itself; and intrinsics of other pictures (``lens_reading``). The one under
-which tangent planes touch both outlines of each pair is named. If there is none, the calibration is another rig's, or
-older than a change of this one; unless many planes meet closely nevertheless, for then the masks are loose, with a
-shadow on the wall or hair that some of them lack. If a single camera contradicts the others, it is named.
+points, as a mirrored rig would see them; flipped, as some cameras deliver them; turned by 180 degrees, or by 90 if
+they are square; poses written in another convention (``rig.plausibility``), which a rig whose cameras stand on a
+sphere around the world's origin does not reveal by itself; and intrinsics of pictures that were cropped, reduced or
+taken at another zoom (``LensReading``). The one under which tangent planes touch both outlines of each pair is named.
+If there is none, the calibration is another rig's, or older than a change of this one; unless many planes meet closely
+nevertheless, for then the masks are loose, with a shadow on the wall or hair that some of them lack. If a single
+camera contradicts the others, it is named.
 
 Enters: silhouettes and the rig. Leaves: what is wrong and what to do, or nothing.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -20,8 +21,7 @@ from jaxtyping import Float
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview.tangency import outer_hull
 from pipeline.view_checks.camera_assignment import FITTING_MISFIT, INSET_PX, mean_misfit, tangency_errors_px, with_masks
-from pipeline.view_checks.lens_reading import find_lens_reading
-from rig.camera import Camera, Intrinsics
+from rig.camera import Intrinsics
 from rig.messages.message import Message, compose
 from rig.plausibility import alternative_conventions
 from rig.rig import Rig
@@ -33,9 +33,8 @@ MAX_RIGHT = 0.25  # of a reading that is believed
 MAX_CLEAR = 0.32  # of one by which the others are worse: 0.28 where the wrong rig has spoilt the outlines, which are
 # found with each other's help ...
 CLEARLY = 0.45  # ... and its share of theirs: 0.34 there
-MANY_LOST = (
-    0.33  # share of the views that only the others contradict, so that they are asked too: 6 of 11 of a wrong rig
-)
+MANY_LOST = 0.33  # share of the views that only the others contradict, so that they are asked too: 6 of 11 of a wrong
+# rig
 JUDGED_BY_OTHERS = "strange_share"  # a figure of views that were of use before the others were asked
 MAX_LENSES = 0.2  # of one in which focal lengths and principal points were sought: 0.01 to 0.15 where they are wrong
 # Of the picture's width, that half of all planes miss at most in a right rig with loose masks: 50e-4 with long hair
@@ -45,6 +44,14 @@ LOOSE_BIMODAL, MAX_LOOSE_QUARTER = 0.28, 35e-4  # a better quarter's share of it
 # others whole, 0.03 to 0.25 with shadows in all of 11 views; a wrong rig's misses have one spread, 0.34 and more
 MIN_MISPLACED = 0.6  # of one camera among good ones: 0.95 with its rotation transposed; good ones reach 0.25
 MISPLACED_AMONG = 5  # cameras; of four, one that is wrong leaves three, who have six planes at most
+
+FACTORS = (1.0, 0.5, 0.67, 1.5, 2.0)  # of the focal lengths, of which the best are searched from
+MAX_SEARCHED_CAMERAS = 12  # of many: the search takes time by their square, and three numbers need no more
+SEARCHES, STEPS = 2, 90  # and how often the misses are asked in each
+STRIDE = 0.1  # of a factor's logarithm, and of a picture's side
+OTHER_FACTOR, OTHER_SHIFT = 0.15, 0.03  # of a factor's logarithm and a side: what makes a rig contradict itself
+MIN_FACTOR = 0.04  # from one; less is not told
+MIN_SHIFT = 0.02  # of the picture's width; less is not told
 
 Pixels = Float[np.ndarray, "_ 2"]
 Turn = Callable[[Pixels, Intrinsics], Pixels]
@@ -110,6 +117,70 @@ def loose_outlines(silhouettes: Mapping[str, Silhouette], rig: Rig) -> bool:
     return _median_misfit([outer_hull(silhouettes[camera.name], INSET_PX) for camera in seen], seen) >= MIN_WRONG
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LensReading:
+    """Holds the rig with all focal lengths multiplied by ``factor`` and all principal points moved by ``shift``
+    (relative to the pictures' width and height)."""
+
+    rig: Rig
+    factor: float
+    shift: tuple[float, float]
+
+    @property
+    def is_other(self) -> bool:
+        """Tells whether the intrinsics differ from the calibrated ones by more than loose outlines alone would
+        cause."""
+        return bool(abs(np.log(self.factor)) >= OTHER_FACTOR or max(map(abs, self.shift)) >= OTHER_SHIFT)
+
+    def message(self) -> Message:
+        """Returns the message that refuses the rig and says by how much its lenses differ."""
+        k = self.rig.cameras[0].intrinsics
+        changes = []
+        if abs(self.factor - 1.0) >= MIN_FACTOR:
+            changes.append(compose("focal-lengths-times", factor=self.factor))
+        if max(map(abs, self.shift)) >= MIN_SHIFT:
+            right, down = self.shift[0] * k.width, self.shift[1] * k.height
+            changes.append(compose("principal-points-moved", right_px=right, down_px=down))
+        return compose("other-lenses", changes=changes)
+
+
+def find_lens_reading(hulls: Sequence[Pixels], rig: Rig, misfit: Callable[[Rig], float]) -> LensReading:
+    """Searches for the focal factor and principal shift with the smallest ``misfit``, starting from several focal
+    lengths (``FACTORS``).
+
+    Args:
+        hulls: convex hulls of the outlines (px), in the order of the rig.
+        rig: the cameras as calibrated.
+        misfit: returns how badly a rig fits.
+    """
+    from scipy.optimize import minimize  # a quarter of a second, and few rigs are wrong
+
+    searched = np.unique(np.linspace(0, len(rig) - 1, MAX_SEARCHED_CAMERAS).round().astype(int))
+    some, some_hulls = Rig(tuple(rig.cameras[k] for k in searched)), [hulls[k] for k in searched]
+
+    def cost(at: Float[np.ndarray, " 3"]) -> float:
+        misses = np.abs(tangency_errors_px(some_hulls, _with_lenses(some, at)))
+        known = misses[np.isfinite(misses)]
+        return float(np.mean(np.sqrt(known))) if len(known) >= misses.size / 4 else 1e6
+
+    found = []
+    for start in sorted((np.array([np.log(factor), 0.0, 0.0]) for factor in FACTORS), key=cost)[:SEARCHES]:
+        simplex = start + np.vstack([np.zeros(3), STRIDE * np.eye(3)])
+        options = {"initial_simplex": simplex, "maxfev": STEPS, "xatol": 1e-4, "fatol": 1e-4}
+        found.append(minimize(cost, start, method="Nelder-Mead", options=options).x)
+    log_factor, right, down = min(found, key=lambda at: misfit(_with_lenses(rig, at)))
+    read = _with_lenses(rig, np.array([log_factor, right, down]))
+    return LensReading(read, float(np.exp(log_factor)), (float(right), float(down)))
+
+
+def _with_lenses(rig: Rig, at: Float[np.ndarray, " 3"]) -> Rig:
+    factor, (right, down) = float(np.exp(np.clip(at[0], -2.0, 2.0))), at[1:].tolist()
+    return _changed(
+        rig,
+        lambda k: replace(k, fx=k.fx * factor, fy=k.fy * factor, cx=k.cx + right * k.width, cy=k.cy + down * k.height),
+    )
+
+
 def misplaced_camera(silhouettes: Mapping[str, Silhouette], rig: Rig) -> str | None:
     """Returns the one camera that contradicts all others while these agree without it; None if there is none. That
     camera was moved farther than ``camera_drift`` can measure, or its pose or mask is wrong."""
@@ -148,25 +219,18 @@ def _missed_shares(hulls: Sequence[Pixels], rig: Rig) -> Float[np.ndarray, "c c 
     return np.abs(tangency_errors_px(hulls, rig)) / together[..., None]
 
 
+def _changed(rig: Rig, change: Callable[[Intrinsics], Intrinsics]) -> Rig:
+    return Rig(tuple(replace(camera, intrinsics=change(camera.intrinsics)) for camera in rig))
+
+
 def _counted_from_below(rig: Rig) -> Rig:
     """Returns the rig with principal points whose rows were counted upwards from the picture's bottom."""
-
-    def read(camera: Camera) -> Camera:
-        k = camera.intrinsics
-        return replace(camera, intrinsics=replace(k, cy=k.height - 1.0 - k.cy))
-
-    return Rig(tuple(map(read, rig)))
+    return _changed(rig, lambda k: replace(k, cy=k.height - 1.0 - k.cy))
 
 
 def _on_its_side(rig: Rig) -> Rig:
     """Returns the rig with the axes of each camera's picture exchanged."""
-
-    def read(camera: Camera) -> Camera:
-        k = camera.intrinsics
-        exchanged = replace(k, width=k.height, height=k.width, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx)
-        return replace(camera, intrinsics=exchanged)
-
-    return Rig(tuple(map(read, rig)))
+    return _changed(rig, lambda k: replace(k, width=k.height, height=k.width, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx))
 
 
 def _read(hulls: Sequence[Pixels], rig: Rig, turn: Turn) -> list[Pixels]:

@@ -135,11 +135,14 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
 
 
 def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
+    from pipeline.faces.networks import load_networks
+    from pipeline.faces.subject import SearchEffort, find_subject
     from pipeline.segmentation.segment import segment
     from pipeline.settings import OutputSettings
     from pipeline.texturing.chart_colours import chart_colours
     from pipeline.view_checks.guards import Guards
     from pipeline.view_checks.lens_distortion import judge_distortion
+    from pipeline.view_checks.one_moment import judge_moments
     from pipeline.view_checks.usable_views import usable_views
 
     shot, rig = read_scaled_capture(folder)
@@ -149,13 +152,12 @@ def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> lis
         return segment(capture, rig, report=report)
 
     views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
-    lenses = judge_distortion(views.capture.images, views.silhouettes, rig)
-    warnings = [
-        *chosen.warnings,
-        *views.warnings,
-        *lenses,
-        *(chart_colours(shot, rig)[1] if chosen.texture.chart else ()),
-    ]
+    images, without_eyes = views.capture.images, SearchEffort(with_eyes=False)
+    lenses = judge_distortion(images, views.silhouettes, rig)
+    faces = find_subject(images, rig, load_networks(), effort=without_eyes) if chosen.faces.find else None
+    moments = judge_moments(faces, rig)
+    warnings = [*chosen.warnings, *views.warnings, *lenses, *moments]
+    warnings += chart_colours(shot, rig)[1] if chosen.texture.chart else ()
     return documents_of(warnings)
 
 

@@ -9,9 +9,8 @@ if TYPE_CHECKING:
     from rig.render.compute import ComputeDevice
     from rig.render.renderer import Renderer
 
-MOST_THREADS = (
-    8  # of a processor that a GPU is faster than: of an H200 two threads take 1.5 times as long, 16 no longer
-)
+MOST_THREADS = 8  # of a processor that a GPU is faster than: of an H200 two threads take 1.5 times as long, 16 no
+# longer
 
 
 def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Renderer") -> "ComputeDevice | None":

@@ -10,9 +10,8 @@ from starlette.types import Receive
 from rig.messages.message import compose
 from server.wire.problems import Problem
 
-IDLE_TIMEOUT_S = (
-    30.0  # between two pieces: longer than a change of networks takes, shorter than clients wait before a retry
-)
+IDLE_TIMEOUT_S = 30.0  # between two pieces: longer than a change of networks takes, shorter than clients wait before a
+# retry
 
 
 async def with_idle_timeout(stream: AsyncIterator[bytes], silent_s: float) -> AsyncIterator[bytes]:

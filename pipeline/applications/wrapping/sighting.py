@@ -31,10 +31,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "in": 25.4, "dm": 100.0, "m": 1000.0}
-SIZE_RANGE = (
-    0.72,
-    1.4,
-)  # of the mean adult's face: children's to large ones, and narrower than the steps between units
+SIZE_RANGE = 0.72, 1.4  # of the mean adult's face: children's to large ones, and narrower than the steps between units
 SEARCH_PX, SEARCH_RADIUS = 640, 150.0  # of the pictures from all sides; there the scan has this radius
 OUTLYING = 0.5  # percent of the triangles at either end of an axis that a stray part may have
 FRONT_PX, FRONT_MM, FRONT_SHOWN_MM = 768, 800.0, 330.0  # of the pictures before the face: size, distance, breadth

@@ -33,10 +33,8 @@ NORMAL_SHARE = 0.04  # of light at right angles that glTF's material mirrors (in
 REDUCED = 4  # pixels that become one, to calm the noise before colours are compared
 CLIPPED = 0.95  # linear: brighter pixels do not tell how bright
 MIN_COLOUR = 0.01  # linear, mean difference between channels, below which a picture tells no exposure
-EXCHANGED, MIN_EXCHANGED = (
-    2.0,
-    0.002,
-)  # negative by positive light, and the former's mean (linear): noise has 1 and less
+EXCHANGED, MIN_EXCHANGED = 2.0, 0.002  # negative by positive light, and the former's mean (linear): noise has 1 and
+# less
 COLOUR_SIDE = 128  # texels of the image of the lamps' colours: 4 mm on a head
 MIN_MIRRORED = 0.004  # linear; less light is taken for grey
 MAX_TINT = 2.0  # of a channel by the mean

@@ -23,10 +23,7 @@ from rig.rig import Rig
 DatasetFormat = Literal["nerfstudio", "gaussian-avatars"]
 DATASET_FORMATS: tuple[DatasetFormat, ...] = get_args(DatasetFormat)
 MOMENT = 0  # a capture is one moment
-FLAME_MOMENT, FLAME_CANONICAL = (
-    f"flame_param/{MOMENT:05}.npz",
-    "canonical_flame_param.npz",
-)  # where there are parameters
+FLAME_MOMENT, FLAME_CANONICAL = f"flame_param/{MOMENT:05}.npz", "canonical_flame_param.npz"  # where parameters are
 POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in ("red", "green", "blue")]
 )

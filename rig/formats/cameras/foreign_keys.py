@@ -202,16 +202,13 @@ TRANSFORMS: Table = {
     **_keys("told", compose("key-all-frames"), "train_filenames", "val_filenames", "test_filenames"),
     **_keys("nothing", "of the radiance field's own box, not of the cameras", "aabb_scale", "scale", "offset", "aabb"),
     **_keys("nothing", "", "up", "from_na", "n_extra_learnable_dims", "sharpness", "ply_file_path", "colmap_im_id"),
-    **_keys(
-        "nothing", "", "rotation", "white_transparent", "black_transparent", "fix_premult", "render_aabb", "frame_id"
-    ),
-    **_keys(
-        "nothing", "", "enable_depth_loading", "integer_depth_scale", "sharpen", "envmap", "timestamp", "camera_id"
-    ),
+    **_keys("nothing", "", "rotation", "white_transparent", "black_transparent", "fix_premult", "render_aabb"),
+    **_keys("nothing", "", "frame_id", "enable_depth_loading", "integer_depth_scale", "sharpen", "envmap", "timestamp"),
     **_keys("nothing", "of a data set that `eigenhead export` wrote", "unit", "fg_mask_path", "camera_index"),
-    **_keys("nothing", "of a data set that `eigenhead export` wrote", "timestep_index", "camera_indices"),
-    **_keys("nothing", "of a data set that `eigenhead export` wrote", "timestep_indices"),
-    **_keys("nothing", "", "auxiliary_data", "format_version", "dataset_id", "ids", "time", "fps", "num_exposures"),
+    **_keys("nothing", "of a data set that `eigenhead export` wrote", "camera_indices"),
+    **_keys("read", "one moment is read: the first of `timestep_indices`", "timestep_index", "timestep_indices"),
+    **_keys("nothing", "", "camera_id", "auxiliary_data", "format_version", "dataset_id", "ids", "time", "fps"),
+    **_keys("nothing", "", "num_exposures"),
 }
 
 CALISCOPE: Table = {

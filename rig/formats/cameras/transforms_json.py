@@ -4,7 +4,7 @@
 https://docs.nerf.studio/quickstart/data_conventions.html). The centre of the top-left pixel is (0.5, 0.5), as in
 COLMAP, from which nerfstudio takes its intrinsics. Intrinsics are at the top or in a frame; Blender's files give
 ``camera_angle_x``, and the size follows from the pictures. Lengths are metres if all cameras lie within 30 units of
-each other, otherwise millimetres; ``applied_scale`` is undone."""
+each other, otherwise millimetres; ``applied_scale`` is undone. Of several moments (``timestep_index``) one is read."""
 
 import json
 import math
@@ -38,6 +38,7 @@ def read_transforms(path: Path) -> CamerasRead:
     faults = reading.faults
     reading.judge(TRANSFORMS, {key: value for key, value in document.items() if key not in PER_CAMERA}, "")
     names = camera_names([str(frame.get("file_path", f"frame{i:03}")) for i, frame in enumerate(frames)])
+    names, frames = _frames_of_one_moment(document, names, frames, reading)
     matrices = [
         number_array(frame.get("transform_matrix"), (4, 4), f"{name}.transform_matrix", faults)
         for name, frame in zip(names, frames, strict=True)
@@ -57,6 +58,23 @@ def read_transforms(path: Path) -> CamerasRead:
         for name, frame, matrix in zip(names, frames, matrices, strict=True)
     ]
     return reading.finish(entries)
+
+
+def _frames_of_one_moment(
+    document: dict[str, Any], names: list[str], frames: list[dict[str, Any]], reading: Reading
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Returns the cameras and frames of one moment, and leaves the others out: of the first one that the file lists as
+    ``timestep_indices``, or the first one there is. Frames without a number belong to every moment."""
+    numbers = [frame.get("timestep_index") for frame in frames]
+    moments = sorted({number for number in numbers if isinstance(number, int)})
+    listed = document.get("timestep_indices")
+    wanted = [one for one in listed if one in moments] if isinstance(listed, list) else []
+    moment = [*wanted, *moments, 0][0]
+    other = [isinstance(number, int) and number != moment for number in numbers]
+    for name in (name for name, is_other in zip(names, other, strict=True) if is_other):
+        reading.leave_out(name, compose("of-other-moment", moment=moment, moments=moments))
+    kept = [k for k, is_other in enumerate(other) if not is_other]
+    return [names[k] for k in kept], [frames[k] for k in kept]
 
 
 def write_transforms(rig: Rig, path: Path) -> None:

@@ -158,6 +158,7 @@ TEMPLATES = {
     "held-inverse-axes-up": "world_from_camera with y up and z backwards",
     "write-inverse-negated": "write the inverse of each pose, its second and third row negated",
     "cameras-left-out": "{cameras} {why} in {file}: taking no part",
+    "of-other-moment": "of another moment than timestep_index {moment} (there are {moments}; the one to be read stands first in timestep_indices)",
     "left-switched-off": "switched off ({key})",
     "left-not-aligned": "not aligned",
     "left-not-aligned-keys": "not aligned (without {keys})",

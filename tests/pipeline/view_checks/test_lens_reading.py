@@ -8,7 +8,7 @@ import pytest
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.multiview.tangency import outer_hull
 from pipeline.view_checks.camera_assignment import INSET_PX, mean_misfit, tangency_errors_px
-from pipeline.view_checks.lens_reading import find_lens_reading
+from pipeline.view_checks.rig_agreement import find_lens_reading
 from rig.rig import Rig
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]  # the studio takes ten seconds for one capture

@@ -23,9 +23,8 @@ STILL_MM, STILL_RAD = 1e-3, 1e-5  # a smaller step is the last
 NEAREST_SHARE = 0.8  # of the points, those nearest to the truth: a wrong shape of the rest does not turn the face
 MAX_REFINED_DEG, MAX_REFINED_MM = 8.0, 10.0  # from where the landmarks say, which are right to 2.6 degrees and 4.2 mm
 LANDMARK_MM = 3.0  # standard deviation of a landmark's place against the same landmark of another model
-SURFACE_MM = (
-    1.0  # the same of a point of the face against the true surface, all of them together worth as many landmarks
-)
+SURFACE_MM = 1.0  # the same of a point of the face against the true surface, all of them together worth as many
+# landmarks
 SURFACE_WORTH = 60.0  # observations that the face's points count as, for they err alike: of heads whose shape is 0.8 mm
 # off, 0.32 degrees and 0.21 mm; landmarks alone 1.32 and 1.11, the surface all but alone 0.30 and 0.27; of heads 2.8 mm
 # off 1.01 and 0.44, 2.06 and 2.14, 1.13 and 1.16

@@ -56,11 +56,8 @@ HEAVY_HAIR = replace(PRESET, hairstyle=("fringe",))  # over the ears and 30 mm d
 SEEN_MM, HIDDEN_MM = 2.0, 4.0  # from the visible points, 1.5 mm apart; what lies between is neither
 INTERVAL = 1.96  # standard deviations that hold 95 %
 FIRST_SEED = 4  # on the heads before it what intervals assume of unseen skin was measured
-OUTSIDE_MM, OUTSIDE_DIRECTIONS, OUTSIDE_PX = (
-    3000.0,
-    64,
-    320,
-)  # from how far, how many and how finely a head is looked at
+OUTSIDE_MM, OUTSIDE_DIRECTIONS, OUTSIDE_PX = 3000.0, 64, 320  # from how far, how many and how finely a head is looked
+# at
 REACHED_MM = 1.5  # a surface in front of a place by less is its own
 MIN_DIRECTIONS = 8  # skin under hair is seen from 16 and more, a nostril and the inside of a mouth from 6 at most
 MIN_PLACES = 50  # of a region, for figures of its own

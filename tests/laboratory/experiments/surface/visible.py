@@ -63,13 +63,7 @@ SPLAT_MM = 1.8  # half the side of a point of the truth in pictures: points are 
 AZIMUTHS_DEG = (30.0, -75.0)
 SEEN_MM = 2.0  # from a visible point, 1.5 mm apart
 MIN_PLACES = 50  # of a region, for figures of its own
-REGIONS_SCORED = (
-    "face",
-    "eyes",
-    "nose",
-    "mouth",
-    "ears",
-)  # the neck ends where each model ends it, hair hides the rest
+REGIONS_SCORED = "face", "eyes", "nose", "mouth", "ears"  # the neck ends where each model ends it, hair hides the rest
 
 
 def visible(

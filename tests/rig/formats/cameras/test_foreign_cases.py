@@ -129,6 +129,22 @@ def test_names_that_repeat_take_the_innermost_folder_that_tells_them_apart(tmp_p
     assert read_cameras(path).rig.names == fan(4).names
 
 
+@pytest.mark.parametrize(("listed", "moment"), [(None, 3), ([7, 3], 7)])
+def test_of_several_moments_one_is_read(listed: list[int] | None, moment: int, tmp_path: Path) -> None:
+    path = base("nerfstudio", tmp_path)
+    document = json.loads(path.read_text()) | ({} if listed is None else {"timestep_indices": listed})
+    document["frames"] = [
+        frame | {"file_path": f"images/{number}_{frame['file_path'][-9:]}", "timestep_index": number}
+        for number in (7, 3)
+        for frame in document["frames"]
+    ]
+    path.write_text(json.dumps(document))
+    read = read_cameras(path)
+    assert read.rig.names == tuple(f"{moment}_cam{i:02}" for i in range(4))
+    assert list(read.left_out) == [f"{10 - moment}_cam{i:02}" for i in range(4)]
+    assert f"of another moment than timestep_index {moment} (there are 3, 7;" in read.remarks[-1].text
+
+
 BLANK = ["as it is", "none", "two", "a comment between", "points in some"]
 
 

@@ -27,6 +27,7 @@ AS_IT_IS = {
     ("metashape", "component@id"): "test_cameras_of_two_components_are_refused",
     ("metashape", "chunk/transform"): "test_a_metashape_export_projects_by_its_manual",
     ("metashape", "calibration@class"): "test_a_metashape_export_projects_by_its_manual",
+    **{("nerfstudio", f"timestep_{end}"): "test_of_several_moments_one_is_read" for end in ("index", "indices")},
     ("realitycapture", "ComponentId"): "test_cameras_of_two_components_are_refused",
 }
 

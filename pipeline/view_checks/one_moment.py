@@ -1,0 +1,67 @@
+"""Finds views that show another moment or another person than the rest: a face, or lips, that lie elsewhere.
+
+The landmarks of each view are compared with those triangulated from the other views. Two distances are judged: of all
+points (the head has moved, or is another's), and of the lower lip from the upper one (the mouth has opened). What a
+view's landmarks have in common by chance, and what the other views do not know, is the noise of both.
+
+Enters: the faces found in the photographs. Leaves: the views that differ, each with a warning. A head that has moved
+towards a camera or away from it looks the same there, and a mouth seen from the side hardly opens: neither is found.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.faces.detection import FaceDetection
+from pipeline.faces.subject import SubjectFaces
+from pipeline.faces.triangulated_face import shared_modes, triangulate_face, unbiased_px, view_noise_px
+from pipeline.warnings import ReportWarning
+from rig.messages.message import compose
+from rig.rig import Rig
+
+MAX_SIGMAS = 4.5  # 4.2 in clean captures; `python -m tests.laboratory guards` counts both errors
+UPPER_LIP, LOWER_LIP = [0, 37, 267, 13, 82, 312, 81, 311], [17, 84, 314, 14, 87, 317, 178, 402]  # of the 468 points
+
+
+class _Offset(NamedTuple):
+    """How far a view's face, or its lower lip from the upper one, lies from where the other views see it."""
+
+    sigmas: float
+    distance_mm: float
+    camera: str
+
+
+def judge_moments(subject: SubjectFaces | None, rig: Rig) -> list[ReportWarning]:
+    """Returns a warning for each view that shows another moment or person. The worst view is removed before the next
+    one is sought; of three views, where each may be the wrong one, all that differ are named."""
+    face, odd = None if subject is None else subject.matched, list[_Offset]()
+    if subject is None or face is None:
+        return []
+    in_place = {name: subject.found[name][0] for name in subject.expected if subject.found.get(name)}
+    shown = in_place | dict(face.outliers) | dict(face.detections)
+    while len(shown) > 2 and 2 * len(odd) < len(shown):
+        agreeing = {name: seen for name, seen in face.detections.items() if name in shown}
+        offsets = [one for name in shown if (one := _offset(name, shown[name], agreeing, rig)) is not None]
+        over = sorted((one for one in offsets if one.sigmas > MAX_SIGMAS), reverse=True)
+        odd += over if len(shown) == 3 else over[:1]
+        if not over or len(shown) == 3:
+            break
+        del shown[over[0].camera]
+    return [compose("moments-differ", camera=one.camera, offset_mm=one.distance_mm) for one in odd]
+
+
+def _offset(name: str, seen: FaceDetection, agreeing: Mapping[str, FaceDetection], rig: Rig) -> _Offset | None:
+    others = {other: detection for other, detection in agreeing.items() if other != name}
+    face = triangulate_face(others, rig) if len(others) > 1 else None
+    if face is None:
+        return None
+    camera, points = rig[name], face.points.positions_world
+    pixels, slopes = camera.project_with_jacobian(points)
+    missed = unbiased_px(seen, face.world_from_face, camera) - pixels
+    unknown = np.einsum("nij,mnj->mni", slopes, shared_modes(face, rig)).mean(axis=1)
+    noise_px = np.hypot(view_noise_px(seen.size_px, face.world_from_face, camera), np.sqrt((unknown**2).sum() / 2.0))
+    whole, upper, lower = (np.median(missed[rows], axis=0) for rows in (slice(None), UPPER_LIP, LOWER_LIP))
+    off_px = max(float(np.linalg.norm(whole)), float(np.linalg.norm(lower - upper)))
+    mm_per_px = float(camera.camera_from_world.apply(points)[:, 2].mean()) / camera.intrinsics.fx
+    return _Offset(off_px / float(noise_px), off_px * mm_per_px, name)
