@@ -121,9 +121,7 @@ class Settings:
     front: str | None = None  # the camera that the subject faces; name it where the guess from the camera fan is wrong
     exchanged_pictures: Literal["repair", "refuse"] = "repair"  # what is done when cameras hold each other's pictures;
     # refuse where a mistake in filing must not pass
-    anyway: bool = (
-        False  # true warns where a check would refuse a head that is still possible; its pose counts as doubtful
-    )
+    anyway: bool = False  # true warns where a check would refuse a head that is still possible; its pose is doubtful
     unexplained_outlines: Literal["refuse", "warn"] = "refuse"  # of a head that explains hardly any of them; warn for
     # subjects with long hair all around
     device: Literal["auto", "cpu", "gl"] = "auto"  # what compares photographs; auto takes a GPU where there is one and
