@@ -153,7 +153,7 @@ from pipeline.photometric_fit.refine import finer
 from pipeline.head_model.model_basis import model_basis
 from pipeline.settings import Settings
 model = model_basis(load_model(), Settings())
-fine, patches, at_centres = finer(model, Settings().photo)
+fine, patches, at_centres = finer(model)
 print(hash((model.modes.tobytes(), fine.modes.tobytes(), fine.sigma.tobytes(), patches.member.tobytes(),
             patches.agreement.tobytes(), at_centres.tobytes())), at_centres.flags.writeable)
 """
