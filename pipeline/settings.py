@@ -34,7 +34,7 @@ FIXED = {
     "texture": ("contour_margin_px", "footprint_px", "hidden_mm", "least_facing", "outlier", "selection", "sharpness"),
 }  # settings before 0.4.0 whose numbers are constants now: by table, () for all of a table
 RENAMED = {
-    "outputs": {"skin": ("albedo", {"albedo": "glb"}), "delight": ("albedo", {"True": "file"})},
+    "outputs": {"skin": ("albedo", {"albedo": "glb"}), "delight": ("albedo", {"True": "file"})}
 }  # settings before 0.4.0: by table and name, the new name and the new value by the old one
 
 

@@ -9,13 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.scene.scale import (
-    Scale,
-    find_tags_of_shot,
-    scale_from_cameras,
-    scale_from_points,
-    scale_from_tags,
-)
+from calibration.scene.scale import Scale, find_tags_of_shot, scale_from_cameras, scale_from_points, scale_from_tags
 from rig.capture import Capture
 from rig.formats.cameras.scale_json import CameraDistance, KnownLength, PointDistance
 from rig.formats.pictures.work_size import work_features

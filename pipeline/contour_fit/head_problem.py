@@ -85,11 +85,7 @@ class FeatureTerm:
 
 
 def head_problem(
-    problem: ContourProblem,
-    evidence: StageEvidence,
-    stage: Stage,
-    scale_px: float,
-    reference_px: float | None = None,
+    problem: ContourProblem, evidence: StageEvidence, stage: Stage, scale_px: float, reference_px: float | None = None
 ) -> Problem[State]:
     """Builds the least-squares problem of one stage: all its terms as functions of shape, pose and, in stages that
     solve for them, cameras. ``scale_px`` is the robust scale of the contours, ``reference_px`` the outline length to

@@ -42,11 +42,7 @@ def blinks_of(model: HeadModel) -> dict[str, int]:
 
 
 def estimate_eyelid_closure(
-    fit: Fit,
-    model: HeadModel,
-    base: Float[np.ndarray, "v 3"],
-    surface: SurfacePoints,
-    eyes: Mapping[str, EyeEvidence],
+    fit: Fit, model: HeadModel, base: Float[np.ndarray, "v 3"], surface: SurfacePoints, eyes: Mapping[str, EyeEvidence]
 ) -> tuple[dict[str, float], frozenset[str]]:
     """Estimates how far each eye that the model can close is closed (0 open, 1 closed). Also returns the eyes whose
     lids must be bridged instead: they look closed, but no blink of the model brings its lids nearer to the points.

@@ -28,13 +28,7 @@ from pipeline.detail.nodes import NodeMesh, Nodes, solving_nodes
 from pipeline.detail.outline_points import Outlines, OutlineSearch
 from pipeline.detail.patch_points import PatchPlaces, PatchSearch
 from pipeline.detail.smooth_field import SmoothField, smooth_field
-from pipeline.detail.solve import (
-    Observed,
-    Posterior,
-    free_directions,
-    normal_directions,
-    solve_field,
-)
+from pipeline.detail.solve import Observed, Posterior, free_directions, normal_directions, solve_field
 from pipeline.detail.surface_points import SurfacePoints, thinned
 from pipeline.fusion.untangling import untangled_head
 from pipeline.geometry.nearest import PointTree, nearest

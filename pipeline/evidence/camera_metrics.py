@@ -49,12 +49,7 @@ class CameraFigures:
 
 
 def camera_figures(
-    model: HeadModel,
-    fit: Fit,
-    silhouettes: Mapping[str, Silhouette],
-    rig: Rig,
-    fitted: Masks,
-    started: Masks,
+    model: HeadModel, fit: Fit, silhouettes: Mapping[str, Silhouette], rig: Rig, fitted: Masks, started: Masks
 ) -> dict[str, CameraFigures]:
     """Computes the figures of every camera, in the order of the rig. The cameras are those of the calibration, without
     the corrections of the fit."""

@@ -14,13 +14,7 @@ from jaxtyping import Float
 
 from pipeline.faces.crops import Crop, Pyramid, in_picture, make_pyramid
 from pipeline.faces.networks import FINDER_SIZE, LANDMARK_SIZE, FaceNetworks
-from pipeline.faces.points import (
-    CHIN,
-    FOREHEAD,
-    LEFT_EYE_CORNERS,
-    RIGHT_EYE_CORNERS,
-    point_table,
-)
+from pipeline.faces.points import CHIN, FOREHEAD, LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS, point_table
 from rig.capture import ImageRgb
 
 CROP_OF_FACE = 1.5  # side of a crop by the larger side of the points in it

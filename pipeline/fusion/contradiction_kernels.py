@@ -24,12 +24,7 @@ SURE_MM = 1.0  # points with a larger deviation do not count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_contradicted(
-    target: int,
-    views: Pixels,
-    blocks: np.ndarray,
-    width: int,
-) -> None:
+def mark_contradicted(target: int, views: Pixels, blocks: np.ndarray, width: int) -> None:
     """Marks blocks of the view ``target`` in which other views have a precise surface point outside of its outline:
     sets bit v % 64 of ``blocks`` (rows, columns; words of 64 bits, changed in place) for each such view v.
 

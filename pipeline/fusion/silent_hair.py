@@ -57,11 +57,7 @@ class SilentHair:
 
 @traced
 def find_silent_hair(
-    depth_maps: Sequence[DepthMap],
-    parts: Mapping[str, PartMap],
-    votes: PartVotes | None,
-    rig: Rig,
-    head_world: Mesh,
+    depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig, head_world: Mesh
 ) -> tuple[SilentHair | None, Sequence[DepthMap]]:
     """Tells whether the subject has long hair of which the photographs hardly show the depth.
 

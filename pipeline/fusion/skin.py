@@ -129,10 +129,7 @@ def heights_over(head: HeadSkin, mesh_world: Mesh) -> HeightField:
 
 
 def skin_share(
-    beside: Adjacency,
-    vertices: Float[np.ndarray, "v 3"],
-    skin: Float[np.ndarray, " v"],
-    seen: Bool[np.ndarray, " v"],
+    beside: Adjacency, vertices: Float[np.ndarray, "v 3"], skin: Float[np.ndarray, " v"], seen: Bool[np.ndarray, " v"]
 ) -> Float[np.ndarray, " v"]:
     """Returns the probability that each vertex shows skin; where no view sees it, that of what is seen nearest."""
     rim = np.flatnonzero(seen)

@@ -241,10 +241,7 @@ def _any_corner(vertex: Bool[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) -
 
 
 def _with_rings(
-    times: Int[np.ndarray, " v"],
-    spoilt: Bool[np.ndarray, " f"],
-    faces: Int[np.ndarray, "f 3"],
-    rings: tuple[int, ...],
+    times: Int[np.ndarray, " v"], spoilt: Bool[np.ndarray, " f"], faces: Int[np.ndarray, "f 3"], rings: tuple[int, ...]
 ) -> Bool[np.ndarray, " v"]:
     """Returns the vertices of all spots: the corners of the spoilt triangles and the ``rings`` about them, whose number
     grows with how often a corner was spoilt."""

@@ -79,13 +79,7 @@ def square_to_box(x: float, y: float, z: float, box: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_nearest(
-    tree: Tree,
-    places: np.ndarray,
-    within: float,
-    distance: np.ndarray,
-    near: np.ndarray,
-    first: int,
-    last: int,
+    tree: Tree, places: np.ndarray, within: float, distance: np.ndarray, near: np.ndarray, first: int, last: int
 ) -> None:
     """Finds the points nearest to places ``first`` to ``last`` (n, 3), as many as ``distance`` and ``near`` (n, count)
     have columns: their distances, the least first, and their rows. Of points equally far the first row comes first.

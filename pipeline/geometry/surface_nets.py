@@ -56,9 +56,7 @@ def surface_net(
     return SurfaceNet(vertices, net_faces(field, neighbours, vertices, of_cell, True), of_cell)
 
 
-def volume_net(
-    field: Float32[np.ndarray, "nx ny nz"],
-) -> tuple[Float32[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
+def volume_net(field: Float32[np.ndarray, "nx ny nz"]) -> tuple[Float32[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
     """Builds the mesh of the zero level in a whole volume; all quadrilaterals are split the same way."""
     nx, ny, nz = field.shape
     index = nodes_about_surface(field)

@@ -49,10 +49,7 @@ def with_kernel(
     modes = kernel_modes(span, scales, most)
     sigma = np.linalg.norm(modes.reshape(len(modes), -1), axis=1).astype(np.float32)
     return replace(
-        span,
-        modes=np.concatenate([span.modes, modes]),
-        sigma=np.concatenate([span.sigma, sigma]),
-        _bases={},
+        span, modes=np.concatenate([span.modes, modes]), sigma=np.concatenate([span.sigma, sigma]), _bases={}
     )
 
 

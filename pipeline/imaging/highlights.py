@@ -75,10 +75,7 @@ class Excess:
 
 @traced
 def without_highlights(
-    images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]],
-    silhouettes: Mapping[str, Silhouette],
-    rig: Rig,
-    head_world: Mesh,
+    images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], silhouettes: Mapping[str, Silhouette], rig: Rig, head_world: Mesh
 ) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
     """Returns the images with the highlights on the head darkened to the skin's own light.
 
@@ -159,11 +156,7 @@ def local_range(values: Float[np.ndarray, " v"], faces: Int[np.ndarray, "f 3"]) 
 
 
 def _seen(
-    camera: Camera,
-    image: UInt8[np.ndarray, "h w 3"],
-    silhouette: Silhouette,
-    head_world: Mesh,
-    normals: np.ndarray,
+    camera: Camera, image: UInt8[np.ndarray, "h w 3"], silhouette: Silhouette, head_world: Mesh, normals: np.ndarray
 ) -> _Sight:
     vertices, k = head_world.vertices, camera.intrinsics
     pixels, depths = project_points(camera, vertices), camera_depths(camera, vertices)

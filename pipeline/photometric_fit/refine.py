@@ -59,10 +59,7 @@ MISFIT_FACTOR, MISFIT_LOCAL = 1.2, 0.6  # the latter is the share of a place's o
 
 @traced
 def refine_with_photographs(
-    solved: ContourSolution,
-    images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
-    *,
-    hair: HairProbability | None = None,
+    solved: ContourSolution, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], *, hair: HairProbability | None = None
 ) -> tuple[ContourSolution, Detail]:
     """Continues the contour solution with finer modes and with observations of the surface from photographs.
 

@@ -180,11 +180,7 @@ def similarity_document(transform: Similarity) -> SimilarityReport:
     """Returns the similarity in the paper's form ``x_world = s (R x_head + t)``; its translation is that of
     ``transform`` divided by the scale."""
     translation = transform.translation / transform.scale
-    return {
-        "scale": transform.scale,
-        "rotation": transform.rotation.tolist(),
-        "translation": translation.tolist(),
-    }
+    return {"scale": transform.scale, "rotation": transform.rotation.tolist(), "translation": translation.tolist()}
 
 
 def _texture(texturing: Texturing) -> TextureReport:

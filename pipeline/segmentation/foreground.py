@@ -237,8 +237,7 @@ def _closed(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def whole_subject(
-    mask: Bool[np.ndarray, "h w"],
-    plain: Bool[np.ndarray, "h w"],
+    mask: Bool[np.ndarray, "h w"], plain: Bool[np.ndarray, "h w"]
 ) -> tuple[Bool[np.ndarray, "h w"], tuple[float, ...]]:
     """Returns the largest component of the mask with its small gaps and holes filled, and the areas of the other
     components as shares of its area."""
@@ -265,9 +264,7 @@ def whole_subject(
 
 
 def smooth_odds(
-    odds: Float32[np.ndarray, "h w"],
-    image: Float32[np.ndarray, "h w 3"],
-    background: Background,
+    odds: Float32[np.ndarray, "h w"], image: Float32[np.ndarray, "h w 3"], background: Background
 ) -> Float[np.ndarray, "h w"]:
     """Returns the probability of the subject at each pixel after mean-field smoothing, in which neighbours with similar
     residuals influence each other."""
@@ -288,10 +285,7 @@ def find_shadows(
     ratio = ((image * plate / variance) @ CHANNEL_SUM) / np.maximum((plate**2 / variance) @ CHANNEL_SUM, 1e-6)
     strength = np.sqrt(chi2 / (2 * ANY_COLOUR_ODDS))
     best, soft = chi2, np.zeros(odds.shape, bool)
-    for sign, most, chroma in (
-        (-1.0, 1 - DARKEST_SHADOW, SHADOW_CHROMA),
-        (1.0, BRIGHTEST, REFLECTED_CHROMA),
-    ):
+    for sign, most, chroma in ((-1.0, 1 - DARKEST_SHADOW, SHADOW_CHROMA), (1.0, BRIGHTEST, REFLECTED_CHROMA)):
         depth = np.clip(sign * (ratio - 1), 0.0, most).astype(np.float32)
         slack = variance + (chroma * depth[:, :, None] * plate) ** 2
         left = (((image - (1 + sign * depth)[:, :, None] * plate) ** 2 / slack) @ CHANNEL_SUM).astype(np.float32)

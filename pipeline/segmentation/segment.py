@@ -173,11 +173,7 @@ def _decided(image: ImageRgb, plates: tuple[ImageRgb, ...]) -> Decision:
     return decide(image, plates_for(image, plates))
 
 
-def _refined(
-    image: ImageRgb,
-    decision: Decision,
-    counted: Bool[np.ndarray, "h w"] | None = None,
-) -> Silhouette:
+def _refined(image: ImageRgb, decision: Decision, counted: Bool[np.ndarray, "h w"] | None = None) -> Silhouette:
     """Returns the sub-pixel silhouette of a coarse decision, or an unusable one if the mask is too small. ``counted``
     are the pixels whose outline is judged; None for all."""
     if decision.mask.mean() < MIN_SUBJECT_SHARE:
@@ -254,11 +250,7 @@ def _mask_quality(mask: Bool[np.ndarray, "h w"]) -> ViewQuality:
 
 
 def _quality(
-    mask: Bool[np.ndarray, "h w"],
-    components_holes: tuple[int, int],
-    contrast: float,
-    weak: float,
-    figures: dict,
+    mask: Bool[np.ndarray, "h w"], components_holes: tuple[int, int], contrast: float, weak: float, figures: dict
 ) -> ViewQuality:
     """Judges a mask by itself: what cuts it off, its contrast and area, and the warnings that follow."""
     borders = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}

@@ -78,10 +78,7 @@ def cast_votes(silhouettes: Mapping[str, Silhouette], rig: Rig, count: int = GRI
 
 @traced
 def judge_agreement(
-    silhouettes: Mapping[str, Silhouette],
-    rig: Rig,
-    *,
-    ready: Collection[str] = (),
+    silhouettes: Mapping[str, Silhouette], rig: Rig, *, ready: Collection[str] = ()
 ) -> dict[str, Silhouette]:
     """Compares each silhouette with those of the other cameras. Returns the same silhouettes with the disagreement
     added to their quality.

@@ -24,12 +24,7 @@ from pipeline.evidence.expression import (
 )
 from pipeline.evidence.gaze import pupils
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
-from pipeline.evidence.plausibility import (
-    UnexplainedOutlines,
-    plausibility_warnings,
-    unexplained_outlines,
-    unseen_face,
-)
+from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines, unseen_face
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment

@@ -85,13 +85,7 @@ def texture_head(
     if settings.outputs.albedo != "none":
         albedo, albedo_warnings = estimate_albedo(mesh, normals, vertices, atlas, face, around, chart=chart)
     sets, set_warnings = colour_by_sets(
-        capture.texture_sets,
-        vertices.decision,
-        mesh,
-        views.silhouettes,
-        layout,
-        atlas=atlas,
-        settings=settings.texture,
+        capture.texture_sets, vertices.decision, mesh, views.silhouettes, layout, atlas=atlas, settings=settings.texture
     )
     warnings = (*chart_warnings, *vertices.warnings, *layout_warnings, *albedo_warnings, *pores_warnings, *set_warnings)
     return Staged(Texturing(normals, depths, capture, vertices, atlas, reduced, chart, albedo, skin, sets), warnings)
@@ -110,12 +104,5 @@ def _read_pores(
         return None, []
     if context.read_original is None or coloured.decision is None:
         return None, [compose("no-pores")]
-    close = read_close_views(
-        context.read_original,
-        mesh,
-        coloured,
-        face,
-        sources=views.assignment,
-        chart=chart,
-    )
+    close = read_close_views(context.read_original, mesh, coloured, face, sources=views.assignment, chart=chart)
     return close, []

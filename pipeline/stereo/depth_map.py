@@ -35,9 +35,7 @@ def points_world(depth_map: DepthMap) -> Float[np.ndarray, "n 3"]:
     return place_known(depth_map.depth_mm, depth_map.deviation_mm, pinhole, turn, shift)
 
 
-def placing(
-    camera: Camera,
-) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
+def placing(camera: Camera) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
     """Returns what ``depth_map_kernels`` need of a camera without distortion: fx fy cx cy (px), and rotation and
     translation (mm) of world_from_camera."""
     k, pose = camera.intrinsics, camera.camera_from_world.inverse()

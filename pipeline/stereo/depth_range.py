@@ -67,11 +67,7 @@ def find_depth_ranges(
 
 
 def _bounds(
-    crop: Crop,
-    least: Stack,
-    view: int,
-    head_world: Mesh | None,
-    extent: tuple[Float[np.ndarray, " 3"], float],
+    crop: Crop, least: Stack, view: int, head_world: Mesh | None, extent: tuple[Float[np.ndarray, " 3"], float]
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
     """Returns the nearest and farthest depth (mm) of each pixel at the least size; 0 where no depth is possible."""
     camera = crop.levels[-1].camera

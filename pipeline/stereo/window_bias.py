@@ -29,9 +29,7 @@ class WindowBias:
 
 
 def windowed_height(
-    vertices: Float[np.ndarray, "v 3"],
-    normals: Float[np.ndarray, "v 3"],
-    wanted: Bool[np.ndarray, " v"] | None = None,
+    vertices: Float[np.ndarray, "v 3"], normals: Float[np.ndarray, "v 3"], wanted: Bool[np.ndarray, " v"] | None = None
 ) -> Float[np.ndarray, " v"]:
     """Computes how far (mm, along the normal) the mean of the surface over a window lies above each vertex. Parts of
     the window that face another way do not count. If ``wanted`` is not None, vertices outside it get 0."""

@@ -79,10 +79,7 @@ def estimate_albedo(
 
 
 def shine_left(
-    shown: Float[np.ndarray, "v 3"],
-    dim: Float[np.ndarray, "v 3"],
-    seen: Bool[np.ndarray, " v"],
-    around: Neighbourhood,
+    shown: Float[np.ndarray, "v 3"], dim: Float[np.ndarray, "v 3"], seen: Bool[np.ndarray, " v"], around: Neighbourhood
 ) -> Float[np.ndarray, " v"]:
     """Returns the share of each vertex's light that is not highlight, from ``1 - MAX_SHINE`` to 1. It compares the
     brightness of the colours ``shown`` with that of the ``dim`` views. Colour is not compared: a highlight has the

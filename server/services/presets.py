@@ -36,12 +36,7 @@ PRESETS = (
         compose("preset-renderers-explained"),
         {"outputs": {"formats": ["glb", "ply", "obj", "usdz"]}},
     ),
-    Preset(
-        "simplex",
-        compose("preset-paper"),
-        compose("preset-paper-explained"),
-        {"method": "simplex"},
-    ),
+    Preset("simplex", compose("preset-paper"), compose("preset-paper-explained"), {"method": "simplex"}),
 )
 
 

@@ -94,10 +94,7 @@ class SurfaceBinding:
 
 
 def surface_binding(
-    rest: Float[np.ndarray, "t 3"],
-    skin: Int[np.ndarray, " n"],
-    attachment: Attachment,
-    wholes: Int[np.ndarray, " t"],
+    rest: Float[np.ndarray, "t 3"], skin: Int[np.ndarray, " n"], attachment: Attachment, wholes: Int[np.ndarray, " t"]
 ) -> SurfaceBinding:
     """Builds a binding, and chooses the skin vertices that deeper ones follow: those nearest to them, and some spread
     over all of the skin."""

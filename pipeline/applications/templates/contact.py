@@ -133,10 +133,7 @@ def _together(
 
 
 def _relaxed(
-    rest: RestSurface,
-    wanted: Float[np.ndarray, "t 3"],
-    clean: Float[np.ndarray, "t 3"],
-    zone: Int[np.ndarray, " r"],
+    rest: RestSurface, wanted: Float[np.ndarray, "t 3"], clean: Float[np.ndarray, "t 3"], zone: Int[np.ndarray, " r"]
 ) -> Float[np.ndarray, "t 3"]:
     """Returns the displacement nearest to ``wanted``, on the way from ``clean``, that does not cross either."""
     if (wanted == clean).all() or _spot(rest, clean, WEIGHTS, zone).any():

@@ -22,11 +22,7 @@ MIN_NOISE = 0.7  # levels: what a sensor and 8 bits leave
 
 
 def decision_without_plate(
-    image: UInt8[np.ndarray, "_ _ 3"],
-    coarse: Float32[np.ndarray, "h w 3"],
-    found: CoarseMask,
-    *,
-    solid: bool = False,
+    image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], found: CoarseMask, *, solid: bool = False
 ) -> Decision:
     """Returns a decision for the matting, with a background estimated from the pixels around the mask. If ``solid``,
     the subject is a head, and holes in the mask are filled as skin or hair of the wall's colour."""

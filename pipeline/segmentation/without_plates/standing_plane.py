@@ -64,10 +64,7 @@ def ball_above(
 
 
 def _holds(
-    plane: Float[np.ndarray, " 4"],
-    points: Float[np.ndarray, "n 3"],
-    centre: Float[np.ndarray, " 3"],
-    radius: float,
+    plane: Float[np.ndarray, " 4"], points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"], radius: float
 ) -> bool:
     height = points @ plane[:3] + plane[3]
     on = points[np.abs(height) < NEAR * radius]

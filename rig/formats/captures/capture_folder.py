@@ -30,13 +30,7 @@ from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.cameras.reading import CamerasRead
 from rig.formats.captures.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.captures.features_json import document_from_features, features_from_bytes
-from rig.formats.captures.shot_files import (
-    BESIDE_PICTURES,
-    ShotFiles,
-    find_files,
-    listed_pictures,
-    stray_sentence,
-)
+from rig.formats.captures.shot_files import BESIDE_PICTURES, ShotFiles, find_files, listed_pictures, stray_sentence
 from rig.formats.pictures.images import cut_out_alpha, decode_image_file, page_count, picture_size, write_image
 from rig.formats.pictures.picture_names import is_junk
 from rig.formats.pictures.picture_rims import fill_rims

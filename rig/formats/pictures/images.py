@@ -78,11 +78,7 @@ def is_picture(path: Path) -> bool:
 
 
 def write_image(
-    path: Path,
-    image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"],
-    quality: int = 95,
-    *,
-    parents: bool = True,
+    path: Path, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], quality: int = 95, *, parents: bool = True
 ) -> None:
     """Writes RGB or grey pixels in the format of the suffix. ``quality`` is JPEG's; ``parents`` makes the folder if
     need be."""

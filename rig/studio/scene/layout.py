@@ -92,12 +92,7 @@ def rig_from_directions(
 
 
 def _camera(
-    name: str,
-    azimuth_deg: float,
-    elevation_deg: float,
-    rng: np.random.Generator,
-    distance_mm: float,
-    roll_deg: float,
+    name: str, azimuth_deg: float, elevation_deg: float, rng: np.random.Generator, distance_mm: float, roll_deg: float
 ) -> Camera:
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     direction = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])

@@ -124,12 +124,7 @@ def setting_lines(s: ServiceSettings) -> list[SettingLine]:
         "upload_hours": compose("hours", hours=s.upload_hours),
     }
     return [
-        {
-            "name": name,
-            "variable": PREFIX + name.upper(),
-            "value": value.document(),
-            "means": MEANINGS[name].document(),
-        }
+        {"name": name, "variable": PREFIX + name.upper(), "value": value.document(), "means": MEANINGS[name].document()}
         for name, value in values.items()
     ]
 

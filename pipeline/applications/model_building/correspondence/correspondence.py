@@ -208,11 +208,7 @@ def _landmark_rows(template: HeadModel) -> Int[np.ndarray, " L"]:
 
 
 def statistical(
-    prior: Prior,
-    faces: Int[np.ndarray, "F 3"],
-    index: Int[np.ndarray, " L"],
-    target: Target,
-    matching: Matching,
+    prior: Prior, faces: Int[np.ndarray, "F 3"], index: Int[np.ndarray, " L"], target: Target, matching: Matching
 ) -> Float[np.ndarray, "V 3"]:
     """Returns the most probable head under the prior, given the scan's landmarks and surface: first with broad modes,
     then with all.

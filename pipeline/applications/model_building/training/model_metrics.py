@@ -19,11 +19,7 @@ def compactness(sigma: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
 
 
 def generalisation(
-    components: Components,
-    region: Bool[np.ndarray, " V"],
-    counts: Iterable[int],
-    *,
-    report: Progress | None = None,
+    components: Components, region: Bool[np.ndarray, " V"], counts: Iterable[int], *, report: Progress | None = None
 ) -> dict[int, float]:
     """Computes the mean vertex distance (mm, over ``region``) of each head to the nearest head in the PCA of all
     others, by number of modes.
