@@ -72,7 +72,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         pose = replace(pose, doubtful=True)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
-    return Reconstruction(
+    result = Reconstruction(
         model_name=context.model.name,
         model_sha256=context.model.sha256,
         settings=context.settings,
@@ -92,3 +92,4 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         warnings=run.warnings,
         seconds=run.seconds(),
     )
+    return result.widen_by_scale(context.rig.scale_sigma) if context.rig.scale_sigma else result

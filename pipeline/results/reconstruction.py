@@ -5,9 +5,13 @@ seconds of the stages (those reach report.json only, never head.ply).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
 
 from pipeline.evidence.pose import PoseEvidence
+from pipeline.faces.irises import Iris
 from pipeline.settings import Settings
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.bust import Bust, HairyHead
@@ -45,8 +49,34 @@ class Reconstruction:
     evidence: Evidence
     warnings: tuple[ReportWarning, ...]
     seconds: Mapping[str, float]  # per stage, and "total"
+    scale_sigma: float = 0.0  # as in ``Rig``; in every deviation
 
     @property
     def mesh_world(self) -> Mesh:
         """Returns the delivered head, full level, world frame, mm."""
         return self.refined.mesh_world
+
+    def widen_by_scale(self, sigma: float) -> "Reconstruction":
+        """Returns the result with deviations that also hold for cameras whose common scale has the relative standard
+        deviation ``sigma``, about the head's origin."""
+        centre = self.head.fit.world_from_head.translation
+
+        def widen(mesh: Mesh, deviation_mm: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+            return np.hypot(deviation_mm, sigma * ((mesh.vertices - centre) * mesh.normals()).sum(axis=1))
+
+        refined = replace(self.refined, deviation_mm=widen(self.mesh_world, self.refined.deviation_mm))
+        bust = self.bust
+        if bust is not None:
+            surface = replace(bust.surface, deviation_mm=widen(bust.mesh_world, bust.surface.deviation_mm))
+            bust = replace(bust, shaped=replace(bust.shaped, surface=surface))
+        evidence = replace(
+            self.evidence,
+            landmarks={name: mark.widen_by_scale(sigma, centre) for name, mark in self.evidence.landmarks.items()},
+            measurements={name: length.widen_by_scale(sigma) for name, length in self.evidence.measurements.items()},
+        )
+        eyes = {
+            side: eye.widen_by_scale(sigma, centre) if isinstance(eye, Iris) else eye
+            for side, eye in self.faces.eyes.items()
+        }
+        faces = replace(self.faces, eyes=eyes)
+        return replace(self, refined=refined, bust=bust, evidence=evidence, faces=faces, scale_sigma=sigma)

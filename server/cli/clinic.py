@@ -119,7 +119,10 @@ def register(
 
     patient = read_surface(surface, cast(Axes | None, axes))
     marks = None if landmarks is None else read_surface_landmarks(landmarks, patient.axes)
-    registered = register_head(read_visit(result, model), patient, marks)
+    visit = read_visit(result, model)
+    for warning in visit.warnings:
+        warn(str(warning))
+    registered = register_head(visit, patient, marks)
     prepare_folder(out)
     document = write_registration(out, registered)
     answer(document | {"out": str(out)}, json_out, _registration_lines(document, out))

@@ -15,7 +15,9 @@ import numpy as np
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
 from pipeline.faces.matching import EYE_DISTANCE_MM
 from pipeline.faces.networks import DamagedNetwork, FaceNetworks, load_networks
-from pipeline.faces.sighting import GLANCE_PX, SMALLEST_PX, reduce_picture, sight_face
+from pipeline.faces.sighting import GLANCE, GLANCE_PX, SMALLEST_PX, reduce_picture, sight_face
+from pipeline.faces.subject import find_subject
+from pipeline.view_checks.one_moment import judge_moments
 from pipeline.warnings import ReportWarning
 from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
@@ -273,7 +275,9 @@ def _face_of(
     images = {name: image for name, (image, _) in small.items()}
     reduced = Rig(tuple(camera for _, camera in small.values()))
     limits = EYE_DISTANCE_MM if is_metric else None
-    return sight_face(images, reduced, networks, front=rig.front_camera(), eye_distance_mm=limits)
+    subject = find_subject(images, reduced, networks, eye_distance_mm=limits, effort=GLANCE)
+    sighting = sight_face(subject, reduced, front=rig.front_camera())
+    return replace(sighting, remarks=(*sighting.remarks, *judge_moments(subject, reduced)))
 
 
 def _is_metric(root: Path) -> bool:

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rig.messages.message import compose
 from rig.progress import Progress
 from server.processes import share_one_heap, tidied
 from server.tasks.child import Report, WorkerContext
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from server.tasks.photographs import Prepared
 
 DONE = "done"  # the pipeline's last word, when nothing is written yet
+SURE_SCALE = 0.02  # relative: 3 mm of a head; above it the warning says that lengths are estimates
 
 
 def reconstruct_capture(
@@ -116,6 +118,10 @@ def run_job(
         )
     )
     report("write", 0.0)
-    done = replace(done, warnings=(*prepared.warnings, *done.warnings))
+    warnings = (*prepared.warnings, *done.warnings)
+    if done.scale_sigma > SURE_SCALE and all(warning.code != "scale-assumed" for warning in warnings):
+        estimated = compose("scale-estimated", share=done.scale_sigma)
+        warnings = (compose("scale-assumed", scale=estimated), *warnings)
+    done = replace(done, warnings=warnings)
     with span("stage", "write"):
         write_result(out, done, prepared.capture, writers)

@@ -61,6 +61,11 @@ EXPERIMENTS = {
         "Counts false alarms and hits of every check that can refuse a capture.",
         {"folders": inputs.folders_or_known},
     ),
+    "living": Record(
+        "experiments.people.living:living",
+        "Compares heads of living people from few and many cameras.",
+        {"folders": inputs.photograph_folders},
+    ),
     "planted": Record("experiments.faults.planted:planted", "Runs whole jobs on pictures with faults of studios."),
     "visible": Record(
         "experiments.surface.visible:visible",
@@ -121,7 +126,6 @@ BENCHMARKS = {
     "farm_cuts": Record("benchmarks.farm_cuts:run", "Kills and cuts off workers without a common folder."),
     "image_stages": Record("benchmarks.image_stages:run", "Times the stages of a job."),
     "large_pictures": Record("benchmarks.large_pictures:run", "Writes, or times, a capture of 24 Mpx pictures."),
-    "long_lists": Record("benchmarks.long_lists:run", "Times lists of a hundred thousand captures."),
     "scene_calibration": Record("benchmarks.scene_calibration:run", "Judges calibration from photographs alone."),
     "side_by_side": Record("benchmarks.side_by_side:run", "Compares two checkouts on the same captures."),
     "studio_masks": Record("benchmarks.studio_masks:run", "Compares masks of the studio with the truth."),

@@ -38,7 +38,7 @@ from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
 
 READ = {
-    "": {"format", "unit", "cameras"},
+    "": {"format", "unit", "cameras", "scale_sigma"},
     "cameras": {"name", "width", "height", "intrinsics", "distortion", "camera_from_world", "covariance", "serial"},
     "cameras.intrinsics": {"fx", "fy", "cx", "cy"},
     "cameras.camera_from_world": {"rotation", "translation"},

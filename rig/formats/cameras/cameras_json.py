@@ -44,11 +44,12 @@ class CameraDocument(TypedDict):
 
 
 class CamerasDocument(TypedDict):
-    """Holds the content of ``cameras.json``."""
+    """Holds the content of ``cameras.json``. ``scale_sigma`` is as in ``Rig``."""
 
     format: str
     unit: str
     cameras: list[CameraDocument]
+    scale_sigma: NotRequired[float]
 
 
 def read_rig(path: Path) -> Rig:
@@ -69,7 +70,14 @@ def write_rig(rig: Rig, path: Path) -> None:
 
 def document_from_rig(rig: Rig) -> CamerasDocument:
     """Returns the content of ``cameras.json`` for a rig."""
-    return {"format": FORMAT, "unit": "mm", "cameras": [_camera_document(camera) for camera in rig]}
+    document: CamerasDocument = {
+        "format": FORMAT,
+        "unit": "mm",
+        "cameras": [_camera_document(camera) for camera in rig],
+    }
+    if rig.scale_sigma:
+        document["scale_sigma"] = rig.scale_sigma
+    return document
 
 
 def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
@@ -89,11 +97,14 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
     found = [camera for camera in cameras if camera is not None]
     names = [camera.name for camera in found]
     faults += _repeated(names) + _shared_serials(found)
+    scale_sigma = document.get("scale_sigma", 0.0)
+    if not _is_number(scale_sigma) or not 0.0 <= scale_sigma < 1.0:
+        faults.append(compose("no-share", key="scale_sigma", value=f"{scale_sigma!r:.80}"))
     if faults:
         read = [entry for entry in entries[:CAMERAS_MOST] if isinstance(entry, dict)]
         written = [entry["name"] for entry in read if isinstance(entry.get("name"), str)]
         raise InputError(subject, say_once(faults, [*filter(None, written), *places]))
-    return Rig(tuple(found))
+    return Rig(tuple(found), float(scale_sigma))
 
 
 def _unit_fault(unit: Any) -> Message:

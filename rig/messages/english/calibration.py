@@ -92,6 +92,8 @@ TEMPLATES = {
     "scale-camera-lost": "cameras: {camera} did not join the others; name two that did",
     "scale-by-cameras": "the {distance_mm:g} mm between {first} and {second}",
     "scale-by-points": "the {distance_mm:g} mm between two picked points",
+    "scale-estimated": "an estimate that is good to {share:.0%}, as cameras.json says; give scale.json to know it",
+    "scale-by-face": "an ASSUMPTION: the face in the photographs has a mean adult's size; give scale.json to know it",
     "scale-by-head": "an ASSUMPTION: the points in the middle are a head of the model's mean size; give scale.json to know it",
     "front-of-no-photograph": "{front} is none of the photographs' ({cameras})",
     "pose-known-to": "{camera} is known to {px:.1f} px at the subject only: add views beside it",

@@ -49,6 +49,7 @@ TEMPLATES = {
     "no-pixel-count": "{key} is {value}, wanted a whole number of pixels from 16 to {most}",
     "no-object-of": "{key} is missing or no object: wanted are {names} by name",
     "no-finite-number": "{key} is {value}, wanted a finite number",
+    "no-share": "{key} is {value}, wanted a share from 0 to 1",
     "no-positive-number": "{key} is {value}, wanted a positive number",
     "no-number": "{key} is {value}, wanted a number",
     "no-table": "{key} is no table",

@@ -2,6 +2,7 @@
 
 import copy
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,9 @@ def fan(turn: RigidTransform | None = None) -> Rig:
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     rig = fan()
-    write_rig(rig, tmp_path / "cameras.json")
+    write_rig(replace(rig, scale_sigma=0.06), tmp_path / "cameras.json")
     again = read_rig(tmp_path / "cameras.json")
+    assert again.subset(["cam01"]).scaled(0.5).scale_sigma == 0.06
     assert again.names == rig.names
     for one, other in zip(rig, again, strict=True):
         assert one.intrinsics == other.intrinsics
@@ -97,6 +99,7 @@ MIRROR = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]
         ("cameras.3.height", True, "cam03.height is True"),
         ("cameras.3.height", NAN, "cam03.height is nan"),
         ("cameras.3.height", INF, "cam03.height is inf"),
+        ("scale_sigma", 1.5, "scale_sigma is 1.5, wanted a share from 0 to 1"),
         ("cameras.3.intrinsics", ..., "cam03.intrinsics is missing or no object: wanted are fx, fy, cx, cy by name"),
         ("cameras.3.intrinsics.fx", NAN, "cam03.intrinsics.fx is nan"),
         ("cameras.3.intrinsics.fx", "1500", "cam03.intrinsics.fx is '1500'"),
