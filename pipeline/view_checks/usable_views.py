@@ -13,7 +13,7 @@ from typing import Literal
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.view_checks.camera_drift import find_drift
 from pipeline.view_checks.guards import STRICT, Guards
-from pipeline.view_checks.head_size import judge_head_size
+from pipeline.view_checks.head_size import find_low_crowns, judge_head_size
 from pipeline.view_checks.image_assignment import assign_images
 from pipeline.view_checks.mask_edges import masks_off_edges
 from pipeline.view_checks.picture_faults import plates_brightness, with_picture_faults
@@ -103,6 +103,10 @@ def usable_views(
     if usable < MIN_VIEWS and not by_face:
         overruled.append(guards.refuse(TooFewViews(silhouettes, capture)))
         silhouettes = {name: _tried(silhouette) for name, silhouette in silhouettes.items()}
+    low = find_low_crowns(silhouettes, rig, find_face)
+    left_out = usable - len(low) >= MIN_VIEWS
+    silhouettes = {n: _left_out(s) if left_out and n in low else s for n, s in silhouettes.items()}
+    crowns = [compose("crown-low", camera=name, low_mm=mm) for name, mm in low.items()]
     silhouettes, moved = without_moved_cameras(silhouettes, rig)
     unexplained = silhouettes
     silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys())
@@ -112,7 +116,7 @@ def usable_views(
     given_masks = [name for name in rig.names if name in assigned.capture.masks]
     beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
     of_views = (*view_warnings(silhouettes), *moved_warnings)
-    warnings = (*assigned.warnings, *overruled, *of_views, *size, *beside, *capture.remarks)
+    warnings = (*assigned.warnings, *overruled, *crowns, *of_views, *size, *beside, *capture.remarks)
     return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
 
 
@@ -120,6 +124,10 @@ def _tried(silhouette: Silhouette) -> Silhouette:
     """Returns the silhouette as a usable one if it shows anything."""
     usable = silhouette.quality.usable or float(silhouette.mask.mean()) > MIN_AREA
     return replace(silhouette, quality=replace(silhouette.quality, usable=usable))
+
+
+def _left_out(silhouette: Silhouette) -> Silhouette:
+    return replace(silhouette, quality=replace(silhouette.quality, usable=False))
 
 
 def without_moved_cameras(
@@ -130,12 +138,11 @@ def without_moved_cameras(
     kept, warnings = dict(silhouettes), dict[str, ReportWarning]()
     for drift in find_drift(silhouettes, rig):
         if drift.moved:
-            quality = replace(silhouettes[drift.camera].quality, usable=False)
-            kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
+            kept[drift.camera] = _left_out(silhouettes[drift.camera])
         warnings[drift.camera] = drift.warning()
     misplaced = misplaced_camera(kept, rig)
     if misplaced is not None:
-        kept[misplaced] = replace(kept[misplaced], quality=replace(kept[misplaced].quality, usable=False))
+        kept[misplaced] = _left_out(kept[misplaced])
         warnings[misplaced] = compose("camera-moved", finding=compose("camera-misplaced", camera=misplaced))
     return kept, warnings
 

@@ -183,6 +183,7 @@ TEMPLATES = {
     "outlines-unexplained": "the fitted head explains hardly any outline: in {poor} of {views} views its contour lies {off_mm:.0f} mm (median) from the subject's. Check that cameras and masks are of these pictures and to scale, name the camera that the subject faces (--front), or give feature points",
     "outlines-loose": "most outlines contradict each other by more than these cameras explain: look at the overlays for a shadow on the wall, or hair that some masks miss; where the masks are tight, calibrate again",
     "no-face": "no face was found in the photographs, though {views} cameras stand before the head as it was fitted: its pose comes from outlines alone. Look at the overlays; give feature points or --front where it is wrong",
+    "crown-low": "{camera}: its mask ends {low_mm:.0f} mm below the crown that the other cameras show; give its whole mask. It takes no part where three others are left",
     "moments-differ": "{camera} shows another moment or another person: its face, or its lips, lie {offset_mm:.0f} mm from where the other cameras see them. Trigger all cameras at once, or put the right picture there",
     "pose-doubtful": "{finding}",
     "refusal-overruled": "without --anyway this capture would have been refused, and the head may be wrong: {refusal}",

@@ -695,6 +695,7 @@ export default {
   "outlines-unexplained": "der angepasste Kopf erklärt kaum einen Umriss: in {poor} von {views} Ansichten liegt seine Kontur {off_mm:.0f} mm (Median) von der der Person. Prüfen, ob Kameras und Masken zu diesen Bildern gehören und der Maßstab stimmt, die Kamera nennen, der die Person zugewandt ist (--front), oder Merkmale setzen",
   "outlines-loose": "die meisten Umrisse widersprechen einander mehr, als diese Kameras erklären: in den Überlagerungen nach einem Schatten an der Wand sehen oder nach Haar, das in manchen Masken fehlt; sind die Masken eng, neu kalibrieren",
   "no-face": "in den Fotos wurde kein Gesicht gefunden, obwohl {views} Kameras vor dem Kopf stehen, wie er angepasst wurde: Seine Lage kommt allein aus Umrissen. Überlagerungen ansehen; wo sie falsch ist, Merkmale setzen oder --front angeben",
+  "crown-low": "{camera}: ihre Maske endet {low_mm:.0f} mm unter dem Scheitel, den die übrigen Kameras zeigen; die ganze Maske mitgeben. Sie bleibt außer Betracht, wo drei andere übrig sind",
   "moments-differ": "{camera} zeigt einen anderen Moment oder eine andere Person: Gesicht oder Lippen liegen {offset_mm:.0f} mm von dort, wo die übrigen Kameras sie sehen. Alle Kameras gleichzeitig auslösen, oder das richtige Bild dorthin legen",
   "pose-doubtful": "{finding}",
   "refusal-overruled": "ohne --anyway wäre diese Aufnahme abgelehnt worden, und der Kopf ist vielleicht falsch: {refusal}",
