@@ -602,7 +602,7 @@ export default {
   "lens-views-too-few": "{camera}: {views} gute Ansichten der Tafel; mindestens {needed}, besser 10, sind nötig",
   "camera-mirrored": "{camera} ist gespiegelt: Spiegeln in der Kamera oder ihrer Software abschalten und die Aufnahmen wiederholen",
   "front-of-other-rig": "{front} ist keine Kamera des Rigs ({cameras})",
-  "board-in-no-picture": "kein Bild zeigt sie: Ist board.toml die verwendete Tafel, und ist sie ganz in den Bildern?",
+  "board-in-no-picture": "kein Bild zeigt die Tafel: prüfen, ob board.toml sie beschreibt und ob sie ganz in den Bildern ist",
   "no-picture-of-board": "kein Bild zeigt die Tafel",
   "camera-without-board": "{camera} sieht die Tafel nie ({why})",
   "views-contradict": "{camera} widerspricht den anderen Kameras in {count} von {all} Aufnahmen: nachsehen, ob ihre Bilder gespiegelt oder von anderen Augenblicken sind, und ob sie sich bewegt hat",
