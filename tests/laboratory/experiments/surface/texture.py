@@ -9,7 +9,7 @@ pixels with the steepest gradients: eyes, brows, lips.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -42,7 +42,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 from tests.laboratory.experiments.surface.paper_blend import paper_texture
 
 SUBJECTS = 10
@@ -79,7 +79,7 @@ def texture(
         picture = None if bench.folder is None else bench.folder / f"texture-{name}.png"
         compute = partial(row_of, read, model, renderer, settings, number, picture)
         rows.append({"name": name, "group": group, **records.row(name, compute)})
-    return {"figures": _figures(rows), "rows": rows}
+    return {"figures": means_by(rows, "group"), "rows": rows}
 
 
 def row_of(
@@ -243,12 +243,3 @@ def _side_by_side(photograph: Image, drawn: Mapping[str, np.ndarray], face: np.n
             for text, image in panels.items()
         ]
     )
-
-
-def _figures(rows: Sequence[Row]) -> dict[str, float]:
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        for key, value in row.items():
-            if isinstance(value, float):
-                values.setdefault(f"{row['group']}_{key}", []).append(value)
-    return {key: float(np.mean(found)) for key, found in values.items()}

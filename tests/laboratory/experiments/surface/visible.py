@@ -9,7 +9,7 @@ reaches 1. ``precision_seen`` is of what the file itself calls seen.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -45,7 +45,7 @@ from tests.laboratory.experiments.paper.detail import (
 )
 from tests.laboratory.experiments.paper.span import weighted_quantile
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 from tests.laboratory.experiments.surface.face_skin import (
     crater_map,
     face_places,
@@ -102,7 +102,7 @@ def visible(
         picture = None if bench.folder is None else bench.folder / f"visible-{name}.png"
         compute = partial(known_row, read, model, renderer, picture)
         rows.append({"name": name, "group": group, **records.row(name, compute)})
-    return {"figures": figures(rows), "rows": rows}
+    return {"figures": means_by(rows, "group"), "rows": rows}
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
@@ -197,13 +197,3 @@ def _row(name: str, in_head: Mapping[str, Mesh]) -> np.ndarray:
             for title, mesh in in_head.items()
         ]
     )
-
-
-def figures(rows: Sequence[Row]) -> dict[str, float]:
-    """Returns means over the subjects of each group, of the figures that they have."""
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        for key, value in row.items():
-            if isinstance(value, float):
-                values.setdefault(f"{row['group']}_{key}", []).append(value)
-    return {key: float(np.mean(found)) for key, found in values.items()}

@@ -1,9 +1,9 @@
 """Measures the face finder on renders of known heads, and writes the tables that ship with it.
 
-    python -m tests.support.landmark_map photograph FOLDER --ict-facekit MODEL --of makehuman --heads 60
-    python -m tests.support.landmark_map photograph FOLDER --ict-facekit MODEL --of ict-facekit --heads 60
-    python -m tests.support.landmark_map tables FOLDER --ict-facekit MODEL     writes pipeline/faces/packs/*.npz
-    python -m tests.support.landmark_map check FOLDER --ict-facekit MODEL      judges half of the heads by the others
+    python -m tests.laboratory.model_packs.landmark_map photograph FOLDER --ict-facekit MODEL --of makehuman --heads 60
+    python -m tests.laboratory.model_packs.landmark_map photograph FOLDER --ict-facekit MODEL --of ict-facekit --heads 60
+    python -m tests.laboratory.model_packs.landmark_map tables FOLDER --ict-facekit MODEL     writes pipeline/faces/packs/*.npz
+    python -m tests.laboratory.model_packs.landmark_map check FOLDER --ict-facekit MODEL      judges half of the heads by the others
 
 (MODEL: ../shared/data/ict-facekit/ict_facekit_light.npz.)
 
@@ -40,8 +40,8 @@ from pipeline.head_model.model import HeadModel, assemble, load_model
 from rig.geometry import Similarity, rigid_fit
 from rig.mesh import vertex_normals
 from rig.render.renderer import Renderer
+from tests.laboratory.model_packs.landmark_renders import PhotographedHead, load_head, photograph_head, save_head
 from tests.support.drawn_faces import drawn_face
-from tests.support.landmark_renders import PhotographedHead, load_head, photograph_head, save_head
 
 MODELS = ("makehuman", "ict-facekit")
 MIN_SCORE, MIN_VIEWS = 2.0, 5
