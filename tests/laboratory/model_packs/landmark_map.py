@@ -1,9 +1,8 @@
 """Measures the face finder on renders of known heads, and writes the tables that ship with it.
 
-    python -m tests.laboratory.model_packs.landmark_map photograph FOLDER --ict-facekit MODEL --of makehuman --heads 60
-    python -m tests.laboratory.model_packs.landmark_map photograph FOLDER --ict-facekit MODEL --of ict-facekit --heads 60
-    python -m tests.laboratory.model_packs.landmark_map tables FOLDER --ict-facekit MODEL     writes pipeline/faces/packs/*.npz
-    python -m tests.laboratory.model_packs.landmark_map check FOLDER --ict-facekit MODEL      judges half of the heads by the others
+    python -m tests.laboratory.model_packs.landmark_map COMMAND FOLDER --ict-facekit MODEL
+        photograph, with --of makehuman --heads 60, then --of ict-facekit; tables writes pipeline/faces/packs/*.npz;
+        check judges half of the heads by the others
 
 (MODEL: ../shared/data/ict-facekit/ict_facekit_light.npz.)
 
