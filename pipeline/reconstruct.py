@@ -67,7 +67,7 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
             )
     with run.stage("bust") as stage:
         bust = stage.keep(colour_bust(stage.context, views, surface.product, texturing.capture))
-        hair = stage.keep(push_out_hair(stage.context, refined, bust))
+        hair = stage.keep(push_out_hair(stage.context, views, refined, bust, texturing.capture))
     if any(warning.code == "pose-doubtful" for warning in run.warnings):  # of a refusal that was overruled, too
         pose = replace(pose, doubtful=True)
     refuse(run.warnings, context.settings.fail_on)

@@ -17,7 +17,7 @@ be painted in the colour of the skin around it. Such a patch takes its colours f
 it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -60,6 +60,7 @@ GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
 
 
+MIN_SKIN, MIN_MEAN_SKIN = 0.5, 0.7  # of a view, and of all: at a collar's soft edge single views are sure of skin
 GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
 
 Rgb = tuple[float, float, float]
@@ -80,6 +81,32 @@ class Texture:
     warnings: tuple[ReportWarning, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinShown:
+    """Says where views show the skin of a head: ``share`` (0 to 1) gives for a camera how probably it does at each
+    vertex. Unseen vertices ``within`` a part of the mesh are filled from that part alone."""
+
+    share: Callable[[Camera], Float[np.ndarray, " v"]]
+    within: Bool[np.ndarray, " v"]
+
+    def shown(self, weights: Float32[np.ndarray, "k v"], views: Rig) -> Bool[np.ndarray, "k v"]:
+        """Tells which views may colour each vertex: not where they, or the mean of all, hardly show its skin."""
+        shares = np.stack([self.share(camera) for camera in views])
+        mean = (weights * shares).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
+        return (shares > MIN_SKIN) & (mean > MIN_MEAN_SKIN)
+
+    def filled(
+        self,
+        colours: Float[np.ndarray, "v 3"],
+        seen: Bool[np.ndarray, " v"],
+        faces: Int[np.ndarray, "f 3"],
+        whole: Float[np.ndarray, "v 3"],
+    ) -> Float[np.ndarray, "v 3"]:
+        """Returns the colours ``whole`` with those of the part filled from the part alone."""
+        inside = faces[self.within[faces].all(axis=1)]
+        return np.where(self.within[:, None], fill_unknown(colours, seen & self.within, inside), whole)
+
+
 @traced
 def texture(
     mesh_world: Mesh,
@@ -93,14 +120,15 @@ def texture(
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
     outlier: float = OUTLIER,
+    skin: SkinShown | None = None,
 ) -> Texture:
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
 
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
-    weight are no brighter. A view counts half where it differs from the median of the
-    views by ``outlier`` of its level.
+    weight are no brighter. A view counts half where it differs from the median of the views by ``outlier`` of its level.
+    With ``skin``, no view colours a vertex where it shows something before the mesh.
     """
     views = usable_views(capture, silhouettes, rig)
     if settings.blend == "reference":
@@ -117,6 +145,8 @@ def texture(
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
+    if skin is not None:
+        weights *= skin.shown(weights, views)
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
         gains, offsets = balance(weights, colours)
@@ -132,7 +162,9 @@ def texture(
         pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world=mesh_world)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths)
-    shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
+    whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
+    whole = whole if skin is None else skin.filled(agreed, seen > 0, mesh_world.faces, whole)
+    shown = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8)
     by_camera = _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
     warnings = _gain_warnings(by_camera)

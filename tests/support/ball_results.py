@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from rig.atomic_write import write_atomically
-from rig.formats.meshes.glb import write_glb
+from rig.formats.meshes.glb import glb_bytes
 from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from rig.progress import Progress
@@ -52,7 +52,7 @@ def work(
             part=part,
             comments=["unit mm"],
         )
-        write_glb(folder / f"{name}.glb", Mesh(ball.vertices, ball.faces, colours), normals=normals, colours=colours)
+        (folder / f"{name}.glb").write_bytes(glb_bytes(ball, normals=normals, colours=colours))
     place = {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
     document = {"model": {"name": "ball", "sha256": "0"}, "method": "contour", "world_from_head": place}
     write_atomically(folder / "report.json", json.dumps(document).encode())

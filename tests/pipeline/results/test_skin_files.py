@@ -6,8 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pipeline.results.head_files import write_skin_maps
 from pipeline.results.report import skin_document
-from pipeline.results.skin_files import write_skin_maps
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
 from pipeline.texturing.pores.skin_maps import SkinMaps, codes_of
 

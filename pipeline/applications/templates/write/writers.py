@@ -1,4 +1,4 @@
-"""Lists what a job with a template adds to its result."""
+"""Lists what applications add to a job's result."""
 
 from functools import partial
 
@@ -6,18 +6,18 @@ from pipeline.applications.templates.load import load_template
 from pipeline.applications.templates.template_file import Template
 from pipeline.applications.templates.write.flame import write_flame
 from pipeline.applications.templates.write.mesh import write_template, write_template_hair
-from pipeline.applications.templates.write.shapes import write_template_shapes
+from pipeline.applications.templates.write.shapes import write_posed, write_template_shapes
 from pipeline.head_model.model import HeadModel
 from pipeline.results.write import ResultWriter
 
 
 def load_template_writers(name: str | None, model: HeadModel) -> tuple[ResultWriter, ...]:
-    """Loads the named template for a job with this model; returns its writers, or none if ``name`` is None.
+    """Loads the named template, if any, for a job with this model; returns the writer of posed.glb, and the template's.
 
     Raises UnknownTemplate, BadTemplate, OtherModel.
     """
     template = load_template(name, model)
-    return () if template is None else template_writers(template)
+    return (write_posed, *(() if template is None else template_writers(template)))
 
 
 def template_writers(template: Template) -> tuple[ResultWriter, ...]:

@@ -149,7 +149,7 @@ def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig,
     coloured = coloured_by(around=layout.around)
     atlas = paint_head(layout, mesh, coloured, model.levels["full"].face_region, settings)
     if atlas is not None:
-        encoded(atlas, "jpeg")
+        encoded(atlas.image, "jpeg")
     times.append((time.perf_counter(), time.process_time()))
     (wall, cpu), (more_wall, more_cpu) = ((b[0] - a[0], b[1] - a[1]) for a, b in pairwise(times))
     return {"vertices_s": wall, "texture_adds_s": more_wall - wall, "texture_adds_cpu_s": more_cpu - cpu}

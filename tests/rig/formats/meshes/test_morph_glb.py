@@ -1,7 +1,5 @@
 """Morph targets of a GLB, read back by a reader of the test's own."""
 
-import json
-import struct
 from typing import Any
 
 import numpy as np
@@ -9,9 +7,10 @@ import pytest
 import trimesh
 from trimesh.util import wrap_as_stream
 
-from rig.formats.meshes.glb import glb_bytes
-from rig.formats.meshes.morph_glb import with_morphs
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.scene import Part, Scene, Skin
 from rig.mesh import Mesh
+from tests.support.glb import opened_glb
 from tests.support.scenes import ellipsoid
 
 
@@ -20,19 +19,11 @@ def head() -> Mesh:
     return ellipsoid(3)
 
 
-def morphed(head: Mesh) -> bytes:
-    colours = np.full((len(head.vertices), 3), 128, np.uint8)
+def morphed(head: Mesh, skin: Skin | None = None) -> bytes:
     bump = np.zeros_like(head.vertices)
     bump[:40] = [1.0, 2.0, -3.0]
-    glb = glb_bytes(head, normals=head.normals(), colours=colours)
-    return with_morphs(glb, head.vertices, head.faces, {"jawOpen": bump, "tongueOut": 0 * bump}, {"jawOpen": 0.25})
-
-
-def read(glb: bytes) -> tuple[dict[str, Any], bytes]:
-    magic, version, length = struct.unpack_from("<4sII", glb)
-    assert (magic, version, length) == (b"glTF", 2, len(glb))
-    (size,) = struct.unpack_from("<I", glb, 12)
-    return json.loads(glb[20 : 20 + size]), glb[28 + size :]
+    morphs = {"jawOpen": bump, "tongueOut": 0 * bump}
+    return scene_glb_bytes(Scene([Part("head", head, skin=skin, morphs=morphs, weights={"jawOpen": 0.25})]))
 
 
 def accessor(document: dict[str, Any], payload: bytes, number: int) -> np.ndarray:
@@ -48,7 +39,7 @@ def accessor(document: dict[str, Any], payload: bytes, number: int) -> np.ndarra
 
 
 def test_a_morph_moves_what_it_says(head: Mesh) -> None:
-    document, payload = read(morphed(head))
+    document, payload = opened_glb(morphed(head))
     mesh = document["meshes"][0]
     assert mesh["extras"]["targetNames"] == ["jawOpen", "tongueOut"]
     assert mesh["weights"] == [0.25, 0.0]
@@ -68,3 +59,18 @@ def test_other_programs_still_read_the_mesh(head: Mesh) -> None:
     assert isinstance(scene, trimesh.Scene)
     (mesh,) = scene.geometry.values()
     np.testing.assert_allclose(mesh.vertices * 1000.0, head.vertices, atol=1e-3)
+
+
+def test_a_vertex_on_a_seam_moves_as_its_twin(head: Mesh) -> None:
+    count = len(head.vertices)
+    source = np.append(np.arange(count), 3)
+    faces = head.faces.copy()
+    row, corner = np.argwhere(faces == 3)[0]
+    faces[row, corner] = count
+    skin = Skin(np.zeros((count + 1, 2)), b"\x89PNG\r\n", "image/png", source, faces)
+    document, payload = opened_glb(morphed(head, skin))
+    target = document["meshes"][0]["primitives"][0]["targets"][0]
+    for kind in ("POSITION", "NORMAL"):
+        moved = accessor(document, payload, target[kind])
+        np.testing.assert_array_equal(moved[count], moved[3])
+    assert "TEXCOORD_0" in document["meshes"][0]["primitives"][0]["attributes"]

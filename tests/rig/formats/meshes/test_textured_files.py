@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from rig.formats.meshes.glb import Skin, glb_bytes
-from rig.formats.meshes.obj import mtl_bytes, textured_obj_bytes
+from rig.formats.meshes.glb import glb_bytes
+from rig.formats.meshes.obj import mtl_bytes, scene_obj_bytes
 from rig.formats.meshes.ply import ply_bytes, read_head_ply
 from rig.formats.meshes.printing import stl_bytes, threemf_bytes
-from rig.formats.meshes.usdz import usdz_bytes
+from rig.formats.meshes.scene import Part, Scene, Skin
+from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.mesh import Mesh
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=90.0)
@@ -55,7 +56,7 @@ def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
 
 
 def test_trimesh_reads_a_textured_obj_with_its_material(tmp_path: Path) -> None:
-    data = textured_obj_bytes(MESH, normals=NORMALS, uv=UV, faces_uv=MESH.faces, library="head.mtl")
+    data = scene_obj_bytes(Scene([Part("head", MESH, NORMALS, Skin(UV, b"", "image/png"))]), "head.mtl")
     (tmp_path / "head.obj").write_bytes(data)
     (tmp_path / "head.mtl").write_bytes(mtl_bytes("head.png"))
     (tmp_path / "head.png").write_bytes(image(".png"))
@@ -110,9 +111,9 @@ def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
     UsdGeom: Any = pytest.importorskip("pxr.UsdGeom")
     UsdShade: Any = pytest.importorskip("pxr.UsdShade")
 
-    parts = {"normals": NORMALS, "uv": UV, "faces_uv": MESH.faces, "image": image(".jpg"), "suffix": ".jpg"}
-    data = usdz_bytes(MESH, **parts)
-    assert data == usdz_bytes(MESH, **parts)
+    scene = Scene([Part("head", MESH, NORMALS, Skin(UV, image(".jpg")))])
+    data = scene_usdz_bytes(scene)
+    assert data == scene_usdz_bytes(scene)
     path = tmp_path / "head.usdz"
     path.write_bytes(data)
     with zipfile.ZipFile(path) as archive:
@@ -121,13 +122,13 @@ def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
             assert (entry.compress_type, start % 64) == (zipfile.ZIP_STORED, 0)
     stage = pxr.Stage.Open(str(path))
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
-    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/head/mesh"))
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/person/head"))
     np.testing.assert_allclose(np.array(shape.GetPointsAttr().Get()) * 1000, MESH.vertices, atol=1e-4)
     coordinates = UsdGeom.PrimvarsAPI(shape).GetPrimvar("st")
     np.testing.assert_allclose(
         np.array(coordinates.ComputeFlattened()), (UV * (1, -1) + (0, 1))[MESH.faces].reshape(-1, 2), atol=1e-6
     )
     material, _ = UsdShade.MaterialBindingAPI(shape.GetPrim()).ComputeBoundMaterial()
-    assert material.GetPath() == "/head/skin"
-    picture = UsdShade.Shader(stage.GetPrimAtPath("/head/skin/texture"))
-    assert picture.GetInput("file").Get().resolvedPath.endswith("[texture.jpg]")
+    assert material.GetPath() == "/person/head_skin"
+    picture = UsdShade.Shader(stage.GetPrimAtPath("/person/head_skin/texture"))
+    assert picture.GetInput("file").Get().resolvedPath.endswith("[head.jpg]")
