@@ -127,7 +127,7 @@ def texture(
 
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
-    weight are no brighter. A view counts half where it differs from the median of the views by ``outlier`` of its level.
+    weight are no brighter. A view counts half where it differs from the views' median by ``outlier`` of its level.
     With ``skin``, no view colours a vertex where it shows something before the mesh.
     """
     views = usable_views(capture, silhouettes, rig)
