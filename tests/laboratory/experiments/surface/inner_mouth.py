@@ -22,7 +22,6 @@ from pipeline.applications.templates.inner_mouth import (
     placed_inner_mouth,
 )
 from pipeline.applications.templates.pivots import jaw_motions
-from pipeline.head_model import inner_mouth_file
 from pipeline.head_model.model import HeadModel
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 from tests.laboratory.experiments.surface.eyeballs import HEADS, OpenHead, open_head
@@ -33,7 +32,7 @@ Moves = Mapping[str, Float[np.ndarray, "v 3"]]
 def inner_mouths(facekit: HeadModel, *, bench: Bench) -> Outcome:
     """Returns ``meeting_rest``, ``meeting_before`` and ``meeting_after`` (triangles of the skin over all heads, shapes
     and weights), and ``lift_worst_mm``."""
-    records, rows = bench.records("inner-mouth", key_of(facekit.sha256, tested, inner_mouth_file)), []
+    records, rows = bench.records("inner-mouth", key_of(facekit.sha256, tested)), []
     for number in range(HEADS):
         bench.report(f"head {number}", number / HEADS)
         rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))

@@ -7,13 +7,13 @@ from pipeline.applications.templates.animated import AnimatedMesh
 from pipeline.applications.templates.inner_mouth import (
     InnerMouth,
     kept_off_teeth,
+    load_inner_mouth,
     meeting_triangles,
     placed_inner_mouth,
 )
 from pipeline.applications.templates.pivots import hinge, jaw_motions
 from pipeline.applications.templates.write.shapes import animated_scene
 from pipeline.fusion.crossings import crossing_faces
-from pipeline.head_model.inner_mouth_file import load_inner_mouth
 from pipeline.head_model.model import HeadModel, load_model
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.mesh import boundary_edges

@@ -9,9 +9,8 @@ import pytest
 
 from pipeline.applications.templates.carrying import bind_vertices, surface_binding
 from pipeline.applications.templates.header import BadTemplate, OtherModel
-from pipeline.applications.templates.load import load_template
 from pipeline.applications.templates.names import UnknownTemplate, WrongName, list_templates, new_path, remove_template
-from pipeline.applications.templates.template_file import Template, read_template, save_template
+from pipeline.applications.templates.template_file import Template, load_template, read_template, save_template
 from pipeline.applications.templates.write.mesh import write_template
 from pipeline.head_model.data_folder import DATA
 from pipeline.head_model.model import HeadModel, load_model

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.segmentation.without_plates.standing_plane import NEAR, ball_above, standing_plane
+from pipeline.segmentation.without_plates.decide import NEAR, ball_above, standing_plane
 
 CENTRE, RADIUS = np.array([5.0, -3.0, 8.0]), 200.0
 
