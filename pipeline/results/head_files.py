@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from pipeline.head_model.subdivision import boundary_loops, close_loop
-from pipeline.results.metadata import QUALITY, asset_extras, ply_comments
-from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extras, ply_comments
 from pipeline.texturing.chart_colours import CODES, ENCODED
 from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Atlas

@@ -33,9 +33,8 @@ from pipeline.results.head_files import (
     write_formats,
     write_head_ply,
 )
-from pipeline.results.metadata import QUALITY, asset_extras, ply_comments
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
-from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extras, ply_comments
 from pipeline.results.report import report_document
 from pipeline.results.report_types import AddedReport
 from pipeline.results.slicer_landmarks import landmarks_document

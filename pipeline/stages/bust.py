@@ -18,8 +18,8 @@ from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
-from pipeline.texturing.head_texture import find_layout, paint_head
 from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.paint import find_layout, paint_head
 from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
 from rig.mesh import Mesh

@@ -25,7 +25,8 @@ from pipeline.evidence.expression import (
 from pipeline.evidence.gaze import pupils
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
 from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines, unseen_face
-from pipeline.evidence.pose import PoseEvidence
+from pipeline.evidence.pose import PoseEvidence, judge_pose
+from pipeline.faces.landmark_map import landmark_map
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
@@ -147,3 +148,20 @@ def eye_warnings(closed: frozenset[str]) -> list[ReportWarning]:
         return []
     both = len(closed) == 2
     return [compose("eyes-closed", eyes=compose("both-eyes-are") if both else compose("one-eye-is", side=min(closed)))]
+
+
+def check_pose(
+    context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
+) -> Staged[PoseEvidence]:
+    """Compares the head's landmarks with the faces in the photographs, and the cost of its pose with that of the best
+    other pose."""
+    evidence, warnings = judge_pose(
+        refined.mesh_world,
+        head.fit.world_from_head,
+        context.rig,
+        faces.subject,
+        None if faces.subject is None else landmark_map(context.model),
+        method=alignment.method,
+        rival=alignment.rival,
+    )
+    return Staged(evidence, warnings)

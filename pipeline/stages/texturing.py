@@ -16,9 +16,9 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo
 from pipeline.texturing.chart_colours import ChartColours, chart_colours, with_true_colours
-from pipeline.texturing.head_texture import find_layout, paint_head
-from pipeline.texturing.layout.reduced_layout import ReducedLayout, reduced_layout
+from pipeline.texturing.layout.normal_map import ReducedLayout, reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.paint import find_layout, paint_head
 from pipeline.texturing.pores.close_views import CloseViews, read_close_views
 from pipeline.texturing.pores.skin_maps import SkinMaps, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets

@@ -32,8 +32,7 @@ from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
-from pipeline.texturing.inpaint import fill_unknown
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown
 from pipeline.texturing.paint_kernels import Pictures
 from pipeline.texturing.seam_levelling import level_views
 from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views

@@ -7,9 +7,8 @@ import numpy as np
 
 from pipeline.compute.array_cache import cached_arrays
 from pipeline.head_model.model import HeadModel
-from pipeline.texturing.inpaint import neighbours
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 
 
 @dataclass(frozen=True, slots=True, eq=False)

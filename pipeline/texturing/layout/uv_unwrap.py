@@ -13,11 +13,12 @@ The layout is made from a model's mean head, so that texels of any two subjects 
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.sparse.linalg
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from rig.errors import EigenheadError
 from rig.messages.message import compose
@@ -201,3 +202,14 @@ def _stretch(
     over = np.bincount(faces.ravel(), np.repeat(area * square, 3), len(points))
     found = np.sqrt(over / np.bincount(faces.ravel(), np.repeat(area, 3), len(points)))
     return found / np.median(found)
+
+
+def spread_texels(image: Float32[np.ndarray, "s s k"], known: Bool[np.ndarray, "s s"]) -> Float32[np.ndarray, "s s k"]:
+    """Returns the image with every unknown texel replaced by the nearest known one."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.asarray(labels).astype(np.int32)
+    values = np.ones((int(nearest.max()) + 1, image.shape[2]), np.float32)
+    values[nearest[known]] = image[known]
+    return values[nearest]

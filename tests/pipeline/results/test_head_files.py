@@ -22,7 +22,7 @@ from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings, settings_from_document
 from pipeline.texturing.albedo import Albedo
 from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.reduced_layout import reduced_layout
+from pipeline.texturing.layout.normal_map import reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
 from pipeline.texturing.light import Light
 from pipeline.texturing.sets.specular import Specular

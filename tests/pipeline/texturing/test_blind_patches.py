@@ -8,9 +8,8 @@ import numpy as np
 from pipeline.geometry.raster import depth_maps
 from pipeline.head_model.subdivision import boundary_loops, close_loop
 from pipeline.settings import TextureSettings
-from pipeline.texturing.inpaint import neighbours
 from pipeline.texturing.layout.uv_unwrap import unwrap
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.vertex_colours import fill_unobserved_patches, texture
 from rig.colour_space import srgb_from_linear

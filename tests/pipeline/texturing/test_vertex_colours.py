@@ -12,7 +12,7 @@ from pipeline.geometry.raster import depth_map, depth_maps
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.settings import TextureSettings
-from pipeline.texturing.inpaint import fill_unknown
+from pipeline.texturing.neighbourhood import fill_unknown
 from pipeline.texturing.vertex_colours import Texture, texture
 from pipeline.texturing.vertex_colours_kernels import OUTLIER
 from pipeline.texturing.visibility import sharpened

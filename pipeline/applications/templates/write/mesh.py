@@ -14,8 +14,7 @@ from jaxtyping import Int, UInt8
 from pipeline.applications.templates.template_file import Template
 from pipeline.applications.templates.write.texture import Tile, corner_tiles, skin_polygons, template_textures
 from pipeline.results.head_files import ENCODINGS, encoded
-from pipeline.results.metadata import ply_comments
-from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.reconstruction import Reconstruction, ply_comments
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.obj import MATERIAL
 from rig.formats.meshes.polygon_obj import PolygonMesh, polygon_obj_bytes

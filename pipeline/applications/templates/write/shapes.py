@@ -28,8 +28,7 @@ from pipeline.faces.irises import Iris, UnseenEye
 from pipeline.head_model.subdivision import opened_faces
 from pipeline.head_model.visemes import VISEMES
 from pipeline.results.head_files import encoded, head_from_world, head_mesh, head_skin
-from pipeline.results.metadata import asset_extras
-from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.reconstruction import Reconstruction, asset_extras
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.obj import scene_obj_bytes

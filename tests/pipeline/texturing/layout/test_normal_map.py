@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
-from pipeline.texturing.layout.reduced_layout import ReducedLayout, reduce
+from pipeline.texturing.layout.normal_map import ReducedLayout, normal_mapped, png, reduce, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
 from rig.formats.meshes.glb import glb_bytes
 from rig.formats.meshes.scene import Skin
