@@ -1,41 +1,13 @@
 """Describes a head model, as ``eigenhead model info --json`` prints it."""
 
-from collections.abc import Mapping
-from typing import TypedDict
+from typing import Any
 
 from pipeline.head_model.model import HeadModel
 
 
-class LevelInfo(TypedDict):
-    """Describes the size of a mesh level."""
-
-    vertices: int
-    faces: int
-
-
-class ModelInfo(TypedDict):
-    """Describes a head model. ``vertices`` and ``faces`` are those of the full level; figures that were never measured
-    are None."""
-
-    name: str
-    licence: str
-    sha256: str
-    subjects: dict[str, int]
-    modes: int
-    expressions: list[str]
-    vertices: int
-    faces: int
-    landmarks: int
-    generalisation_mm: float | None
-    specificity_mm: float | None
-    source: str
-    notice: str
-    figures: Mapping[str, object]
-    levels: dict[str, LevelInfo]
-
-
-def model_info(model: HeadModel) -> ModelInfo:
-    """Returns the description of a model as JSON types."""
+def model_info(model: HeadModel) -> dict[str, Any]:
+    """Returns the description of a model as JSON types. ``vertices`` and ``faces`` are those of the full level; figures
+    that were never measured are None."""
     full = model.levels["full"]
     return {
         "name": model.name,

@@ -125,7 +125,7 @@ def colour_bust(
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
+    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture)
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 
 
@@ -154,7 +154,7 @@ def push_out_hair(
     mesh = Mesh(shell.vertices_world, refined.mesh_world.faces)
     normals, depths, layout = mesh.normals(), depth_maps(rig, mesh), find_layout(context.model, settings)[0]
     around = None if layout is None else layout.around
-    colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture, around=around)
+    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, around=around)
     atlas = paint_head(layout, mesh, colours, context.model.levels["full"].face_region, settings)
     made = HairyHead(shell, normals, colours.colours, colours.views, atlas)
     beyond = shell.covered < MIN_COVERED

@@ -58,7 +58,6 @@ def texture_head(
     ears = pinnae(model)
     vertices = texture(
         mesh,
-        normals,
         capture,
         views.silhouettes,
         rig,

@@ -109,7 +109,6 @@ class SkinShown:
 @traced
 def texture(
     mesh_world: Mesh,
-    normals: Float[np.ndarray, "v 3"],
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
@@ -129,18 +128,16 @@ def texture(
     weight are no brighter. A view counts half where it differs from the views' median by ``outlier`` of its level.
     With ``skin``, no view colours a vertex where it shows something before the mesh.
     """
-    views = usable_views(capture, silhouettes, rig)
+    views, normals = usable_views(capture, silhouettes, rig), mesh_world.normals()
     if settings.blend == "reference":
         return _reference(mesh_world, normals, capture, silhouettes, views, depths)
     if not len(views):
         return _untextured(len(normals))
 
     def read_view(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
-        name = camera.name
-        image = sharpened(capture.images[name], silhouettes[name].mask, settings.sharpening)
-        points, silhouette = mesh_world.vertices, silhouettes[name]
-        sight = see_points(camera, image, silhouette, depths[name], points, normals)
-        return sight, image
+        silhouette = silhouettes[camera.name]
+        image = sharpened(capture.images[camera.name], silhouette.mask, settings.sharpening)
+        return see_points(camera, image, silhouette, depths[camera.name], mesh_world.vertices, normals), image
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
@@ -156,19 +153,22 @@ def texture(
         return _untextured(len(seen))
     decision = None
     if around is not None:
-        images = [image for _, image in found]
         masks = {name: silhouettes[name].mask for name in views.names}
-        pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world=mesh_world)
+        pictures = pack_pictures(views, [image for _, image in found], masks, gains, offsets, mesh_world=mesh_world)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
     whole = whole if skin is None else skin.filled(agreed, seen > 0, mesh_world.faces, whole)
-    shown = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8)
-    by_camera = _by_name(views, gains)
-    filled = int(np.count_nonzero(seen == 0))
-    warnings = _gain_warnings(by_camera)
-    dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
-    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
+    return Texture(
+        np.rint(255 * srgb_from_linear(whole)).astype(np.uint8),
+        seen,
+        _by_name(views, gains),
+        _by_name(views, offsets),
+        int(np.count_nonzero(seen == 0)),
+        decision,
+        None if dim_share is None else underexposed_views(weights, balanced, dim_share),
+        _gain_warnings(_by_name(views, gains)),
+    )
 
 
 def underexposed_views(

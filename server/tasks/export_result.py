@@ -1,7 +1,5 @@
 """Writes files of a finished result in other formats, by the writers that wrote the result."""
 
-import json
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,6 +37,7 @@ from pipeline.warnings import Detail
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb
 from rig.errors import InputError
+from rig.formats.meshes.mesh_file import read_textured_mesh
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from rig.messages.message import compose, verbatim
@@ -141,23 +140,11 @@ def _read_textures(folder: Path, bare: Texturing, model: HeadModel, mesh: Mesh, 
 
 def _head_image(folder: Path) -> np.ndarray | None:
     """Returns the texture of head.png or head.glb (sRGB), or None."""
-    if (folder / "head.png").is_file():
+    if (folder / "head.png").is_file() or not (folder / "head.glb").is_file():
         return _read_image(folder / "head.png")
-    try:
-        data = (folder / "head.glb").read_bytes()
-        (length,) = struct.unpack_from("<I", data, 12)
-        document = json.loads(data[20 : 20 + length])
-        view = document["bufferViews"][document["images"][0]["bufferView"]]
-    except (OSError, struct.error, ValueError, KeyError):
-        return None
-    start = 28 + length + view["byteOffset"]
-    return _decoded(np.frombuffer(data, np.uint8, view["byteLength"], start))
+    return read_textured_mesh(folder / "head.glb").image
 
 
 def _read_image(path: Path) -> np.ndarray | None:
-    return _decoded(np.fromfile(path, np.uint8)) if path.is_file() else None
-
-
-def _decoded(data: np.ndarray) -> np.ndarray | None:
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     return image if image is None or image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])

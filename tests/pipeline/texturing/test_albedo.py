@@ -76,7 +76,7 @@ def found(mesh: Mesh, layout: Layout) -> dict[str, tuple[Atlas, Albedo, np.ndarr
         silhouettes = {key: silhouette_from_mask(mask) for key, (_, mask) in shots.items()}
         depths, settings = depth_maps(rig, mesh), TextureSettings()
         coloured = texture(
-            mesh, normals, capture, silhouettes, rig, depths, settings=settings, around=around, dim_share=DIM_SHARE
+            mesh, capture, silhouettes, rig, depths, settings=settings, around=around, dim_share=DIM_SHARE
         )
         assert coloured.decision is not None
         atlas = paint_texture(layout, mesh, coloured.colours, coloured.decision, 1024)

@@ -40,9 +40,7 @@ def coloured(shot: Shot) -> Texture:
     mesh = shot.mesh
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
     depths, settings = depth_maps(shot.rig, mesh), TextureSettings()
-    return texture(
-        mesh, mesh.normals(), shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around
-    )
+    return texture(mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around)
 
 
 @pytest.fixture(scope="module")
