@@ -17,8 +17,7 @@ from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.model_layout import ModelLayout, model_layout
-from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, NoLayout
+from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout
 from pipeline.texturing.paint_kernels import paint_rows
 from pipeline.texturing.vertex_colours import Texture
 from pipeline.warnings import ReportWarning

@@ -29,8 +29,7 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
 from pipeline.texturing.albedo import estimate_albedo
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.layout.uv_unwrap import Atlas, model_layout
 from pipeline.texturing.pores.skin_maps import SkinMaps
 from pipeline.texturing.vertex_colours import Texture
 from pipeline.warnings import Detail

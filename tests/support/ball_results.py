@@ -10,11 +10,11 @@ import numpy as np
 import trimesh
 
 from rig.atomic_write import write_atomically
-from rig.formats.meshes.glb import glb_bytes
 from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from rig.progress import Progress
 from server.tasks.child import WorkerContext
+from tests.support.glb import glb_bytes
 
 RADIUS_MM = 90.0
 QUALITY_MOST_MM = 2.0  # at the top of the ball; 1.0 at the bottom
@@ -52,7 +52,7 @@ def work(
             part=part,
             comments=["unit mm"],
         )
-        (folder / f"{name}.glb").write_bytes(glb_bytes(ball, normals=normals, colours=colours))
+        (folder / f"{name}.glb").write_bytes(glb_bytes(Mesh(ball.vertices, ball.faces, colours), normals=normals))
     place = {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
     document = {"model": {"name": "ball", "sha256": "0"}, "method": "contour", "world_from_head": place}
     write_atomically(folder / "report.json", json.dumps(document).encode())

@@ -16,8 +16,7 @@ from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
 from pipeline.texturing.chart_colours import CODES, ENCODED, LINEAR
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.model_layout import ModelLayout
-from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
 from pipeline.texturing.light import fit_light, transfer
 from pipeline.texturing.pores.close_views import CloseViews, halves_of
 from pipeline.texturing.pores.relief import MIN_SKIN, Strips, estimate_detail

@@ -13,11 +13,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from rig.colour_space import linear_from_srgb
-from rig.formats.meshes.scene import NECK, Part, Scene, Skin, quaternion
-from rig.mesh import Mesh, vertex_normals
+from rig.formats.meshes.scene import NECK, Part, Scene, quaternion
+from rig.mesh import vertex_normals
 
 ROUGHNESS = 0.55  # glTF's roughness of skin: 0.4 on an oily nose, 0.7 on a cheek
 WEBP, TEXTURE_WEBP = "image/webp", "EXT_texture_webp"  # glTF 2.0 itself knows JPEG and PNG alone
@@ -27,19 +27,6 @@ VERTICES, INDICES = 34962, 34963
 LEAST_MM = 0.005  # smaller displacements are left out
 LEAST_TURN = 1e-3  # smaller changes of a unit normal are left out
 GREY = 200  # of a mesh without colours
-
-
-def glb_bytes(
-    mesh: Mesh,
-    *,
-    normals: Float[np.ndarray, "v 3"],
-    colours: UInt8[np.ndarray, "v 3"] | None = None,
-    skin: Skin | None = None,
-    extras: Mapping[str, Any] | None = None,
-) -> bytes:
-    """Encodes one mesh (head frame, mm), with sRGB ``colours`` if it has no texture."""
-    part = Part("head", Mesh(mesh.vertices, mesh.faces, colours), normals, skin)
-    return scene_glb_bytes(Scene([part]), extras)
 
 
 def scene_glb_bytes(scene: Scene, extras: Mapping[str, Any] | None = None) -> bytes:

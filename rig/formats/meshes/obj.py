@@ -4,15 +4,9 @@ import io
 
 import numpy as np
 
-from rig.formats.meshes.scene import Part, Scene
-from rig.mesh import Mesh
+from rig.formats.meshes.scene import Scene
 
 MATERIAL = "skin"
-
-
-def obj_bytes(mesh: Mesh) -> bytes:
-    """Encodes one mesh with its vertex colours."""
-    return scene_obj_bytes(Scene([Part("head", mesh)]))
 
 
 def scene_obj_bytes(scene: Scene, library: str | None = None) -> bytes:

@@ -21,9 +21,8 @@ from pipeline.results.report import report_document, skin_document
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings, settings_from_document
 from pipeline.texturing.albedo import Albedo
-from pipeline.texturing.layout.model_layout import model_layout
 from pipeline.texturing.layout.normal_map import reduced_layout
-from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
+from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, model_layout
 from pipeline.texturing.light import Light
 from pipeline.texturing.pores.skin_maps import SkinMaps, codes_of
 from pipeline.texturing.sets.specular import Specular

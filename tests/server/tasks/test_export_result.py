@@ -15,8 +15,7 @@ from pipeline.evidence.expression import Found, build_blendshape_rig
 from pipeline.head_model.model import load_model
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.layout.uv_unwrap import Atlas, model_layout
 from rig.capture import Capture
 from rig.mesh import Mesh
 from server.cli.main import app

@@ -28,8 +28,7 @@ from pipeline.results.head_files import encoded
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.uv_unwrap import Layout
+from pipeline.texturing.layout.uv_unwrap import Layout, model_layout
 from pipeline.texturing.paint import paint_head
 from pipeline.texturing.vertex_colours import texture as colour
 from rig.camera import Camera

@@ -16,8 +16,7 @@ from pipeline.head_model.data_folder import DATA
 from pipeline.head_model.model import HeadModel, load_model
 from pipeline.head_model.model_names import UnknownModel, model_path
 from pipeline.settings import Settings, settings_from_document
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.layout.uv_unwrap import Atlas, model_layout
 from rig.errors import InputError
 from rig.formats.meshes.polygon_obj import PolygonMesh, read_polygons
 from rig.mesh import Mesh

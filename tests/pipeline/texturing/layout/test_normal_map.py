@@ -12,9 +12,9 @@ import trimesh
 
 from pipeline.texturing.layout.normal_map import ReducedLayout, normal_mapped, png, reduce, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
-from rig.formats.meshes.glb import glb_bytes
 from rig.formats.meshes.scene import Skin
 from rig.mesh import Mesh
+from tests.support.glb import glb_bytes
 
 RADIUS_MM, BUMP_MM, WAVES = 90.0, 0.5, 24.0
 

@@ -11,8 +11,7 @@ from pipeline.geometry.raster import depth_maps
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.model_layout import ModelLayout
-from pipeline.texturing.layout.uv_unwrap import Atlas, unwrap
+from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout, unwrap
 from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.sets.specular import exposure_ratios

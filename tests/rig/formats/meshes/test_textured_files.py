@@ -14,14 +14,14 @@ import pytest
 import trimesh
 from trimesh.util import wrap_as_stream
 
-from rig.formats.meshes.glb import glb_bytes, scene_glb_bytes
+from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.obj import mtl_bytes, scene_obj_bytes
 from rig.formats.meshes.ply import ply_bytes, read_head_ply
 from rig.formats.meshes.printing import stl_bytes, threemf_bytes
 from rig.formats.meshes.scene import Part, Scene, Skin
 from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.mesh import Mesh
-from tests.support.glb import opened_glb
+from tests.support.glb import glb_bytes, opened_glb
 from tests.support.scenes import ellipsoid
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=90.0)

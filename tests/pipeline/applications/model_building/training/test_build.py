@@ -17,9 +17,9 @@ from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.landmarks import NAMES, mirrored
 from pipeline.head_model.model import HeadModel, load_model
 from rig.errors import InputError
-from rig.formats.meshes.obj import obj_bytes
 from rig.geometry import rigid_fit
 from rig.mesh import Mesh
+from tests.support.glb import obj_bytes
 from tests.support.landmark_files import write_landmarks
 
 SUBJECTS = (4, 40, 100, 120)
