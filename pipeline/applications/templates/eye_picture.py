@@ -107,5 +107,5 @@ def _photographed(
     corners = layout.uv[layout.faces[photographed.between[hits.triangles]]]
     texels = (np.einsum("nk,nkx->nx", hits.weights, corners) * len(image) - 0.5).astype(np.float32)
     rows = np.resize(texels, (-(-len(texels) // SIZE_PX), SIZE_PX, 2))  # remap takes no more than 32,767 in a row
-    colours = cv2.remap(image, rows, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colours = cv2.remap(image, rows[..., 0], rows[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(colours, float).reshape(-1, 3)[: len(texels)], np.linalg.norm(aside, axis=1) < ASIDE_MM

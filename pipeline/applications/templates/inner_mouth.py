@@ -26,7 +26,7 @@ from rig.atomic_write import write_atomically
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 
-PACK = Path(__file__).parent / "packs" / "inner_mouth.npz"
+PACK = Path(__file__).parents[2] / "head_model" / "packs" / "inner_mouth.npz"
 PARTS = ("teeth_upper", "teeth_lower", "tongue")
 ANCHORS = (
     "subnasale", "labiale_superius", "stomion", "labiale_inferius", "sublabiale", "pogonion", "gnathion",

@@ -179,7 +179,7 @@ class _Writer:
         return len(self.document["bufferViews"]) - 1
 
     def _accessor(self, array: np.ndarray, target: int, **more: Any) -> int:
-        kind = {"componentType": COMPONENTS[array.dtype.str], "count": len(array)}
+        kind: dict[str, Any] = {"componentType": COMPONENTS[array.dtype.str], "count": len(array)}
         kind["type"] = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
         self.document["accessors"].append({"bufferView": self._view(array.tobytes(), target)} | kind | more)
         return len(self.document["accessors"]) - 1

@@ -1,6 +1,7 @@
 """A finished result in every other format, beside what a job writes."""
 
 import json
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,10 @@ from pipeline.settings import OutputSettings, Settings
 from pipeline.texturing.layout.uv_unwrap import Atlas, model_layout
 from rig.capture import Capture
 from rig.mesh import Mesh
+from rig.progress import discard_progress
 from server.cli.main import app
+from server.tasks.child import WorkerContext
+from server.tasks.export_archive import export_archive
 from tests.support.glb import opened_glb
 from tests.support.made_up_results import textured_result
 
@@ -84,6 +88,19 @@ def test_shapes_and_albedo_need_no_new_job(folder: Path, tmp_path: Path) -> None
     assert "tongueOut" not in head["extras"]["targetNames"]
     tongue = next(mesh for mesh in ours["meshes"] if mesh["name"] == "tongue")
     assert "tongueOut" in tongue["extras"]["targetNames"]
+
+
+@pytest.mark.slow
+def test_an_archive_holds_the_files_of_an_export(folder: Path, tmp_path: Path) -> None:
+    outputs = {"formats": ["obj"], "template": None, "morphs": False, "albedo": "none"}
+    archive = tmp_path / "export.zip"
+    export_archive(WorkerContext(), discard_progress, result=str(folder), archive=str(archive), outputs=outputs)
+    files = exported(folder, tmp_path / "obj", "obj")
+    with zipfile.ZipFile(archive) as packed:
+        assert {name: packed.read(name) for name in packed.namelist()} == {
+            name: (tmp_path / "obj" / name).read_bytes() for name in files
+        }
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["obj"]  # what was packed is gone
 
 
 def test_what_is_no_result_is_refused(tmp_path: Path) -> None:

@@ -132,16 +132,8 @@ def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig,
     """Returns wall-clock and processor seconds of vertex colours alone, and of what the texture adds, its JPEG
     included."""
     mesh, layout = found.mesh_world, model_layout(model)
-    coloured_by = partial(
-        colour,
-        mesh,
-        found.texturing.normals,
-        capture,
-        found.views.silhouettes,
-        rig,
-        depth_maps(rig, mesh),
-        settings=settings.texture,
-    )
+    views, depths = found.views.silhouettes, depth_maps(rig, mesh)
+    coloured_by = partial(colour, mesh, capture, views, rig, depths, settings=settings.texture)
     times = [(time.perf_counter(), time.process_time())]
     coloured_by()
     times.append((time.perf_counter(), time.process_time()))

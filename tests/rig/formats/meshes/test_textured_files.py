@@ -1,8 +1,6 @@
 """Textured and printable meshes: other programs read what we write, and the same input is the same bytes."""
 
 import io
-import json
-import struct
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from trimesh.util import wrap_as_stream
 
 from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.obj import mtl_bytes, scene_obj_bytes
@@ -36,11 +33,6 @@ def image(suffix: str) -> bytes:
     return cv2.imencode(suffix, PICTURE)[1].tobytes()
 
 
-def document(data: bytes) -> dict:
-    size = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + size])
-
-
 @pytest.mark.parametrize(("suffix", "mime"), [(".jpg", "image/jpeg"), (".png", "image/png"), (".webp", "image/webp")])
 def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
     extras = {"version": "1", "unit": "m"}
@@ -50,7 +42,7 @@ def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
     visual: Any = loaded.visual
     np.testing.assert_allclose(loaded.vertices * 1000, MESH.vertices, atol=1e-4)
     np.testing.assert_allclose(visual.uv, UV * (1, -1) + (0, 1), atol=1e-6)  # trimesh's v is upwards
-    header = document(data)
+    header, _ = opened_glb(data)
     assert header["asset"]["extras"] == extras
     assert header["images"][0]["mimeType"] == mime
     assert ("EXT_texture_webp" in header.get("extensionsRequired", [])) == (suffix == ".webp")
@@ -175,13 +167,6 @@ def test_a_morph_moves_what_it_says(head: Mesh) -> None:
     turned = head.normals() + accessor(document, payload, mesh["primitives"][0]["targets"][0]["NORMAL"])
     np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1.0, atol=2e-3)
     assert document["buffers"][0]["byteLength"] == len(payload)
-
-
-def test_other_programs_still_read_the_mesh(head: Mesh) -> None:
-    scene = trimesh.load(wrap_as_stream(morphed(head)), file_type="glb")
-    assert isinstance(scene, trimesh.Scene)
-    (mesh,) = scene.geometry.values()
-    np.testing.assert_allclose(mesh.vertices * 1000.0, head.vertices, atol=1e-3)
 
 
 def test_a_vertex_on_a_seam_moves_as_its_twin(head: Mesh) -> None:
