@@ -32,9 +32,8 @@ def _planes() -> tuple[str, ...]:
 
 
 @app.command(
-    epilog="Example: eigenhead export heads/anna --as usdz --out usd/anna   For 3D Slicer: eigenhead export heads/anna "
-    "--as slicer --plane frankfurt --out clinic/anna   A capture: eigenhead export shots/anna --as nerfstudio --result "
-    "heads/anna --out sets/anna"
+    epilog="Example: eigenhead export heads/anna --as usdz --out usd/anna   A capture: eigenhead export shots/anna "
+    "--as nerfstudio --result heads/anna --out sets/anna"
 )
 def export(
     capture: Annotated[

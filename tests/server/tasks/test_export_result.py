@@ -92,8 +92,7 @@ def test_shapes_and_albedo_need_no_new_job(folder: Path, tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_an_archive_holds_the_files_of_an_export(folder: Path, tmp_path: Path) -> None:
-    outputs = {"formats": ["obj"], "template": None, "morphs": False, "albedo": "none"}
-    archive = tmp_path / "export.zip"
+    outputs, archive = {"formats": ["obj"], "template": None, "albedo": "none"}, tmp_path / "export.zip"
     export_archive(WorkerContext(), discard_progress, result=str(folder), archive=str(archive), outputs=outputs)
     files = exported(folder, tmp_path / "obj", "obj")
     with zipfile.ZipFile(archive) as packed:
