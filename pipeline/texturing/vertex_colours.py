@@ -141,8 +141,10 @@ def texture(
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
+    hidden = (weights > 0).any(axis=0)
     if skin is not None:
         weights *= skin.shown(weights, views)
+    hidden &= ~(weights > 0).any(axis=0)
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
         gains, offsets = balance(weights, colours)
@@ -156,7 +158,7 @@ def texture(
         masks = {name: silhouettes[name].mask for name in views.names}
         pictures = pack_pictures(views, [image for _, image in found], masks, gains, offsets, mesh_world=mesh_world)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
-        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths)
+        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
     whole = whole if skin is None else skin.filled(agreed, seen > 0, mesh_world.faces, whole)
     return Texture(
@@ -314,10 +316,12 @@ def fill_unobserved_patches(
     mesh_world: Mesh,
     silhouettes: Mapping[str, Silhouette],
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+    hidden: Bool[np.ndarray, " v"] | None = None,
 ) -> Decision:
     """Returns the decision with a view added at the corners of every wide patch that a camera sees although it sees
-    none of the corners, such as a strip that closes an eye."""
-    rows = np.flatnonzero(_blind(decision.weights, mesh_world.faces))
+    none of the corners, such as a strip that closes an eye; not where hair or clothes lie before ``hidden`` corners."""
+    blind = _blind(decision.weights, mesh_world.faces)
+    rows = np.flatnonzero(blind if hidden is None else blind & ~hidden[mesh_world.faces].any(axis=1))
     faces, normals, area = _parts(mesh_world, rows)
     rows = rows[_wide(faces, area)]
     if not len(rows):
