@@ -161,16 +161,10 @@ def texture(
         decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
     whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
     whole = whole if skin is None else skin.filled(agreed, seen > 0, mesh_world.faces, whole)
-    return Texture(
-        np.rint(255 * srgb_from_linear(whole)).astype(np.uint8),
-        seen,
-        _by_name(views, gains),
-        _by_name(views, offsets),
-        int(np.count_nonzero(seen == 0)),
-        decision,
-        None if dim_share is None else underexposed_views(weights, balanced, dim_share),
-        _gain_warnings(_by_name(views, gains)),
-    )
+    shown, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
+    filled = int(np.count_nonzero(seen == 0))
+    dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
+    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, _gain_warnings(by_camera))
 
 
 def underexposed_views(
