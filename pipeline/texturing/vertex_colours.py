@@ -141,7 +141,7 @@ def texture(
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
-    hidden = (weights > 0).any(axis=0)
+    hidden = np.asarray((weights > 0).any(axis=0))
     if skin is not None:
         weights *= skin.shown(weights, views)
     hidden &= ~(weights > 0).any(axis=0)

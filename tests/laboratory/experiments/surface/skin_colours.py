@@ -68,7 +68,7 @@ def _point_colours(known: Known) -> UInt8[np.ndarray, "n 3"]:
         image, towards = known.capture.images[camera.name], camera.centre_world - points
         facing = np.einsum("nx,nx->n", normals, towards) / np.linalg.norm(towards, axis=1)
         at = np.rint(project_points(camera, points)).astype(int)
-        framed = ((at >= 0) & (at < np.array(image.shape[1::-1]))).all(axis=1)
+        framed = np.asarray(((at >= 0) & (at < np.array(image.shape[1::-1]))).all(axis=1))
         depth, cell = camera_depths(camera, points), np.where(framed[:, None], at, 0) // CELL_PX
         nearest = np.full(cell.max(axis=0) + 1, np.inf)
         np.minimum.at(nearest, tuple(cell[framed].T), depth[framed])
