@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.compute.trace import traced
 from pipeline.detail.smooth_field import smooth_field
-from pipeline.estimation.sparse_factor import factorised
+from pipeline.estimation.positive_definite import factorised
 from pipeline.faces.eyes import MAX_CLOSED_OPENING, MIN_HALF_OPENING
 from pipeline.head_model.model import HeadModel
 from rig.mesh import vertex_normals

@@ -6,13 +6,15 @@ seconds of the stages (those reach report.json only, never head.ply).
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.evidence.pose import PoseEvidence
 from pipeline.faces.irises import Iris
-from pipeline.settings import Settings
+from pipeline.settings import Settings, document_from_settings
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.bust import Bust, HairyHead
 from pipeline.stages.evidence import Evidence
@@ -23,6 +25,7 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
 from pipeline.warnings import ReportWarning
+from rig.digest import document_sha256
 from rig.mesh import Mesh
 
 
@@ -80,3 +83,35 @@ class Reconstruction:
         }
         faces = replace(self.faces, eyes=eyes)
         return replace(self, refined=refined, bust=bust, evidence=evidence, faces=faces, scale_sigma=sigma)
+
+
+QUALITY = "quality is the posterior standard deviation in mm, views the number of images that coloured a vertex"
+
+
+def ply_comments(result: Reconstruction) -> list[str]:
+    """Returns the comment lines that the headers of a result's PLY and OBJ files share."""
+    return [
+        "unit mm",
+        "frame world",
+        f"model {_ascii(result.model_name)} sha256 {result.model_sha256}",
+        f"job inputs sha256 {document_sha256(result.digests)}",
+        f"job settings sha256 {document_sha256(document_from_settings(result.settings))}",
+        f"version eigenhead {version('eigenhead')}",
+    ]
+
+
+def asset_extras(result: Reconstruction) -> dict[str, Any]:
+    """Returns the object ``asset.extras`` of head.glb and bust.glb."""
+    return {
+        "unit": "m",
+        "frame": "head",
+        "model": {"name": result.model_name, "sha256": result.model_sha256},
+        "inputs_sha256": document_sha256(result.digests),
+        "settings_sha256": document_sha256(document_from_settings(result.settings)),
+        "version": version("eigenhead"),
+    }
+
+
+def _ascii(text: str) -> str:
+    """Returns the text with every character that a PLY header cannot hold replaced by a question mark."""
+    return "".join(c if c.isascii() and c.isprintable() else "?" for c in text)

@@ -24,8 +24,9 @@ from pipeline.evidence.expression import (
 from pipeline.evidence.gaze import pupils
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
 from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines, unseen_face
-from pipeline.evidence.pose import PoseEvidence
+from pipeline.evidence.pose import PoseEvidence, judge_pose
 from pipeline.faces.eyes import MAX_CLOSED_OPENING, closed_by_openings, eye_warnings
+from pipeline.faces.landmark_map import landmark_map
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
@@ -136,3 +137,20 @@ def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> f
     ``openings`` of the lids where these are clear."""
     apart = {side for side, opening in openings.items() if opening > MAX_CLOSED_OPENING}
     return (closed | closed_by_openings(openings)) - apart
+
+
+def check_pose(
+    context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
+) -> Staged[PoseEvidence]:
+    """Compares the head's landmarks with the faces in the photographs, and the cost of its pose with that of the best
+    other pose."""
+    evidence, warnings = judge_pose(
+        refined.mesh_world,
+        head.fit.world_from_head,
+        context.rig,
+        faces.subject,
+        None if faces.subject is None else landmark_map(context.model),
+        method=alignment.method,
+        rival=alignment.rival,
+    )
+    return Staged(evidence, warnings)

@@ -110,10 +110,10 @@ def register(
         raise Overwrites(out / "registration.json")
     from typing import cast
 
+    from pipeline.applications.clinic.patient_files import write_registration
+    from pipeline.applications.clinic.registration import read_surface_landmarks
     from pipeline.applications.clinic.registration import register as register_head
-    from pipeline.applications.clinic.registration_files import write_registration
     from pipeline.applications.clinic.surface import read_surface
-    from pipeline.applications.clinic.surface_landmarks import read_surface_landmarks
     from pipeline.applications.clinic.visit import read_visit
     from rig.formats.meshes.markups import Axes
 

@@ -10,11 +10,11 @@ import numpy as np
 import trimesh
 
 from rig.atomic_write import write_atomically
-from rig.formats.meshes.glb import write_glb
 from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from rig.progress import Progress
 from server.tasks.child import WorkerContext
+from tests.support.glb import glb_bytes
 
 RADIUS_MM = 90.0
 QUALITY_MOST_MM = 2.0  # at the top of the ball; 1.0 at the bottom
@@ -35,7 +35,7 @@ def work(context: WorkerContext, report: Progress, *, result: str, **others: obj
         part = None if name == "head" else np.where(normals[:, 1] > 0, 2, 1).astype(np.uint8)
         values = {"normals": normals, "colours": colours, "quality": quality, "views": views, "part": part}
         write_ply(folder / f"{name}.ply", ball, comments=["unit mm"], **values)
-        write_glb(folder / f"{name}.glb", Mesh(ball.vertices, ball.faces, colours), normals=normals, colours=colours)
+        (folder / f"{name}.glb").write_bytes(glb_bytes(Mesh(ball.vertices, ball.faces, colours), normals=normals))
     place = {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
     document = {"model": {"name": "ball", "sha256": "0"}, "method": "contour", "world_from_head": place}
     write_atomically(folder / "report.json", json.dumps(document).encode())

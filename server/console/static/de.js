@@ -593,6 +593,8 @@ export default {
   "Picture (PNG)": "Bild (PNG)",
   "What the view shows, on nothing, with the legend of its colours": "Was die Ansicht zeigt, freigestellt, mit der Legende ihrer Farben",
   "Turntable (video)": "Drehung (Video)",
+  "Another format": "Anderes Format",
+  "Export (.zip)": "Exportieren (.zip)",
   "Stop, {share} %": "Anhalten, {share} %",
   "Not through a camera": "Nicht durch eine Kamera",
   "One turn, as the view shows the head": "Eine Umdrehung, wie die Ansicht den Kopf zeigt",

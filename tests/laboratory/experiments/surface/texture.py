@@ -28,9 +28,8 @@ from pipeline.results.head_files import encoded
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
-from pipeline.texturing.head_texture import paint_head
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.uv_unwrap import Layout
+from pipeline.texturing.layout.uv_unwrap import Layout, model_layout
+from pipeline.texturing.paint import paint_head
 from pipeline.texturing.vertex_colours import texture as colour
 from rig.camera import Camera
 from rig.capture import Capture
@@ -133,23 +132,15 @@ def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig,
     """Returns wall-clock and processor seconds of vertex colours alone, and of what the texture adds, its JPEG
     included."""
     mesh, layout = found.mesh_world, model_layout(model)
-    coloured_by = partial(
-        colour,
-        mesh,
-        found.texturing.normals,
-        capture,
-        found.views.silhouettes,
-        rig,
-        depth_maps(rig, mesh),
-        settings=settings.texture,
-    )
+    views, depths = found.views.silhouettes, depth_maps(rig, mesh)
+    coloured_by = partial(colour, mesh, capture, views, rig, depths, settings=settings.texture)
     times = [(time.perf_counter(), time.process_time())]
     coloured_by()
     times.append((time.perf_counter(), time.process_time()))
     coloured = coloured_by(around=layout.around)
     atlas = paint_head(layout, mesh, coloured, model.levels["full"].face_region, settings)
     if atlas is not None:
-        encoded(atlas, "jpeg")
+        encoded(atlas.image, "jpeg")
     times.append((time.perf_counter(), time.process_time()))
     (wall, cpu), (more_wall, more_cpu) = ((b[0] - a[0], b[1] - a[1]) for a, b in pairwise(times))
     return {"vertices_s": wall, "texture_adds_s": more_wall - wall, "texture_adds_cpu_s": more_cpu - cpu}

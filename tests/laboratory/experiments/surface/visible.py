@@ -53,6 +53,7 @@ from tests.laboratory.experiments.surface.face_skin import (
     normal_figures,
     shining_places,
 )
+from tests.laboratory.experiments.surface.skin_colours import wrong_colours
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
 STYLES = (
@@ -113,8 +114,8 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
     if found.bust is None:
         raise EigenheadError(f"{subject.name}: no bust ({'; '.join(str(warning) for warning in found.warnings)})")
     bust = found.bust.surface
+    in_head = found.head.fit.world_from_head.inverse()
     if picture is not None:
-        in_head = found.head.fit.world_from_head.inverse()
         meshes = {"truth": splats(subject.visible), "bust.ply": bust.mesh_world, "head.ply": found.mesh_world}
         write_image(
             picture, _row(subject.name, {k: Mesh(in_head.apply(m.vertices), m.faces) for k, m in meshes.items()})
@@ -123,7 +124,6 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
     shining = shining_places(places, subject.capture.images, subject.rig, subject.mesh)
     craters = find_craters(places, bust.mesh_world, shining)
     if picture is not None:
-        in_head = found.head.fit.world_from_head.inverse()
         true_local = Mesh(in_head.apply(subject.mesh.vertices), subject.mesh.faces)
         drawn = crater_map(craters, in_head.apply(places.points), true_local)
         write_image(picture.with_name(f"{picture.stem}-craters.png"), drawn)
@@ -136,6 +136,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
         **{f"{k}_face_{key}": v for k, mesh in faces.items() for key, v in surface_error(subject, mesh).items()},
         **{f"{k}_{key}": v for k, mesh in faces.items() for key, v in normal_figures(places, mesh).items()},
         **craters.figures(),
+        **wrong_colours(subject, found, model),
         **region_errors(subject, found.mesh_world, head_regions(model)),
         "head_to_bust_median_mm": float(np.median(head_to_bust(found.mesh_world, bust))),
         "cpu_s": seconds,

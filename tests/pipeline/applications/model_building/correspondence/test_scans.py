@@ -19,7 +19,7 @@ from pipeline.applications.model_building.correspondence.correspondence import (
 )
 from pipeline.applications.model_building.correspondence.parallel import FEW, workers
 from pipeline.applications.model_building.correspondence.scans import Scan
-from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
+from pipeline.applications.model_building.training.figures import Scanner, scan_head
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.landmarks import NAMES, mirrored, stacked
 from pipeline.head_model.model import HeadModel

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.applications.templates.flame_file import read_flame
+from pipeline.applications.templates.make import read_flame
 from pipeline.applications.templates.write.writers import template_writers
 from pipeline.contour_fit.fit import Fit
 from pipeline.head_model.model import load_model

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.imaging.undistortion import pinhole_of, undistorted_picture, undistorted_share
+from pipeline.results.view_dataset import pinhole_of, undistorted_picture, undistorted_share
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.geometry import RigidTransform
 from tests.support.dataset_readers import dot_centre, with_dots

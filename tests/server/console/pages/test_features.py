@@ -1,6 +1,6 @@
 """Suggested places become points only by being taken, and never against what somebody picked."""
 
-from server.console.suggestions import drop_suggestions, open_suggestions, take_suggestions
+from server.console.pages.features import drop_suggestions, open_suggestions, take_suggestions
 
 SUGGESTED = {"pronasale": {"cam00": [10.0, 20.0], "cam01": [11.0, 21.0]}, "gnathion": {"cam00": [12.0, 40.0]}}
 PICKED = {"pronasale": {"cam01": [99.0, 98.0]}}
