@@ -110,6 +110,7 @@ EXPERIMENTS = {
         "Judges heads from real photographs by views that were not used.",
         {"folders": inputs.photograph_folders},
     ),
+    "reports": Record("experiments.faults.reports:reports", "Judges what each door answers to the shared reports."),
 }
 
 BENCHMARKS = {
