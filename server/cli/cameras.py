@@ -221,13 +221,23 @@ def convert(
 ) -> None:
     """Convert calibrations to and from other programs."""
     from rig.errors import InputError
-    from rig.formats.cameras.cameras_file import FOLDER_FORMATS, NO_RIG, find_rig_file, read_cameras, write_rig_file
+    from rig.formats.cameras.cameras_file import (
+        FOLDER_FORMATS,
+        find_rig_file,
+        no_rig_fault,
+        read_cameras,
+        write_rig_file,
+    )
+    from rig.formats.captures.capture_folder import has_known_length
+    from rig.plausibility import rig_faults
 
     file = find_rig_file(source) if source.is_dir() else source
     if file is None:
-        raise InputError(str(source), [NO_RIG])
+        raise InputError(str(source), [no_rig_fault(source)])
     read = read_cameras(file)
     rig = read.rig
+    if faults := rig_faults(rig, any_unit=has_known_length(file.parent)):
+        raise InputError(file.name, faults)
     for remark in read.remarks:
         warn(f"{remark.code}: {remark}")
     prepare = prepare_folder if to in FOLDER_FORMATS else prepare_file

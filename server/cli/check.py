@@ -16,6 +16,7 @@ from rig.formats.cameras.cameras_file import read_cameras, rig_files
 from rig.formats.captures.capture_folder import SCALE, capture_root, unread_files, unread_pictures
 from rig.formats.captures.shot_files import BESIDE_PICTURES, find_files, listed_pictures
 from rig.formats.pictures.images import decode_image_file
+from rig.formats.pictures.picture_names import entry
 from rig.messages.message import MessageDocument, compose, documents_of, texts_of
 from rig.progress import Progress
 from server.cli.answers import service_settings
@@ -28,8 +29,6 @@ from server.tasks.reconstruct_folder import folder_of
 if TYPE_CHECKING:
     from pipeline.imaging.silhouette import Silhouette
     from pipeline.settings import Settings
-
-RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
 
 
 class Checked(TypedDict):
@@ -57,6 +56,7 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     try:
         with folder_of(capture) as folder:
             if photographs_alone(folder):
+                document["warnings"] = documents_of(unread_files(capture_root(folder), []))
                 document["cameras"], document["will"] = _plan_for_photographs(folder, report)
                 _check_front(chosen.front, document["cameras"])
                 return document
@@ -107,20 +107,18 @@ def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], li
     root = capture_root(folder)
     photographs = find_photographs(root)
     names = photographs.names
-    beside = [path for kind in BESIDE_PICTURES for path in listed_pictures(root / kind)]
+    beside = [path for kind in BESIDE_PICTURES for path in listed_pictures(entry(root, kind))]
     _check_pictures([*(path for shots in photographs.files.values() for path in shots.values()), *beside], root, report)
-    known = (root / SCALE).is_file()
+    known = entry(root, SCALE).is_file()
     if known:
-        read_scale(root / SCALE, names)
+        read_scale(entry(root, SCALE), names)
     scale = (
         "scale.json tells the scale" if known else "the scale will be ASSUMED from a head's mean size: add scale.json"
     )
-    present = [kind for kind in ("masks", "background") if (root / kind).is_dir()]
+    present = [kind for kind in ("masks", "background") if entry(root, kind).is_dir()]
     masks = f"{present[0]}/ tells the subject" if present else "the subject will be found from the photographs"
-    aside = [path.name for path in sorted(root.iterdir()) if path.suffix in RIG_SUFFIXES and path.name != SCALE]
-    unread = [f"{name} will not be read: it is no rig's file of a known program" for name in aside]
     begun = f"no cameras.json: {len(names)} photographs will be calibrated from the scene"
-    return list(names), [begun, *unread, scale, masks]
+    return list(names), [begun, scale, masks]
 
 
 def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:

@@ -27,6 +27,7 @@ from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
 from rig.formats.captures.capture_folder import (
+    FEATURES,
     SCALE,
     capture_root,
     check_folders,
@@ -36,8 +37,16 @@ from rig.formats.captures.capture_folder import (
     size_fault,
 )
 from rig.formats.captures.features_json import FEATURES_FORMAT, features_from_bytes
-from rig.formats.captures.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
+from rig.formats.captures.shot_files import (
+    ASIDE,
+    BESIDE_PICTURES,
+    ShotFiles,
+    find_files,
+    picture_folder,
+    stray_sentence,
+)
 from rig.formats.pictures.images import IMAGE_SUFFIXES, picture_size
+from rig.formats.pictures.picture_names import entry
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb, plates_for
 from rig.messages.fault_groups import say_once
@@ -65,6 +74,7 @@ def ingest_archive(
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
+    _name_in_small_letters(root)
     warnings = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
     _name_by_camera(root)
     described = check_capture(root, image_pixels, report, networks=_face_networks(context))
@@ -93,6 +103,14 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
         raise InputError("capture", [fault, *refusal.reasons]) from refusal
     _leave_out(root, read_rig(root / CAMERAS))
     return warnings
+
+
+def _name_in_small_letters(root: Path) -> None:
+    """Gives files and folders whose names a capture fixes those names. Raises InputError if two differ in case
+    alone."""
+    for name in (CAMERAS, SCALE, FEATURES, FIGURES, "images", *ASIDE):
+        if (found := entry(root, name)).exists():
+            found.rename(root / name)
 
 
 def _name_by_camera(root: Path) -> None:
@@ -138,11 +156,7 @@ def _leave_out(root: Path, rig: Rig) -> None:
     for folder in (picture_folder(root), *(root / kind for kind in BESIDE_PICTURES), *sets):
         for path in [*folder.iterdir()] if folder.is_dir() else ():
             is_candidate = path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES
-            if (
-                is_candidate
-                and (path.name if path.is_dir() else path.stem) not in rig
-                and path.name not in (*BESIDE_PICTURES, TEXTURE_SETS)
-            ):
+            if is_candidate and (path.name if path.is_dir() else path.stem) not in rig and path.name not in ASIDE:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
@@ -172,9 +186,9 @@ def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image
     """Checks a shot of the calibration board and removes everything but its images from ``folder``: one a camera, of
     any size. Returns the content for the capture's record. Raises InputError naming the images that are too large."""
     root = Path(folder)
-    for entry in root.iterdir():
-        if entry.name != "images":
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    for path in root.iterdir():
+        if path.name != "images":
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
     files = sorted((root / "images").iterdir())
     sizes = {}
     for path in files:
@@ -231,9 +245,9 @@ def check_capture(
             if networks is not None and image is not None and min(image.shape[:2]) >= SMALLEST_PX:
                 small[camera.name] = reduce_picture(image, camera, GLANCE_PX)
         faults += [*of_sizes, *of_files]
-    if (root / "features.json").is_file():
-        faults += _features_file_faults(root / "features.json", rig)
-        digests["features.json"] = _sha256(root / "features.json")
+    if (features := entry(root, FEATURES)).is_file():
+        faults += _features_file_faults(features, rig)
+        digests[FEATURES] = _sha256(features)
     if len(empty) == len(rig):
         faults.append(compose("every-picture-its-plate"))
     if faults:
@@ -243,7 +257,7 @@ def check_capture(
         cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
         front=rig.front_camera(),
         inputs=dict(sorted(digests.items())),
-        bytes=sum((root / name).stat().st_size for name in digests),
+        bytes=sum(entry(root, name).stat().st_size for name in digests),
         faults=tuple(view_faults(views, ShotConfig())),
         checks={name: view.document() for name, view in views.items()},
         face=_face_of(small, rig, networks, is_metric=_is_metric(root)) if networks is not None and small else None,
@@ -254,8 +268,8 @@ def _camera_digests(root: Path, rig_file: Path, rig: Rig) -> dict[str, str]:
     """Returns the SHA-256 of the rig's files and of scale.json. Raises InputError for a wrong scale.json."""
     digests = {path.relative_to(root).as_posix(): _sha256(path) for path in rig_file_parts(rig_file)}
     if has_known_length(root):
-        read_scale(root / SCALE, rig.names)
-        digests[SCALE] = _sha256(root / SCALE)
+        read_scale(entry(root, SCALE), rig.names)
+        digests[SCALE] = _sha256(entry(root, SCALE))
     return digests
 
 

@@ -15,9 +15,10 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
-from rig.formats.cameras.cameras_json import CAMERAS_MOST
+from rig.formats.cameras.cameras_json import CAMERAS_READ_MOST
 from rig.formats.cameras.foreign import Malformed, camera_names, lens_entry, parsed
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
+from rig.formats.pictures.picture_names import entry
 from rig.geometry import vector_from_rotation
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -51,10 +52,11 @@ REFUSED_MODELS = {
 COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 
-def read_colmap(folder: Path, suffix: str = ".bin") -> CamerasRead:
-    """Returns the rig in a COLMAP model: each image becomes a camera of this project, named after the image file.
-    Raises InputError naming every fault."""
-    files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
+def read_colmap(path: Path) -> CamerasRead:
+    """Returns the rig in the COLMAP model of a ``cameras`` file: each image becomes a camera of this project, named
+    after the image file. Raises InputError naming every fault."""
+    folder, suffix = path.parent, path.suffix.lower()
+    files = [entry(folder, f"{kind}{suffix}") for kind in ("cameras", "images")]
     subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
     binary = suffix == ".bin"
     cameras = parsed(files[0], _binary_cameras if binary else _text_cameras)
@@ -219,8 +221,8 @@ def _text_lines(data: bytes) -> Iterator[str]:
 
 
 def _limited(count: int) -> int:
-    if count > CAMERAS_MOST:
-        raise Malformed(compose("images-many", images=str(count), most=CAMERAS_MOST))
+    if count > CAMERAS_READ_MOST:
+        raise Malformed(compose("images-many", images=str(count), most=CAMERAS_READ_MOST))
     return count
 
 

@@ -216,28 +216,23 @@ def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, 
     width, height = (entry[key] if isinstance(entry[key], int) else 0 for key in ("width", "height"))
     assert isinstance(width, int)
     assert isinstance(height, int)
-    _name_lost(values, (width, height), name, faults, fisheye=TYPES.get(kind, False))
+    _drop_invisible(values, (width, height), fisheye=TYPES.get(kind, False))
     centre = values["cx"] + 0.5 * width, values["cy"] + 0.5 * height
     focal = values["f"] + values["b1"], values["f"]
     entry["intrinsics"] = {"fx": focal[0], "fy": focal[1], "cx": centre[0] - 0.5, "cy": centre[1] - 0.5}
+    skew = values["b2"] / focal[0] if focal[0] else 0.0
     if TYPES.get(kind, False):
         held = {key: values[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
-        entry["distortion"] = lens_entry(held, name, faults, fisheye=True)
+        entry["distortion"] = lens_entry(held, name, faults, fisheye=True, skew=skew)
         return
     radial = [values[key] for key in ("k1", "k2", "k3", "k4")]
     k1, k2, k3 = brown_conrady(radial, corner_radius((width, height), focal, centre), values["f"], name, faults)
     held = {"k1": k1, "k2": k2, "k3": k3, "p1": values["p2"], "p2": values["p1"]}
-    entry["distortion"] = lens_entry(held, name, faults)
+    entry["distortion"] = lens_entry(held, name, faults, skew=skew)
 
 
-def _name_lost(
-    values: dict[str, float], size: tuple[int, int], name: str, faults: list[Message], *, fisheye: bool
-) -> None:
-    """Appends a fault if the skew ``b2`` moves a border of the picture visibly, and drops a fisheye's ``p1`` and ``p2``
-    if they move a corner by less than ``LENS_LOSS_PX``."""
-    skewed_px = abs(values["b2"]) * size[1] / 2 / values["f"] if values["f"] > 0 else 0.0
-    if skewed_px > LENS_LOSS_PX:
-        faults.append(compose("picture-skewed", key=f"{name}.b2", skewed_px=skewed_px))
+def _drop_invisible(values: dict[str, float], size: tuple[int, int], *, fisheye: bool) -> None:
+    """Drops a fisheye's ``p1`` and ``p2`` if they move a corner by less than ``LENS_LOSS_PX``."""
     if fisheye and values["f"] > 0:
         reach = np.hypot(*size) / 2 / values["f"]  # of the corner, in radians
         if 3 * max(abs(values["p1"]), abs(values["p2"])) * reach**2 * values["f"] <= LENS_LOSS_PX:

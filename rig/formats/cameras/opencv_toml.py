@@ -9,11 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras.foreign import MATRIX_PLACES, METRES_MOST, lens_entry, number_array, parsed
+from rig.formats.cameras.foreign import (
+    MATRIX_PLACES,
+    lens_entry,
+    matrix_skew,
+    millimetres_of,
+    number_array,
+    parsed,
+)
 from rig.formats.cameras.foreign_keys import ANIPOSELIB, CALISCOPE
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.geometry import rotation_from_vector, vector_from_rotation
@@ -27,7 +35,7 @@ UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}  # millimetres in each
 def read_toml(path: Path) -> CamerasRead:
     """Returns the rig in caliscope's ``camera_array.toml`` or in an aniposelib calibration. Raises InputError naming
     every fault."""
-    document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
+    document = parsed(path, lambda data: tomllib.loads(data.decode()))
     tables, reading = document.get("cameras"), Reading(path.name)
     if isinstance(tables, dict):
         pairs, keys = [(f"cam_{key}", table) for key, table in tables.items()], CALISCOPE
@@ -44,7 +52,7 @@ def read_toml(path: Path) -> CamerasRead:
         camera = table["name"] if isinstance(table.get("name"), str) else name
         if "ignore" in keys and _switch(table, "ignore", camera, reading.faults):
             reading.leave_out(camera, compose("left-switched-off", key="ignore = true"))
-        elif keys is CALISCOPE and not {"rotation", "translation"} & table.keys():
+        elif not {"rotation", "translation"} & table.keys():
             reading.leave_out(camera, compose("left-without-pose"))
         else:
             reading.judge(keys, table, camera)
@@ -104,8 +112,7 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
     if lens.ndim != 1 or not 1 <= len(lens) <= 14 or lens[len(names) :].any():
         list_key = f"{name}.distortions"
         faults.append(compose("coefficients-at-most", key=list_key, most=len(names), names=" ".join(names)))
-    if matrix.shape == (3, 3) and abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
-        faults.append(compose("matrix-skewed", key=f"{name}.matrix"))
+    coefficients = dict(zip(names, lens.ravel().tolist(), strict=False))
     size = table.get("size")
     width, height = size if isinstance(size, list) and len(size) == 2 else (None, None)
     return {
@@ -113,7 +120,7 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
         "width": width,
         "height": height,
         "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
-        "distortion": lens_entry(dict(zip(names, lens.ravel().tolist(), strict=False)), name, faults, fisheye=fisheye),
+        "distortion": lens_entry(coefficients, name, faults, fisheye=fisheye, skew=matrix_skew(matrix)),
         "camera_from_world": {"rotation": rotation.tolist(), "translation": (millimetres * translation).tolist()},
     }
 
@@ -131,23 +138,27 @@ def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]
         return UNITS[unit]
     if unit is not None:
         reading.faults.append(compose("value-not-read", key="metadata.unit", value=shown(unit), known=[*UNITS]))
-    lengths = [
-        np.abs(number_array(table.get("translation"), (3,), "", [])).max()
-        for _, table in pairs
-        if isinstance(table, dict)
-    ]
-    # |t| is the distance to the world's origin, which lies at a camera or at the board and so within the rig.
-    return 1000.0 if lengths and max(lengths) < METRES_MOST else 1.0
+    return millimetres_of([_centre(table) for _, table in pairs if isinstance(table, dict)])
+
+
+def _centre(table: Mapping[str, Any]) -> Float[np.ndarray, " 3"]:
+    """Returns the place of a camera; NaN where its pose is none."""
+    translation = number_array(table.get("translation"), (3,), "", [])
+    rotation = number_array(table.get("rotation"), None, "", [])
+    if rotation.shape == (3,) and np.isfinite(rotation).all():
+        rotation = rotation_from_vector(rotation)
+    return -rotation.T @ translation if rotation.shape == (3, 3) else np.full(3, np.nan)
 
 
 def looks_like_aniposelib(path: Path) -> bool:
     """Tells whether a TOML file consists of aniposelib's camera tables."""
     try:
-        document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
+        document = parsed(path, lambda data: tomllib.loads(data.decode()))
     except InputError:
         return False
     tables = [table for key, table in document.items() if key != "metadata" and isinstance(table, dict)]
-    return bool(tables) and all({"matrix", "rotation", "translation"} <= table.keys() for table in tables)
+    posed = [table for table in tables if {"rotation", "translation"} <= table.keys()]
+    return bool(posed) and all("matrix" in table for table in tables)
 
 
 def _toml_intrinsics(camera: Camera) -> dict[str, list]:

@@ -22,7 +22,7 @@ from rig.errors import InputError
 from rig.formats.cameras.foreign import brown_conrady, camera_names, corner_radius, lens_entry, parsed, sized, xml_root
 from rig.formats.cameras.foreign_keys import REALITYCAPTURE, REALITYCAPTURE_CSV
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
-from rig.formats.pictures.picture_names import picture_stem
+from rig.formats.pictures.picture_names import is_junk, picture_stem
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -49,13 +49,14 @@ _XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 """
 
 
-def read_xmp(folder: Path) -> CamerasRead:
-    """Returns the rig in a folder of XMP files, one camera each. Cameras that are not aligned or not used for meshing
-    take no part. Raises InputError naming every fault."""
+def read_xmp(file: Path) -> CamerasRead:
+    """Returns the rig in an XMP file and those beside it, one camera each. Cameras that are not aligned or not used for
+    meshing take no part. Raises InputError naming every fault."""
+    folder = file.parent
     reading = Reading(f"{folder.name}/*.xmp")
     entries = []
     components = set()
-    for path in sorted(path for path in folder.glob("*.xmp") if not path.name.startswith(".")):
+    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() == ".xmp" and not is_junk(path.name)):
         try:
             values = _xmp_values(path)
         except InputError as error:
@@ -94,7 +95,7 @@ def write_xmp(rig: Rig, folder: Path) -> None:
 
 def read_csv(path: Path) -> CamerasRead:
     """Returns the rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
-    rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(_with_commas(data.decode("utf-8-sig"))))))
+    rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(_with_commas(data.decode())))))
     if not rows or not set(COLUMNS[:8]) <= rows[0].keys():
         raise InputError(path.name, [compose("no-camera-csv", columns=",".join(COLUMNS))])
     reading = Reading(path.name)
@@ -123,9 +124,9 @@ def read_csv(path: Path) -> CamerasRead:
     return reading.finish(entries)
 
 
-def looks_like_csv(head: bytes) -> bool:
+def looks_like_csv(head: str) -> bool:
     """Tells whether a file that begins so is the CSV, as RealityCapture wrote it or as a spreadsheet saved it."""
-    return _with_commas(head.decode("utf-8", "replace")).startswith(",".join(COLUMNS[:8]))
+    return _with_commas(head).startswith(",".join(COLUMNS[:8]))
 
 
 def _with_commas(text: str) -> str:

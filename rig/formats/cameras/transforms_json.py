@@ -16,7 +16,15 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras.foreign import METRES_MOST, camera_names, lens_entry, number_array, parsed, sized
+from rig.formats.cameras.foreign import (
+    MATRIX_PLACES,
+    camera_names,
+    lens_entry,
+    millimetres_of,
+    number_array,
+    pose_matrix,
+    sized,
+)
 from rig.formats.cameras.foreign_keys import TRANSFORMS
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.messages.message import Message, compose
@@ -28,19 +36,19 @@ LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PER_CAMERA = (*LENS, "k5", "k6", "rolling_shutter")  # keys at the top that hold for every camera
 
 
-def read_transforms(path: Path) -> CamerasRead:
-    """Returns the rig in a ``transforms.json``: each frame is a camera. Raises InputError naming every fault."""
-    document = parsed(path, json.loads)
+def read_transforms(document: Any, path: Path) -> CamerasRead:
+    """Returns the rig in a decoded ``transforms.json``: each frame is a camera. Raises InputError naming every
+    fault."""
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(path.name, [compose("no-frame-list")])
     reading = Reading(path.name)
     faults = reading.faults
     reading.judge(TRANSFORMS, {key: value for key, value in document.items() if key not in PER_CAMERA}, "")
-    names = camera_names([str(frame.get("file_path", f"frame{i:03}")) for i, frame in enumerate(frames)])
-    names, frames = _frames_of_one_moment(document, names, frames, reading)
+    listed = camera_names([str(frame.get("file_path", f"frame{i:03}")) for i, frame in enumerate(frames)])
+    names, frames = _frames_of_one_moment(document, listed, frames, reading)
     matrices = [
-        number_array(frame.get("transform_matrix"), (4, 4), f"{name}.transform_matrix", faults)
+        pose_matrix(frame.get("transform_matrix"), f"{name}.transform_matrix", faults)
         for name, frame in zip(names, frames, strict=True)
     ]
     for name, frame in zip(names, frames, strict=True):
@@ -51,8 +59,7 @@ def read_transforms(path: Path) -> CamerasRead:
     if applied <= 0:
         faults.append(compose("no-positive-number", key="applied_scale", value=f"{applied:g}"))
     scale = 1.0 / applied if applied > 0 else 1.0
-    reach = scale * max((np.abs(matrix[:3, 3]).max() for matrix in matrices), default=0.0)
-    millimetres = scale * (1000.0 if reach < METRES_MOST else 1.0)
+    millimetres = scale * millimetres_of([scale * matrix[:3, 3] for matrix in matrices])
     entries = [
         _entry(path.parent, name, document | frame, matrix, millimetres, faults)
         for name, frame, matrix in zip(names, frames, matrices, strict=True)
@@ -64,7 +71,12 @@ def _frames_of_one_moment(
     document: dict[str, Any], names: list[str], frames: list[dict[str, Any]], reading: Reading
 ) -> tuple[list[str], list[dict[str, Any]]]:
     """Returns the cameras and frames of one moment, and leaves the others out: of the first one that the file lists as
-    ``timestep_indices``, or the first one there is. Frames without a number belong to every moment."""
+    ``timestep_indices``, or the first one there is. Frames without a number belong to every moment, and a frame
+    without a pose to none."""
+    posed = [k for k, frame in enumerate(frames) if frame.get("transform_matrix") is not None]
+    for name in (name for k, name in enumerate(names) if k not in posed):
+        reading.leave_out(name, compose("left-without-pose"))
+    names, frames = [names[k] for k in posed], [frames[k] for k in posed]
     numbers = [frame.get("timestep_index") for frame in frames]
     moments = sorted({number for number in numbers if isinstance(number, int)})
     listed = document.get("timestep_indices")
@@ -75,6 +87,48 @@ def _frames_of_one_moment(
         reading.leave_out(name, compose("of-other-moment", moment=moment, moments=moments))
     kept = [k for k, is_other in enumerate(other) if not is_other]
     return [names[k] for k in kept], [frames[k] for k in kept]
+
+
+def read_splatting(document: Any, path: Path) -> CamerasRead:
+    """Returns the rig in Gaussian splatting's ``cameras.json``: world_from_camera with OpenCV's axes, of pinholes with
+    the principal point in the middle. Its scale is free. Raises InputError naming every fault."""
+    reading = Reading(path.name)
+    faults, entries, names = reading.faults, [], camera_names([str(camera["img_name"]) for camera in document])
+    centres = [number_array(camera["position"], (3,), "position", faults) for camera in document]
+    millimetres = millimetres_of(centres)
+    for name, camera, centre in zip(names, document, centres, strict=True):
+        rotation = number_array(camera["rotation"], (3, 3), f"{name}.rotation", faults)
+        width, height, fx = (_number(camera.get(key), f"{name}.{key}", faults) for key in ("width", "height", "fx"))
+        fy = _number(camera.get("fy", fx), f"{name}.fy", faults)
+        matrix = np.array([[fx, 0.0, 0.5 * width - 0.5], [0.0, fy, 0.5 * height - 0.5], [0.0, 0.0, 1.0]])
+        entries.append(_pinhole(name, (width, height), matrix, rotation.T, -rotation.T @ centre * millimetres))
+    return reading.finish(entries)
+
+
+def read_nersemble(document: Any, path: Path) -> CamerasRead:
+    """Returns the rig in NeRSemble's ``camera_params.json``: camera_from_world in metres, OpenCV's axes, one camera
+    matrix of all. The size is read from the pictures. Raises InputError naming every fault."""
+    reading = Reading(path.name)
+    faults, poses = reading.faults, document["world_2_cam"]
+    if not isinstance(poses, dict):
+        raise InputError(path.name, [compose("no-object", key="world_2_cam")])
+    matrix, entries = number_array(document.get("intrinsics"), (3, 3), "intrinsics", faults), []
+    for name, value in poses.items():
+        pose = pose_matrix(value, f"world_2_cam.{name}", faults)
+        entries.append(_pinhole(name, sized(path.parent, name, faults), matrix, pose[:, :3], 1000.0 * pose[:, 3]))
+    return reading.finish(entries)
+
+
+def _pinhole(
+    name: str, size: tuple[float, float], matrix: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+) -> dict[str, object]:
+    return {
+        "name": name,
+        "width": size[0],
+        "height": size[1],
+        "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
+        "camera_from_world": {"rotation": rotation.tolist(), "translation": translation.tolist()},
+    }
 
 
 def write_transforms(rig: Rig, path: Path) -> None:

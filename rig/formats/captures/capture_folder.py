@@ -28,11 +28,12 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_file import no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.cameras.reading import CamerasRead
+from rig.formats.cameras.unread_programs import program_of, unread_programs
 from rig.formats.captures.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.captures.features_json import document_from_features, features_from_bytes
 from rig.formats.captures.shot_files import BESIDE_PICTURES, ShotFiles, find_files, listed_pictures, stray_sentence
 from rig.formats.pictures.images import cut_out_alpha, decode_image_file, page_count, picture_size, write_image
-from rig.formats.pictures.picture_names import is_junk
+from rig.formats.pictures.picture_names import entry, is_junk
 from rig.formats.pictures.picture_rims import fill_rims
 from rig.formats.pictures.picture_samples import WHOLE_BITS, measure_samples
 from rig.formats.pictures.work_size import work_features, work_rig, work_share
@@ -43,7 +44,8 @@ from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.text import suggest
 
-SCALE = "scale.json"
+SCALE, FEATURES = "scale.json", "features.json"
+RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
 ENCLOSING_MOST = 8  # levels of single folders around a capture, as nested packing leaves them
 ALIKE_LEAST = 0.75  # likeness of two folders' names: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 SETS_ALIKE = 0.9  # to texture_sets: "texture_set" 0.96, "texture-sets" 0.92; "textures", other programs' folder, 0.8
@@ -78,7 +80,7 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
     if has_known_length(folder):
-        digests[SCALE] = hashlib.sha256((folder / SCALE).read_bytes()).hexdigest()
+        digests[SCALE] = hashlib.sha256(entry(folder, SCALE).read_bytes()).hexdigest()
         ordered = dict(sorted(digests.items()))
     remarks = [*capture.remarks, *read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
     return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
@@ -97,7 +99,7 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
     remarks = [stray_sentence(files.strays, rig)] if files.strays else []
     known = ("images", *BESIDE_PICTURES, TEXTURE_SETS, *rig.names)
     for path in sorted(folder.iterdir()):
-        is_other = path.is_dir() and path.name not in known and not is_junk(path.name)
+        is_other = path.is_dir() and not {path.name, path.name.lower()} & {*known} and not is_junk(path.name)
         used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
         if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
             remarks.append(compose("folder-unread", folder=path.name))
@@ -105,10 +107,18 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
-    """Returns remarks on the files of further rigs in the folder: only the first of ``rigs`` is read."""
-    read, *others = (path.relative_to(folder).as_posix() for path in rigs)
-    others += _other_models(folder, rigs[0])
-    remarks = [compose("cameras-unread", file=other, read=read) for other in others]
+    """Returns remarks on files of cameras in the folder that are not read: those of other programs, and further rigs,
+    since only the first of ``rigs`` is read. Beside photographs without a rig any file that may hold cameras counts."""
+    remarks = unread_programs(folder)
+    if rigs:
+        read, *others = (path.relative_to(folder).as_posix() for path in rigs)
+        others += _other_models(folder, rigs[0])
+        remarks += [compose("cameras-unread", file=other, read=read) for other in others]
+    else:
+        files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in RIG_SUFFIXES and path.is_file()]
+        known = {SCALE, FEATURES, "calibration.json"}
+        strange = [path.name for path in files if path.name.lower() not in known and program_of(path) is None]
+        remarks += [compose("cameras-of-nobody", files=some_of(strange))] if strange else []
     return [compose("file-unread", remark=message) for message in remarks]
 
 
@@ -117,7 +127,7 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
     separately."""
     if rig_file.suffix not in (".bin", ".txt"):
         return []
-    twin = rig_file.with_suffix(".txt" if rig_file.suffix == ".bin" else ".bin")
+    twin = entry(rig_file.parent, "cameras.txt" if rig_file.suffix == ".bin" else "cameras.bin")
     sparse = sorted((folder / "sparse").glob("*/cameras.*")) if (folder / "sparse").is_dir() else []
     found = [twin] if twin.is_file() else []
     found += [path for path in sparse if path.suffix in (".bin", ".txt") and path.parent != rig_file.parent]
@@ -127,7 +137,7 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
 def has_known_length(folder: Path) -> bool:
     """Tells whether scale.json fixes the unit of the cameras. It does not where it was used already when the cameras
     were calibrated from the photographs."""
-    return (folder / SCALE).is_file() and not (folder / "calibration.json").is_file()
+    return entry(folder, SCALE).is_file() and not (folder / "calibration.json").is_file()
 
 
 def capture_root(folder: Path) -> Path:
@@ -139,10 +149,10 @@ def capture_root(folder: Path) -> Path:
         raise InputError(str(folder.name or folder), [compose("no-capture-folder")])
     for _ in range(ENCLOSING_MOST):
         entries = [entry for entry in folder.iterdir() if not is_junk(entry.name)]
-        if len(entries) != 1 or not entries[0].is_dir() or entries[0].name == "sparse":
+        if len(entries) != 1 or not entries[0].is_dir() or entries[0].name.lower() == "sparse":
             break
         folder = entries[0]
-        if folder.name in ("images", *BESIDE_PICTURES):
+        if folder.name.lower() in ("images", *BESIDE_PICTURES):
             break
     return folder
 
@@ -153,14 +163,14 @@ def check_folders(folder: Path, rig: Rig) -> None:
     They would not be read, and the subject would be segmented without its clean plates, or every picture be missing."""
     kinds = ("images", *BESIDE_PICTURES)
     folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
-    others = {name.casefold(): name for name in folders if name not in (*kinds, *rig.names)}
+    others = {name.casefold(): name for name in folders if not {name, name.lower()} & {*kinds, *rig.names}}
     faults = []
     for kind in kinds:
         alike = suggest(kind, others, min_likeness=ALIKE_LEAST)
-        if alike and not (folder / kind).is_dir():
+        if alike and not entry(folder, kind).is_dir():
             faults.append(compose("folder-misnamed", folder=others[alike[0]], name=kind))
     alike = suggest(TEXTURE_SETS, others, min_likeness=SETS_ALIKE)
-    if alike and not (folder / TEXTURE_SETS).is_dir():
+    if alike and not entry(folder, TEXTURE_SETS).is_dir():
         faults.append(compose("folder-misnamed", folder=others[alike[0]], name=TEXTURE_SETS))
     if faults:
         raise InputError("capture", faults)
@@ -196,9 +206,9 @@ def read_shot(
         if kind.startswith(TEXTURE_SETS)
     }
     features: Features = {}
-    if with_features and (folder / "features.json").is_file():
-        data = (folder / "features.json").read_bytes()
-        digests["features.json"] = hashlib.sha256(data).hexdigest()
+    if with_features and entry(folder, FEATURES).is_file():
+        data = entry(folder, FEATURES).read_bytes()
+        digests[FEATURES] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
         features = work_features(features, rig, work_rig(rig, pixels_most))
     subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)

@@ -21,7 +21,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.imaging.masks import eroded
 from pipeline.imaging.silhouette import Silhouette, signed_distance
 from pipeline.multiview.scene_points import find_scene_points
-from pipeline.multiview.spread_views import spread_views
+from rig.spread_views import spread_views
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.segmentation.segment import segment

@@ -40,6 +40,7 @@ WANTED = {  # by CASE/INPUT, the longest that fits; any of these words; no words
     "23-unread-cameras-uploaded/calibration-json": "calib.io",
     "23-unread-cameras-uploaded/cameras-opk": "omega, phi, kappa",
     "23-unread-cameras-uploaded/blocks-xml": "ContextCapture",
+    "31-far-origin": "km from the world's origin",
     "26-one-camera-upside-down": "upside down",
     "28-compressed-glb": "Draco",
     "32-conventions/world-to-camera": "inverse", "32-conventions/opencv-axes": "negate",
@@ -55,9 +56,10 @@ def reports(
     base: Annotated[Path | None, "keeps the capture that all cases start from"] = None,
     doors: Annotated[Sequence[str], "these doors alone"] = DOORS,
     inputs: Annotated[str, "inputs alone whose name has this pattern"] = "",
+    command: Annotated[Path, "the program, perhaps another checkout's"] = COMMAND,
 ) -> dict[str, Any]:
     """Returns the table of all inputs and doors, and how many answers are wrong."""
-    os.environ |= {"EIGENHEAD": str(COMMAND), "CLONE": ".", "BASE": str((base or scratch / "base").resolve())}
+    os.environ |= {"EIGENHEAD": str(command.absolute()), "CLONE": ".", "BASE": str((base or scratch / "base").resolve())}
     os.environ |= {"EIGENHEAD_DATA": str(scratch / "data"), "EIGENHEAD_CALLS": str(scratch / "calls")}
     found = sorted(path for path in place.iterdir() if (path / "make.py").is_file())
     rows, wrong = [], 0
@@ -137,7 +139,10 @@ def _made(case: Path, out: Path) -> tuple[dict[str, tuple[Path, Path | None]], d
         for name, function in changed.items():
             setattr(common, name, function)
         sys.argv = [str(case / "make.py"), str(out)]
-        with contextlib.redirect_stdout(said), contextlib.suppress(FileNotFoundError):  # of results that no door made yet
+        with (
+            contextlib.redirect_stdout(said),
+            contextlib.suppress(FileNotFoundError),
+        ):  # of results that no door made yet
             runpy.run_path(str(case / "make.py"), run_name="__main__")
     finally:
         sys.argv = arguments
@@ -149,7 +154,7 @@ def _made(case: Path, out: Path) -> tuple[dict[str, tuple[Path, Path | None]], d
 
 
 def _command(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(COMMAND), *map(str, words)], capture_output=True, text=True, check=False)
+    return subprocess.run([os.environ["EIGENHEAD"], *map(str, words)], capture_output=True, text=True, check=False)
 
 
 def _checked(folder: Path) -> Answer:
@@ -201,7 +206,7 @@ def _service(scratch: Path) -> Iterator[str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    words = [str(COMMAND), "serve", "--no-worker", "--data", str(scratch / "service"), "--port", str(port)]
+    words = [os.environ["EIGENHEAD"], "serve", "--no-worker", "--data", str(scratch / "service"), "--port", str(port)]
     with (scratch / "service.log").open("w") as log:
         process = subprocess.Popen(words, stdout=log, stderr=log)
     url = f"http://127.0.0.1:{port}"
