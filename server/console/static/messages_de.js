@@ -1027,6 +1027,8 @@ export default {
   "markups-not-finite": "seine Punkte {names} sind nicht endlich",
   "markups-unread": "lässt sich nicht als Punktliste von 3D Slicer (.mrk.json) lesen ({reason})",
   "mesh-unread": "lässt sich nicht als Netz lesen ({reason})",
+  "glb-extensions-unread": "braucht {extensions}, das nicht gelesen wird: ohne exportieren",
+  "mesh-without-extent": "kann keine Oberfläche sein: seine {count:,} Punkte sind einer, oder seine Dreiecke nennen andere",
   "no-triangles": "enthält keine Dreiecke",
   "scan-coarse": "hat {count:,} Dreiecke; der Scan eines Kopfes hat mindestens {least:,}: ist die Datei vollständig?",
   "scan-huge": "hat {count:,} Dreiecke; höchstens {most:,} werden umhüllt: vereinfachen",

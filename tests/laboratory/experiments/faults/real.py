@@ -21,7 +21,6 @@ from pipeline.head_model.model import HeadModel
 from pipeline.imaging.masks import eroded
 from pipeline.imaging.silhouette import Silhouette, signed_distance
 from pipeline.multiview.scene_points import find_scene_points
-from rig.spread_views import spread_views
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.segmentation.segment import segment
@@ -36,6 +35,7 @@ from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
+from rig.spread_views import spread_views
 from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels
 from tests.laboratory.experiments.records import Bench, Outcome, Row

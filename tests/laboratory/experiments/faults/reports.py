@@ -56,10 +56,14 @@ def reports(
     base: Annotated[Path | None, "keeps the capture that all cases start from"] = None,
     doors: Annotated[Sequence[str], "these doors alone"] = DOORS,
     inputs: Annotated[str, "inputs alone whose name has this pattern"] = "",
-    command: Annotated[Path, "the program, perhaps another checkout's"] = COMMAND,
+    program: Annotated[Path, "the program, perhaps another checkout's"] = COMMAND,
 ) -> dict[str, Any]:
     """Returns the table of all inputs and doors, and how many answers are wrong."""
-    os.environ |= {"EIGENHEAD": str(command.absolute()), "CLONE": ".", "BASE": str((base or scratch / "base").resolve())}
+    os.environ |= {
+        "EIGENHEAD": str(program.absolute()),
+        "CLONE": ".",
+        "BASE": str((base or scratch / "base").resolve()),
+    }
     os.environ |= {"EIGENHEAD_DATA": str(scratch / "data"), "EIGENHEAD_CALLS": str(scratch / "calls")}
     found = sorted(path for path in place.iterdir() if (path / "make.py").is_file())
     rows, wrong = [], 0
@@ -73,7 +77,7 @@ def reports(
                 wrong += list(judged.values()).count("wrong")
                 said = next((answers[d][1] for d, j in judged.items() if j == "wrong"), next(iter(answers.values()))[1])
                 rows.append([name, *(judged.get(door, "-") for door in (*DOORS, "other")), f"{said:.150}"])
-                print(*rows[-1], sep=" | ", file=sys.stderr, flush=True)
+                sys.stderr.write(" | ".join(rows[-1]) + "\n")
     lines = table(("input", *DOORS, "other", "said"), rows).splitlines()
     return {"lines": [*lines, f"{wrong} answers of {len(rows)} inputs are wrong"], "figures": {"wrong": wrong}}
 

@@ -60,7 +60,7 @@ def corrupted(kind: str, folder: Path) -> Path:
             path.write_text(path.read_text().replace(" 0.0 0.0 0.0\n", " 0.0 0.0\n", 1))
         case "text: too many images":
             line = images.read_text().splitlines()[2]
-            images.write_text("\n\n".join([line] * 100))
+            images.write_text("\n\n".join([line] * 1100))
         case "toml: broken":
             path.write_text("[cam_0\n")
         case "toml: NaN rotation and a missing matrix":

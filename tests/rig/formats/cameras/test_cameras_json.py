@@ -88,7 +88,7 @@ MIRROR = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]
         ("cameras.3.name", ..., "cameras[3].name None is no name"),
         ("cameras.3.name", "../etc", "may hold only"),
         ("cameras.3.name", ".hidden", "may not start with '.'"),
-        ("cameras.3.name", "caméra", "may hold only ASCII"),
+        ("cameras.3.name", "cam\u202e3", "may hold only ASCII"),
         ("cameras.3.name", "x" * 65, "is no name of 1 to 64 characters"),
         ("cameras.3.name", "cam04", "camera 'cam04' occurs 2 times"),
         ("cameras.3.width", 0, "cam03.width is 0"),
@@ -140,10 +140,10 @@ def test_the_distortion_may_be_absent() -> None:
     assert rig["cam03"].intrinsics.distortion.is_zero
 
 
-@pytest.mark.parametrize("count", [0, 2, 65])
-def test_three_to_sixty_four_cameras_work(count: int) -> None:
+@pytest.mark.parametrize("count", [0, 2, 1025])
+def test_files_hold_three_cameras_to_a_thousand(count: int) -> None:
     entries = [document_from_rig(fan())["cameras"][0] | {"name": f"c{i}"} for i in range(count)]
-    with pytest.raises(InputError, match=f"{count} cameras; between 3 and 64 work"):
+    with pytest.raises(InputError, match=f"{count} cameras; between 3 and"):
         rig_from_document({"format": "eigenhead-cameras/1", "cameras": entries})
 
 

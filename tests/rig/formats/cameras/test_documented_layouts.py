@@ -53,7 +53,6 @@ def test_a_metashape_export_projects_by_its_manual(tmp_path: Path) -> None:
     ("change", "fault"),
     [
         (("<k4>0.0004", "<k4>5"), "a.k4 bends the picture by"),
-        (("<b2>0.001", "<b2>2"), "a.b2 skews the picture by"),
         (("<f>1500", "<f>long"), "a.f is missing or not 1 number"),
         (('type="frame"><res', 'type="spherical"><res'), "'spherical'"),
         (('sensor_id="0" label="b', 'sensor_id="7" label="b'), "b: its sensor '7' is missing"),
