@@ -13,12 +13,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from pipeline.imaging.silhouette import Silhouette
+from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.view_checks.camera_assignment import FITTING_MISFIT, own_misfit
 from pipeline.view_checks.image_assignment import common_share, thumbnail
 from rig.capture import Capture
 from rig.colour_space import linear_from_srgb
 from rig.image import ImageRgb
 from rig.messages.message import Message, compose
+from rig.rig import Rig
 
 MIN_TURNED = 0.5  # share of a picture that its turned plate explains: 0.65 to 0.69, and 0.55 to 0.79 of right ones ...
 TURNED_GAIN = 1.5  # ... and how many times what the plate explains as it is: 1.7 to 4, and 0.95 at most of right ones
@@ -33,14 +35,14 @@ MIN_PIXELS, MIN_COMPARED = 500, 3  # of a subject, and views, that tell anything
 
 
 def with_picture_faults(
-    silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str]
+    silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str], rig: Rig
 ) -> dict[str, Silhouette]:
     """Returns silhouettes in which the fault of a suspect's picture replaces the warnings that follow from it. Views
     with a turned picture are not usable."""
     found = dict(silhouettes)
     blurred = blurred_views(capture.images, silhouettes) if suspects else {}
     for name in suspects:
-        fault = turned_against_plate(capture, name)
+        fault = turned_against_plate(capture, name) or turned_against_others(silhouettes, name, rig)
         usable = silhouettes[name].quality.usable and fault is None
         fault = fault or blurred.get(name)
         if fault is not None:
@@ -65,6 +67,29 @@ def turned_against_plate(capture: Capture, name: str) -> Message | None:
     if share < max(MIN_TURNED, TURNED_GAIN * common_share(picture, plate)):
         return None
     return compose("picture-turned-to-plate", turn=turn)
+
+
+def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig: Rig) -> Message | None:
+    """Returns the fault of a picture, turned together with its plate, whose outline agrees with those of the other
+    cameras only once it is turned by 180 degrees or flipped."""
+    others = {camera: s for camera, s in silhouettes.items() if s.quality.usable and camera != name}
+    if len(others) < MIN_COMPARED or not silhouettes[name].mask.any():
+        return None
+
+    def misfit(mask: np.ndarray) -> float:
+        return own_misfit({**others, name: silhouette_from_mask(np.ascontiguousarray(mask))}, rig)[name]
+
+    mask = silhouettes[name].mask
+    turns = {
+        compose("turned-half"): mask[::-1, ::-1],
+        compose("flip-across"): mask[:, ::-1],
+        compose("flip-down"): mask[::-1],
+    }
+    misfits = {turn: misfit(turned) for turn, turned in turns.items()}
+    turn, least = min(misfits.items(), key=lambda one: one[1])
+    if least > FITTING_MISFIT or misfit(mask) < TURNED_GAIN * FITTING_MISFIT:
+        return None
+    return compose("picture-turned-to-others", turn=turn)
 
 
 def blurred_views(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette]) -> dict[str, Message]:

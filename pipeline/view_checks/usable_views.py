@@ -97,7 +97,7 @@ def usable_views(
     find_face = cache(lambda: guards.find_face(assigned.capture.images, rig))
     overruled: list[ReportWarning] = []
     doubted = [name for name, s in assigned.silhouettes.items() if s.quality.warnings or not s.quality.usable]
-    silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted)
+    silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted, rig)
     usable = sum(silhouette.quality.usable for silhouette in silhouettes.values())
     by_face = MIN_VIEWS_OF_FACE <= usable < MIN_VIEWS <= len(silhouettes) and find_face() is not None
     if usable < MIN_VIEWS and not by_face:
@@ -105,7 +105,7 @@ def usable_views(
         silhouettes = {name: _tried(silhouette) for name, silhouette in silhouettes.items()}
     silhouettes, moved = without_moved_cameras(silhouettes, rig)
     unexplained = silhouettes
-    silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys())
+    silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys(), rig)
     moved_warnings = [warning for name, warning in moved.items() if silhouettes[name] is unexplained[name]]
     masks_given = bool(assigned.capture.masks)
     size = judge_head_size(silhouettes, rig, find_face, guards=guards, masks_given=masks_given)

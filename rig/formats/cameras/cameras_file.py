@@ -14,7 +14,6 @@ Keys of ``cameras.json`` that are not read, such as a misspelt ``covarianse`` or
 no faults, because files may carry other programs' keys, but a warning tells the author that they have no effect.
 """
 
-import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,9 +22,8 @@ from typing import Any
 
 from rig.errors import InputError
 from rig.formats.cameras.blender_script import write_blender
-from rig.formats.cameras.cameras_json import CAMERAS_MOST, FORMAT, rig_from_document, write_rig
+from rig.formats.cameras.cameras_json import CAMERAS_MOST, FORMAT, read_document, rig_from_document, write_rig
 from rig.formats.cameras.colmap import read_colmap, write_colmap
-from rig.formats.cameras.foreign import parsed
 from rig.formats.cameras.metashape import read_metashape, write_metashape
 from rig.formats.cameras.opencv_toml import looks_like_aniposelib, read_toml, write_aniposelib, write_caliscope
 from rig.formats.cameras.opencv_yaml import read_yaml, write_yaml
@@ -157,22 +155,22 @@ def read_cameras(path: Path) -> CamerasRead:
         **{".json": _read_json, ".toml": read_toml, ".xml": read_metashape, ".csv": read_csv},
         **{".yml": read_yaml, ".yaml": read_yaml, ".bin": read_colmap, ".txt": read_colmap, ".xmp": read_xmp},
     }
-    if suffix not in readers:
-        if program := program_of(path):
-            raise InputError(path.name, [compose("cameras-of-program", files=[path.name], program=program)])
-        raise InputError(path.name, [compose("no-rig-ending", endings=[*readers], formats=FORMATS[:-1])])
-    return _thinned(readers[suffix](path), path.name)
+    try:
+        if suffix not in readers:
+            raise InputError(path.name, [compose("no-rig-ending", endings=[*readers], formats=FORMATS[:-1])])
+        return _thinned(readers[suffix](path), path.name)
+    except InputError:
+        if (program := program_of(path)) is None:
+            raise
+        raise InputError(path.name, [compose("cameras-of-program", files=[path.name], program=program)]) from None
 
 
 def _read_json(path: Path) -> CamerasRead:
     """Reads the cameras of a JSON file, whose program is told by its content."""
-    document = parsed(path, json.loads)
+    document = read_document(path)
     reader = next((read for is_of, read in JSON_READERS if is_of(document)), None)
     if reader is not None:
         return reader(document, path)
-    program = program_of(path)
-    if program and not (isinstance(document, dict) and "cameras" in document):
-        raise InputError(path.name, [compose("cameras-of-program", files=[path.name], program=program)])
     remarks = unread_keys_of(document, path.name)
     return CamerasRead(
         rig_from_document(document, path.name), tuple(compose("unknown-key", remark=remark) for remark in remarks)

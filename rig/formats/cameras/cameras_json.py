@@ -55,13 +55,17 @@ class CamerasDocument(TypedDict):
 
 def read_rig(path: Path) -> Rig:
     """Returns the rig in ``cameras.json``. Raises InputError naming every fault in it."""
+    return rig_from_document(read_document(path), path.name)
+
+
+def read_document(path: Path) -> Any:
+    """Returns a decoded JSON file. Raises InputError."""
     try:
-        document = json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
+        return json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
     except OSError as error:
         raise InputError(path.name, [compose("no-file-read", reason=error.strerror or str(error))]) from error
     except (ValueError, RecursionError) as error:
         raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
-    return rig_from_document(document, path.name)
 
 
 def write_rig(rig: Rig, path: Path) -> None:

@@ -109,15 +109,16 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
     """Returns remarks on files of cameras in the folder that are not read: those of other programs, and further rigs,
     since only the first of ``rigs`` is read. Beside photographs without a rig any file that may hold cameras counts."""
-    remarks = unread_programs(folder)
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and path not in rigs]
     if rigs:
         read, *others = (path.relative_to(folder).as_posix() for path in rigs)
-        others += _other_models(folder, rigs[0])
-        remarks += [compose("cameras-unread", file=other, read=read) for other in others]
+        others += [*_other_models(folder, rigs[0]), *(path.name for path in files if program_of(path))]
+        remarks = [compose("cameras-unread", file=other, read=read) for other in others]
     else:
-        files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in RIG_SUFFIXES and path.is_file()]
         known = {SCALE, FEATURES, "calibration.json"}
-        strange = [path.name for path in files if path.name.lower() not in known and program_of(path) is None]
+        strange = [path.name for path in files if path.suffix.lower() in RIG_SUFFIXES and program_of(path) is None]
+        strange = [name for name in strange if name.lower() not in known]
+        remarks = unread_programs(folder)
         remarks += [compose("cameras-of-nobody", files=some_of(strange))] if strange else []
     return [compose("file-unread", remark=message) for message in remarks]
 

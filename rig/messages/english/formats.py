@@ -211,7 +211,7 @@ TEMPLATES = {
     "markups-not-finite": "its points {names} are not finite",
     "markups-unread": "cannot be read as a point list of 3D Slicer, .mrk.json ({reason})",
     "mesh-unread": "cannot be read as a mesh ({reason})",
-    "glb-extensions-unread": "needs {extensions}, which is not read: export without",
+    "glb-extensions-unread": "is stored with {extensions}, which is not read: export it without",
     "mesh-without-extent": "cannot be a surface: its {count:,} vertices are one point, or its triangles name others",
     "no-triangles": "holds no triangles",
     "scan-coarse": "has {count:,} triangles; the scan of a head has at least {least:,}: is the file whole?",

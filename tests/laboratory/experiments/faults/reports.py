@@ -42,7 +42,7 @@ WANTED = {  # by CASE/INPUT, the longest that fits; any of these words; no words
     "23-unread-cameras-uploaded/blocks-xml": "ContextCapture",
     "31-far-origin": "km from the world's origin",
     "26-one-camera-upside-down": "upside down",
-    "28-compressed-glb": "Draco",
+    "28-compressed-glb": "Draco|quantised",
     "32-conventions/world-to-camera": "inverse", "32-conventions/opencv-axes": "negate",
     "32-conventions/centimetres": "centimetres", "32-conventions/quaternion-w-last": "real part",
 }  # fmt: skip

@@ -166,9 +166,7 @@ def test_two_spellings_of_one_name_are_no_guess(folder: Path) -> None:
     assert any("images/A.png is missing" in fault.text for fault in caught.value.faults)
 
 
-@pytest.mark.parametrize(
-    ("called", "meant"), [("backgrounds", "background"), ("mask", "masks"), ("image", "images")]
-)
+@pytest.mark.parametrize(("called", "meant"), [("backgrounds", "background"), ("mask", "masks"), ("image", "images")])
 def test_a_folder_that_nobody_would_read_is_named(folder: Path, called: str, meant: str) -> None:
     (folder / meant).rename(folder / called)
     with pytest.raises(InputError) as caught:
