@@ -24,6 +24,7 @@ from rig.rig import Rig
 
 MIN_TURNED = 0.5  # share of a picture that its turned plate explains: 0.65 to 0.69, and 0.55 to 0.79 of right ones ...
 TURNED_GAIN = 1.5  # ... and how many times what the plate explains as it is: 1.7 to 4, and 0.95 at most of right ones
+MISFIT_GAIN = 1.2  # how many times the misfit of the right turn that as it is must be: 1.26 to 1.6 if upside down
 FINE_PX, COARSE_PX = 1.0, 2.0  # blurs between which a picture's fine detail lies: noise of single pixels is below
 DETAIL_QUANTILE = 0.9  # of the subject's pixels: eyes, hair and clothes, not flat skin
 MAX_BLURRED = 0.45  # of the median view's detail: 0.39 at a blur of 3 px, 0.28 in motion over 60; 0.57 and more in
@@ -87,7 +88,7 @@ def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig:
     }
     misfits = {turn: misfit(turned) for turn, turned in turns.items()}
     turn, least = min(misfits.items(), key=lambda one: one[1])
-    if least > FITTING_MISFIT or misfit(mask) < TURNED_GAIN * FITTING_MISFIT:
+    if not least < FITTING_MISFIT < misfit(mask) or misfit(mask) < MISFIT_GAIN * least:
         return None
     return compose("picture-turned-to-others", turn=turn)
 

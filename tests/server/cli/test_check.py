@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,26 @@ def test_a_good_capture_is_nothing_to_speak_of(masked: tuple[Capture, Rig], tmp_
     printed = json.loads(done.stdout)
     assert (printed["faults"], printed["warnings"]) == ([], [])
     assert printed["cameras"] == list(masked[1].names)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("name", ["cam03", "cam00", "cam09"])
+@pytest.mark.parametrize(
+    ("turn", "word"),
+    [
+        (lambda of: of[::-1, ::-1], "turned by 180 degrees"),
+        (lambda of: of[:, ::-1], "flipped left to right"),
+        (lambda of: of[::-1], "flipped upside down"),
+    ],
+)
+def test_a_camera_whose_pictures_are_turned_is_named(
+    masked: tuple[Capture, Rig], name: str, turn: Callable[[np.ndarray], np.ndarray], word: str, tmp_path: Path
+) -> None:
+    capture, rig = masked
+    images, masks = ({**of, name: np.ascontiguousarray(turn(of[name]))} for of in (capture.images, capture.masks))
+    write_capture(tmp_path / "shot", replace(capture, images=images, masks=masks), rig)
+    said = [warning["message"] for warning in found_in(tmp_path / "shot")["warnings"] if name in warning["message"]]
+    assert any(word in message for message in said), said
 
 
 @pytest.mark.gl
