@@ -39,13 +39,8 @@ COLMAP_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
 }
 # Models that have no counterpart here, by their number.
 REFUSED_MODELS = {
-    7: "FOV",
-    10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-    12: "SIMPLE_DIVISION",
-    13: "DIVISION",
-    16: "EUCM",
-    17: "EQUIRECTANGULAR",
+    **{7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION"},
+    **{16: "EUCM", 17: "EQUIRECTANGULAR"},
 }
 
 

@@ -109,18 +109,8 @@ def read_csv(path: Path) -> CamerasRead:
         focal = values["f"] / FILM_MM * side
         offset = values["px"] / FILM_MM * side, values["py"] / FILM_MM * side
         position = np.array([values["x"], values["y"], values["alt"]])
-        entries.append(
-            _entry(
-                name,
-                size,
-                (focal, focal),
-                offset,
-                values,
-                DOWN @ _attitude(values).T,
-                position_m=position,
-                faults=faults,
-            )
-        )
+        rotation = DOWN @ _attitude(values).T
+        entries.append(_entry(name, size, (focal, focal), offset, values, rotation, position_m=position, faults=faults))
     return reading.finish(entries)
 
 

@@ -78,10 +78,9 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     digests = dict(capture.digests)
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
-    ordered = dict(sorted(digests.items()))
     if has_known_length(folder):
         digests[SCALE] = hashlib.sha256(entry(folder, SCALE).read_bytes()).hexdigest()
-        ordered = dict(sorted(digests.items()))
+    ordered = dict(sorted(digests.items()))
     remarks = [*capture.remarks, *read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
     return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
 

@@ -59,12 +59,8 @@ def reports(
     program: Annotated[Path, "the program, perhaps another checkout's"] = COMMAND,
 ) -> dict[str, Any]:
     """Returns the table of all inputs and doors, and how many answers are wrong."""
-    os.environ |= {
-        "EIGENHEAD": str(program.absolute()),
-        "CLONE": ".",
-        "BASE": str((base or scratch / "base").resolve()),
-    }
-    os.environ |= {"EIGENHEAD_DATA": str(scratch / "data"), "EIGENHEAD_CALLS": str(scratch / "calls")}
+    os.environ |= {"EIGENHEAD": str(program.absolute()), "BASE": str((base or scratch / "base").resolve())}
+    os.environ |= {"CLONE": ".", "EIGENHEAD_DATA": str(scratch / "data")}
     found = sorted(path for path in place.iterdir() if (path / "make.py").is_file())
     rows, wrong = [], 0
     with _service(scratch) if "upload" in doors else contextlib.nullcontext("") as url:

@@ -52,9 +52,8 @@ def test_encodings_are_told_by_their_marks(kind: str, encoding: str, tmp_path: P
     write_rig_file(fan(), path, kind)
     text = path.read_text().replace('encoding="UTF-8"', 'encoding="UTF-16"').replace("encoding='UTF-8'", "")
     path.write_bytes(text.encode(encoding))
-    found = find_rig_file(tmp_path)
-    assert found == path
-    close(read_cameras(found).rig, fan())
+    assert find_rig_file(tmp_path) == path
+    close(read_cameras(path).rig, fan())
 
 
 def test_two_names_that_differ_in_case_alone_are_refused(tmp_path: Path) -> None:
