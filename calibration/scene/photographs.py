@@ -60,7 +60,7 @@ def find_photographs(folder: Path) -> Photographs:
     if len(files) < CAMERAS_LEAST:
         faults.append(compose("photographs-too-few", count=len(files), needed=CAMERAS_LEAST))
     for name, paths in [*folders.items()] or [(compose("the-folder"), flat)]:
-        stems = [path.stem for path in paths]
+        stems = [safe_name(path.stem) for path in paths]
         twice = sorted({stem for stem in stems if stems.count(stem) > 1})
         faults += [compose("photograph-repeated", folder=name, name=stem, count=stems.count(stem)) for stem in twice]
     if faults:
