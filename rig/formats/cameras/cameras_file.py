@@ -29,12 +29,7 @@ from rig.formats.cameras.opencv_toml import looks_like_aniposelib, read_toml, wr
 from rig.formats.cameras.opencv_yaml import read_yaml, write_yaml
 from rig.formats.cameras.reading import CamerasRead
 from rig.formats.cameras.realitycapture import looks_like_csv, read_csv, read_xmp, write_csv, write_xmp
-from rig.formats.cameras.transforms_json import (
-    read_nersemble,
-    read_splatting,
-    read_transforms,
-    write_transforms,
-)
+from rig.formats.cameras.transforms_json import read_nersemble, read_splatting, read_transforms, write_transforms
 from rig.formats.cameras.unread_programs import head_of, program_of, unread_programs
 from rig.formats.pictures.picture_names import entry, is_junk
 from rig.messages.fault_groups import some_of

@@ -14,14 +14,7 @@ from jaxtyping import Float
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras.foreign import (
-    MATRIX_PLACES,
-    lens_entry,
-    matrix_skew,
-    millimetres_of,
-    number_array,
-    parsed,
-)
+from rig.formats.cameras.foreign import MATRIX_PLACES, lens_entry, matrix_skew, millimetres_of, number_array, parsed
 from rig.formats.cameras.foreign_keys import ANIPOSELIB, CALISCOPE
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.geometry import rotation_from_vector, vector_from_rotation
