@@ -1,16 +1,13 @@
 """Implements ``eigenhead check``: finds what is wrong with a capture without fitting a head.
 
-Files, cameras, clean plates and feature points are checked as the service checks an upload (``server.tasks.ingest``),
-with one difference: pictures that belong to no camera are only warned of, since a reconstruction ignores them. If these
-checks find no fault, the outlines are extracted and used to check pictures and cameras
-(``pipeline.view_checks.usable_views``). A fault of this machine is no fault of the capture and is raised as an
-error."""
+Files, cameras, clean plates and feature points are checked as the service checks an upload (``server.tasks.ingest``):
+if these checks find no fault, the outlines are extracted and used to check pictures and cameras. A fault of this
+machine is no fault of the capture and is raised as an error."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TypedDict
 
-from rig.capture import Capture
+from pipeline.faces.networks import DamagedNetwork, load_networks
 from rig.errors import EigenheadError, InputError, WrongVariable
 from rig.formats.cameras.cameras_file import read_cameras, rig_files
 from rig.formats.captures.capture_folder import SCALE, capture_root, unread_files, unread_pictures
@@ -21,14 +18,9 @@ from rig.messages.message import MessageDocument, compose, documents_of, texts_o
 from rig.progress import Progress
 from server.cli.answers import service_settings
 from server.tasks.child import WorkFailed
-from server.tasks.ingest import check_capture
+from server.tasks.ingest import check_capture, check_views
 from server.tasks.photographs import photographs_alone, read_scaled_capture
-from server.tasks.prepare import prepare_kernels
 from server.tasks.reconstruct_folder import folder_of
-
-if TYPE_CHECKING:
-    from pipeline.imaging.silhouette import Silhouette
-    from pipeline.settings import Settings
 
 
 class Checked(TypedDict):
@@ -61,13 +53,14 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
                 _check_front(chosen.front, document["cameras"])
                 return document
             document["warnings"] = _file_warnings(capture_root(folder))
-            content = check_capture(capture_root(folder), service_settings().image_pixels, report, strays_pass=True)
+            content = check_capture(capture_root(folder), service_settings().image_pixels, report)
             document["cameras"] = [camera.name for camera in content.cameras]
             _check_front(chosen.front, document["cameras"])
             document["front"] = chosen.front or content.front
-            outline_warnings = _outline_warnings(folder, chosen, report)
+            shot, rig = read_scaled_capture(folder)
+            outline_warnings = documents_of(check_views(shot, rig, chosen, load_networks(), report=report))
             document["warnings"] += [warned for warned in outline_warnings if warned not in document["warnings"]]
-    except (WrongVariable, WorkFailed):
+    except (DamagedNetwork, WrongVariable, WorkFailed):
         raise
     except InputError as error:
         document["faults"], document["fault_messages"] = texts_of(error.faults), documents_of(error.faults)
@@ -130,33 +123,6 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
         faults += [] if fault is None else [fault]
     if faults:
         raise InputError("photographs", faults)
-
-
-def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
-    from pipeline.faces.networks import load_networks
-    from pipeline.faces.subject import SearchEffort, find_subject
-    from pipeline.segmentation.segment import segment
-    from pipeline.settings import OutputSettings
-    from pipeline.texturing.chart_colours import chart_colours
-    from pipeline.view_checks.guards import Guards
-    from pipeline.view_checks.lens_distortion import judge_distortion
-    from pipeline.view_checks.one_moment import judge_moments
-    from pipeline.view_checks.usable_views import usable_views
-
-    shot, rig = read_scaled_capture(folder)
-    prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
-
-    def segmented(capture: Capture) -> dict[str, "Silhouette"]:
-        return segment(capture, rig, report=report)
-
-    views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
-    images, without_eyes = views.capture.images, SearchEffort(with_eyes=False)
-    lenses = judge_distortion(images, views.silhouettes, rig)
-    faces = find_subject(images, rig, load_networks(), effort=without_eyes) if chosen.faces.find else None
-    moments = judge_moments(faces, rig)
-    warnings = [*chosen.warnings, *views.warnings, *lenses, *moments]
-    warnings += chart_colours(shot, rig)[1] if chosen.texture.chart else ()
-    return documents_of(warnings)
 
 
 def lines(document: Checked) -> list[str]:

@@ -1,6 +1,7 @@
 """Checks an uploaded archive or a capture folder before it is accepted; runs in a child process.
 
-It works camera by camera, so that a rig of 64 large cameras needs the memory of one.
+Files are checked camera by camera, so that a rig of 64 large cameras needs the memory of one; the outlines of an
+upload, at the size that jobs work at, or smaller.
 """
 
 import hashlib
@@ -9,6 +10,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera
 from rig.capture import TEXTURE_SETS, Capture
-from rig.errors import InputError
+from rig.errors import EigenheadError, InputError
 from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, no_rig_fault, read_cameras, rig_file_parts
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.cameras.scale_json import read_scale
@@ -37,16 +39,10 @@ from rig.formats.captures.capture_folder import (
     size_fault,
 )
 from rig.formats.captures.features_json import FEATURES_FORMAT, features_from_bytes
-from rig.formats.captures.shot_files import (
-    ASIDE,
-    BESIDE_PICTURES,
-    ShotFiles,
-    find_files,
-    picture_folder,
-    stray_sentence,
-)
+from rig.formats.captures.shot_files import ASIDE, BESIDE_PICTURES, ShotFiles, find_files, picture_folder
 from rig.formats.pictures.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.pictures.picture_names import entry
+from rig.formats.pictures.work_size import WORK_PIXELS
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb, plates_for
 from rig.messages.fault_groups import say_once
@@ -56,8 +52,20 @@ from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import WorkerContext
-from server.tasks.photographs import CAMERAS, FIGURES, calibrate_photographs, check_sizes, photographs_alone
+from server.tasks.photographs import (
+    CAMERAS,
+    FIGURES,
+    calibrate_photographs,
+    check_sizes,
+    photographs_alone,
+    read_scaled_capture,
+)
 
+if TYPE_CHECKING:
+    from pipeline.imaging.silhouette import Silhouette
+    from pipeline.settings import Settings
+
+UPLOAD_PIXELS = 64_000_000  # of all pictures whose outlines are checked: 1.3 GB with plates and distances, of 4 GiB
 PICTURES_MOST = 16  # of the largest size that one camera may have: picture, mask, eight plates, six texture sets
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
@@ -77,14 +85,65 @@ def ingest_archive(
     _name_in_small_letters(root)
     warnings = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
     _name_by_camera(root)
-    described = check_capture(root, image_pixels, report, networks=_face_networks(context))
+    networks = _face_networks(context)
+    described = check_capture(root, image_pixels, report, networks=networks)
     if warnings is not None:
         described = _with_calibration(described, root, warnings)
+    else:
+        described = replace(described, warnings=_outline_findings(root, len(described.cameras), networks, report))
     for name in described.inputs:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).rename(target / name)
     shutil.rmtree(unpacked)
     return described
+
+
+def _outline_findings(
+    root: Path, cameras: int, networks: FaceNetworks | None, report: Progress
+) -> tuple[ReportWarning, ...]:
+    """Returns what ``eigenhead check`` warns of. Raises InputError for cameras that contradict the pictures. Too few
+    usable outlines are a warning here: they are a matter of the photographs, which nobody can take again, and of a
+    job's settings."""
+    from pipeline.settings import Settings
+    from pipeline.view_checks.usable_views import TooFewViews
+
+    shot, rig = read_scaled_capture(root, pixels_most=min(WORK_PIXELS, UPLOAD_PIXELS // cameras))
+    try:
+        return check_views(shot, rig, Settings(), networks, report=report)
+    except TooFewViews as error:
+        return (compose("pose-doubtful", finding=error.message), *shot.remarks)
+    except (InputError, DamagedNetwork):
+        raise
+    except EigenheadError as error:
+        raise InputError("capture", [error.message]) from error
+
+
+def check_views(
+    shot: Capture, rig: Rig, chosen: "Settings", networks: FaceNetworks | None, *, report: Progress
+) -> tuple[ReportWarning, ...]:
+    """Returns what outlines and faces say about a capture's pictures and cameras, and all remarks on its files; nobody
+    looks for the face without ``networks``. Raises what the checks refuse with."""
+    from pipeline.faces.subject import SearchEffort, find_subject
+    from pipeline.segmentation.segment import segment
+    from pipeline.settings import OutputSettings
+    from pipeline.texturing.chart_colours import chart_colours
+    from pipeline.view_checks.guards import Guards
+    from pipeline.view_checks.lens_distortion import judge_distortion
+    from pipeline.view_checks.one_moment import judge_moments
+    from pipeline.view_checks.usable_views import usable_views
+    from server.tasks.prepare import prepare_kernels
+
+    prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
+
+    def segmented(capture: Capture) -> "dict[str, Silhouette]":
+        return segment(capture, rig, report=report)
+
+    views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
+    images, without_eyes = views.capture.images, SearchEffort(with_eyes=False)
+    lenses = judge_distortion(images, views.silhouettes, rig)
+    faces = find_subject(images, rig, networks, effort=without_eyes) if networks and chosen.faces.find else None
+    charts = chart_colours(shot, rig)[1] if chosen.texture.chart else ()
+    return (*chosen.warnings, *views.warnings, *lenses, *judge_moments(faces, rig), *charts)
 
 
 def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportWarning, ...]:
@@ -206,18 +265,13 @@ def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image
 
 
 def check_capture(
-    root: Path,
-    image_pixels: int,
-    report: Progress,
-    *,
-    measured: bool = False,
-    strays_pass: bool = False,
-    networks: FaceNetworks | None = None,
+    root: Path, image_pixels: int, report: Progress, *, measured: bool = False, networks: FaceNetworks | None = None
 ) -> CaptureContent:
     """Checks a capture folder and returns its content. Raises InputError naming every fault.
 
     ``measured``: only the subject's place is looked for in the pictures, since the shot measured the rest;
-    ``strays_pass``: accept pictures that belong to no camera; ``networks``: look for the subject's face with these.
+    ``networks``: look for the subject's face with these. Pictures that belong to no camera are no fault, since a
+    reconstruction ignores them with a warning.
     """
     rig_file = find_rig_file(root)
     if rig_file is None:
@@ -229,7 +283,6 @@ def check_capture(
     faults = [compose("located", where=rig_file.name, fault=fault) for fault in judged]
     files = find_files(root, rig, read.left_out)
     faults += files.faults
-    faults += [stray_sentence(files.strays, rig)] if files.strays and not strays_pass else []
     digests: dict[str, str] = {}
     empty: list[str] = []
     views: dict[str, ViewCheck] = {}
