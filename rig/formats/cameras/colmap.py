@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.formats.cameras.cameras_json import CAMERAS_READ_MOST
-from rig.formats.cameras.foreign import Malformed, camera_names, lens_entry, parsed
+from rig.formats.cameras.foreign import Malformed, camera_entry, camera_names, lens_entry, parsed
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.formats.pictures.picture_names import entry
-from rig.geometry import vector_from_rotation
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -228,31 +228,14 @@ def _model_fault(model: str | Message, number: Any) -> Message:
 def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[Message]) -> dict[str, object]:
     parameters = dict(zip(COLMAP_MODELS[camera.model][1], camera.values, strict=True))
     focal = parameters.get("f", 0.0)
-    w, x, y, z = _unit_quaternion(image.pose[:4])
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return {
-        "name": name,
-        "width": camera.width,
-        "height": camera.height,
-        "intrinsics": {
-            "fx": parameters.get("fx", focal),
-            "fy": parameters.get("fy", focal),
-            "cx": parameters["cx"] - 0.5,
-            "cy": parameters["cy"] - 0.5,
-        },
-        "distortion": lens_entry(parameters, name, faults, fisheye="FISHEYE" in camera.model),
-        "camera_from_world": {"rotation": rotation, "translation": list(image.pose[4:])},
-    }
-
-
-def _unit_quaternion(values: list[float]) -> tuple[float, ...]:
-    length = math.hypot(*values)
+    fx, fy = parameters.get("fx", focal), parameters.get("fy", focal)
+    lens = lens_entry(parameters, name, faults, fisheye="FISHEYE" in camera.model)
     # A length far from 1 is no rotation; NaN is named by the document's own check.
-    return tuple(value / length for value in values) if 0.9 < length < 1.1 else (math.nan,) * 4
+    is_unit = 0.9 < math.hypot(*image.pose[:4]) < 1.1
+    rotation = Rotation.from_quat(np.roll(image.pose[:4], -1)).as_matrix() if is_unit else np.full((3, 3), math.nan)
+    intrinsics = fx, fy, parameters["cx"] - 0.5, parameters["cy"] - 0.5
+    size = camera.width, camera.height
+    return camera_entry(name, size, intrinsics, lens, rotation, np.array(image.pose[4:]))
 
 
 def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
@@ -265,10 +248,8 @@ def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
 
 
 def _colmap_pose(camera: Camera) -> list[float]:
-    vector = vector_from_rotation(camera.camera_from_world.rotation)
-    angle = float(np.linalg.norm(vector))
-    imaginary = vector * (math.sin(angle / 2) / angle if angle > 1e-12 else 0.5)
-    return [math.cos(angle / 2), *imaginary.tolist(), *camera.camera_from_world.translation.tolist()]
+    *imaginary, real = Rotation.from_matrix(camera.camera_from_world.rotation).as_quat().tolist()
+    return [real, *imaginary, *camera.camera_from_world.translation.tolist()]
 
 
 def _text_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:

@@ -14,11 +14,11 @@ from jaxtyping import Float
 
 from rig.errors import InputError
 from rig.formats.pictures.picture_names import IMAGE_SUFFIXES, entry, picture_stem, safe_name
+from rig.geometry import rotation_from_vector
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS, LensModel
 
 T = TypeVar("T")
-MATRIX_PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 LENS_LOSS_PX = 0.02  # allowed error of a converted lens: a tenth of a calibration's error
 UTF16_DECLARED = re.compile(rb"(?i)^(\s*<\?xml[^>]*?)encoding=[\"']utf-(?:16|32)[^\"']*[\"']")
 SKEW_LEAST = 1e-6  # in focal lengths; far below a visible error, above the rounding of files
@@ -82,6 +82,38 @@ def camera_names(files: list[str]) -> list[str]:
         if all(folders) and len(set(folders)) == len(folders):
             return folders
     return stems
+
+
+def camera_entry(
+    name: str,
+    size: Sequence[float | None],
+    intrinsics: Sequence[float],
+    lens: Mapping[str, str | float],
+    rotation: Float[np.ndarray, "3 3"],
+    translation: Float[np.ndarray, " 3"],
+) -> dict[str, object]:
+    """Returns a camera's entry of ``eigenhead-cameras/1``: width and height, fx fy cx cy, ``lens_entry``'s lens, and
+    rotation and translation (mm) of camera_from_world."""
+    return {
+        "name": name,
+        "width": size[0],
+        "height": size[1],
+        "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, intrinsics), strict=True)),
+        "distortion": lens,
+        "camera_from_world": {"rotation": rotation.tolist(), "translation": translation.tolist()},
+    }
+
+
+def matrix_intrinsics(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
+    """Returns fx, fy, cx and cy of a camera matrix."""
+    return matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+
+
+def pose_rotation(value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Returns the matrix of a rotation vector, and any other array as it is."""
+    if value.size != 3:
+        return value
+    return rotation_from_vector(value.ravel()) if np.isfinite(value).all() else np.full((3, 3), np.nan)
 
 
 def lens_entry(

@@ -14,10 +14,19 @@ from jaxtyping import Float
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras.foreign import MATRIX_PLACES, lens_entry, matrix_skew, millimetres_of, number_array, parsed
+from rig.formats.cameras.foreign import (
+    camera_entry,
+    lens_entry,
+    matrix_intrinsics,
+    matrix_skew,
+    millimetres_of,
+    number_array,
+    parsed,
+    pose_rotation,
+)
 from rig.formats.cameras.foreign_keys import ANIPOSELIB, CALISCOPE
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
-from rig.geometry import rotation_from_vector, vector_from_rotation
+from rig.geometry import vector_from_rotation
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
@@ -99,8 +108,6 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
     rotation = number_array(table.get("rotation"), None, f"{name}.rotation", faults)
     translation = number_array(table.get("translation"), (3,), f"{name}.translation", faults)
     lens = number_array(table.get("distortions", [0.0] * 4), None, f"{name}.distortions", faults)
-    if rotation.shape == (3,):
-        rotation = rotation_from_vector(rotation) if np.isfinite(rotation).all() else np.full((3, 3), np.nan)
     names = COEFFICIENTS["kannala-brandt" if fisheye else "rational"]
     if lens.ndim != 1 or not 1 <= len(lens) <= 14 or lens[len(names) :].any():
         list_key = f"{name}.distortions"
@@ -108,14 +115,9 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
     coefficients = dict(zip(names, lens.ravel().tolist(), strict=False))
     size = table.get("size")
     width, height = size if isinstance(size, list) and len(size) == 2 else (None, None)
-    return {
-        "name": name,
-        "width": width,
-        "height": height,
-        "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
-        "distortion": lens_entry(coefficients, name, faults, fisheye=fisheye, skew=matrix_skew(matrix)),
-        "camera_from_world": {"rotation": rotation.tolist(), "translation": (millimetres * translation).tolist()},
-    }
+    found = lens_entry(coefficients, name, faults, fisheye=fisheye, skew=matrix_skew(matrix))
+    translation = millimetres * translation
+    return camera_entry(name, (width, height), matrix_intrinsics(matrix), found, pose_rotation(rotation), translation)
 
 
 def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]], reading: Reading) -> float:
@@ -137,9 +139,7 @@ def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]
 def _centre(table: Mapping[str, Any]) -> Float[np.ndarray, " 3"]:
     """Returns the place of a camera; NaN where its pose is none."""
     translation = number_array(table.get("translation"), (3,), "", [])
-    rotation = number_array(table.get("rotation"), None, "", [])
-    if rotation.shape == (3,) and np.isfinite(rotation).all():
-        rotation = rotation_from_vector(rotation)
+    rotation = pose_rotation(number_array(table.get("rotation"), None, "", []))
     return -rotation.T @ translation if rotation.shape == (3, 3) else np.full(3, np.nan)
 
 

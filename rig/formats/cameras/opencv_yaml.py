@@ -17,19 +17,20 @@ from jaxtyping import Float
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
 from rig.formats.cameras.foreign import (
-    MATRIX_PLACES,
     Malformed,
+    camera_entry,
     lens_entry,
+    matrix_intrinsics,
     matrix_skew,
     millimetres_of,
     number_array,
     parsed,
+    pose_rotation,
     sized,
 )
 from rig.formats.cameras.foreign_keys import OPENCV_YAML
 from rig.formats.cameras.reading import CamerasRead, Reading
 from rig.formats.pictures.picture_names import entry
-from rig.geometry import rotation_from_vector
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
@@ -61,45 +62,26 @@ def read_yaml(path: Path) -> CamerasRead:
     lacking = [key for key in poses if (m := POSE_KEY.match(key)) and key[m.end() :] not in held]
     if lacking:
         faults.append(compose("yaml-pose-alone", keys=some_of(lacking)))
-    entries: list[dict[str, Any]] = []
+    read: list[tuple[Any, ...]] = []
     for name in names:
         matrix = number_array(lenses[f"K_{name}"], (3, 3), f"K_{name}", faults)
         lens = number_array(lenses.get(f"dist_{name}", np.zeros(5)), None, f"dist_{name}", faults).ravel()
         keys = COEFFICIENTS["rational"]
         if lens[len(keys) :].any():
             faults.append(compose("coefficients-many", key=f"dist_{name}", most=len(keys), names=" ".join(keys)))
-        turned, rodrigues = poses.get(f"Rot_{name}"), _array(poses, f"R_{name}")
-        if turned is None:
-            turned = rotation_from_vector(rodrigues.ravel()) if rodrigues.size == 3 else rodrigues
+        turned = poses.get(f"Rot_{name}", pose_rotation(_array(poses, f"R_{name}")))
         rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
         _check_alike(poses, name, faults)
         translation = number_array(_array(poses, f"T_{name}").ravel(), (3,), f"T_{name}", faults)
-        size: tuple[float, float]
         if f"W_{name}" in lenses and f"H_{name}" in lenses:
-            width, height = (
-                number_array(_array(lenses, key).ravel(), (1,), key, faults) for key in (f"W_{name}", f"H_{name}")
-            )
-            size = float(width[0]), float(height[0])
+            sides = [number_array(_array(lenses, f"{s}_{name}").ravel(), (1,), f"{s}_{name}", faults) for s in "WH"]
+            size = float(sides[0][0]), float(sides[1][0])
         else:
             size = sized(path.parent, name, faults)
-        entries.append(
-            {
-                "name": name,
-                "width": size[0],
-                "height": size[1],
-                "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
-                "distortion": lens_entry(
-                    dict(zip(keys, lens.tolist(), strict=False)), name, faults, skew=matrix_skew(matrix)
-                ),
-                "camera_from_world": {"rotation": rotation, "translation": translation},
-            }
-        )
-    poses_read = [entry["camera_from_world"] for entry in entries]
-    millimetres = millimetres_of([-pose["rotation"].T @ pose["translation"] for pose in poses_read])
-    for pose in poses_read:
-        pose["rotation"] = pose["rotation"].tolist()
-        pose["translation"] = (millimetres * pose["translation"]).tolist()
-    return reading.finish(entries)
+        held_lens = lens_entry(dict(zip(keys, lens.tolist(), strict=False)), name, faults, skew=matrix_skew(matrix))
+        read.append((name, size, matrix_intrinsics(matrix), held_lens, rotation, translation))
+    millimetres = millimetres_of([-rotation.T @ translation for *_, rotation, translation in read])
+    return reading.finish([camera_entry(*camera, millimetres * translation) for *camera, translation in read])
 
 
 def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) -> list[str]:
@@ -131,8 +113,7 @@ def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> 
     vector, matrix = _array(poses, f"R_{name}"), _array(poses, f"Rot_{name}")
     if vector.size not in (3, 9) or matrix.shape != (3, 3):
         return
-    other = rotation_from_vector(vector.ravel()) if vector.size == 3 else vector.reshape(3, 3)
-    if not np.abs(other - matrix).max() < 1e-3:
+    if not np.abs(pose_rotation(vector).reshape(3, 3) - matrix).max() < 1e-3:
         faults.append(compose("rotations-differ", one=f"R_{name}", other=f"Rot_{name}"))
 
 

@@ -10,16 +10,27 @@ k4; t1 and t2 are OpenCV's p1 and p2."""
 
 import csv
 import io
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras.foreign import brown_conrady, camera_names, corner_radius, lens_entry, parsed, sized, xml_root
+from rig.formats.cameras.foreign import (
+    brown_conrady,
+    camera_entry,
+    camera_names,
+    corner_radius,
+    lens_entry,
+    parsed,
+    sized,
+    xml_root,
+)
 from rig.formats.cameras.foreign_keys import REALITYCAPTURE, REALITYCAPTURE_CSV
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.formats.pictures.picture_names import is_junk, picture_stem
@@ -133,11 +144,9 @@ def write_csv(rig: Rig, path: Path) -> None:
         k, d, side = camera.intrinsics, camera.intrinsics.distortion, _side(camera)
         if abs(k.fx / k.fy - 1) * side > 0.02:
             raise InputError("realitycapture-csv", [compose("focal-lengths-differ", camera=camera.name)])
-        world_from_camera = camera.camera_from_world.rotation.T @ DOWN
-        pitch = np.arcsin(np.clip(world_from_camera[2, 1], -1.0, 1.0))
-        heading = np.arctan2(world_from_camera[0, 1], world_from_camera[1, 1])
-        roll = np.arctan2(-world_from_camera[2, 0], world_from_camera[2, 2])
-        angles = np.degrees([heading, pitch, roll]).tolist()
+        turned = Rotation.from_matrix(camera.camera_from_world.rotation.T @ DOWN)
+        with warnings.catch_warnings(action="ignore"):  # of a level camera, whose heading and roll are one angle
+            angles = (turned.as_euler("ZXY", degrees=True) * (-1.0, 1.0, 1.0)).tolist()
         offset = np.array([k.cx + 0.5 - 0.5 * k.width, k.cy + 0.5 - 0.5 * k.height]) / side * FILM_MM
         lens = [d.k1, d.k2, d.k3, 0.0, d.p1, d.p2]
         position = (camera.centre_world / 1000.0).tolist()
@@ -149,11 +158,8 @@ def write_csv(rig: Rig, path: Path) -> None:
 def _attitude(values: Mapping[str, float]) -> Float[np.ndarray, "3 3"]:
     """Returns ``world_from_camera`` in the CSV's axes: heading about z, clockwise, then pitch about x, then roll about
     y."""
-    heading, pitch, roll = np.radians([-values["heading"], values["pitch"], values["roll"]])
-    z = np.array([[np.cos(heading), -np.sin(heading), 0], [np.sin(heading), np.cos(heading), 0], [0, 0, 1]])
-    x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
-    y = np.array([[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]])
-    return z @ x @ y
+    angles = [-values["heading"], values["pitch"], values["roll"]]
+    return Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
 
 
 def _xmp_values(path: Path) -> dict[str, str]:
@@ -201,17 +207,9 @@ def _entry(
     centre = offset[0] + 0.5 * size[0], offset[1] + 0.5 * size[1]
     radial = [lens[key] for key in ("k1", "k2", "k3", "k4")]
     k1, k2, k3 = brown_conrady(radial, corner_radius(size, focal, centre), focal[1], name, faults)
-    return {
-        "name": name,
-        "width": size[0],
-        "height": size[1],
-        "intrinsics": {"fx": focal[0], "fy": focal[1], "cx": centre[0] - 0.5, "cy": centre[1] - 0.5},
-        "distortion": lens_entry({"k1": k1, "k2": k2, "k3": k3, "p1": lens["t1"], "p2": lens["t2"]}, name, faults),
-        "camera_from_world": {
-            "rotation": rotation.tolist(),
-            "translation": (-rotation @ (1000.0 * position_m)).tolist(),
-        },
-    }
+    held = lens_entry({"k1": k1, "k2": k2, "k3": k3, "p1": lens["t1"], "p2": lens["t2"]}, name, faults)
+    intrinsics = *focal, centre[0] - 0.5, centre[1] - 0.5
+    return camera_entry(name, size, intrinsics, held, rotation, -rotation @ (1000.0 * position_m))
 
 
 def _held(rig: Rig, kind: str) -> Rig:

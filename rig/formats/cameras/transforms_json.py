@@ -17,9 +17,10 @@ from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
 from rig.formats.cameras.foreign import (
-    MATRIX_PLACES,
+    camera_entry,
     camera_names,
     lens_entry,
+    matrix_intrinsics,
     millimetres_of,
     number_array,
     pose_matrix,
@@ -100,8 +101,9 @@ def read_splatting(document: Any, path: Path) -> CamerasRead:
         rotation = number_array(camera["rotation"], (3, 3), f"{name}.rotation", faults)
         width, height, fx = (_number(camera.get(key), f"{name}.{key}", faults) for key in ("width", "height", "fx"))
         fy = _number(camera.get("fy", fx), f"{name}.fy", faults)
-        matrix = np.array([[fx, 0.0, 0.5 * width - 0.5], [0.0, fy, 0.5 * height - 0.5], [0.0, 0.0, 1.0]])
-        entries.append(_pinhole(name, (width, height), matrix, rotation.T, -rotation.T @ centre * millimetres))
+        intrinsics = fx, fy, 0.5 * width - 0.5, 0.5 * height - 0.5
+        translation = -rotation.T @ centre * millimetres
+        entries.append(camera_entry(name, (width, height), intrinsics, {}, rotation.T, translation))
     return reading.finish(entries)
 
 
@@ -112,23 +114,13 @@ def read_nersemble(document: Any, path: Path) -> CamerasRead:
     faults, poses = reading.faults, document["world_2_cam"]
     if not isinstance(poses, dict):
         raise InputError(path.name, [compose("no-object", key="world_2_cam")])
-    matrix, entries = number_array(document.get("intrinsics"), (3, 3), "intrinsics", faults), []
+    intrinsics = matrix_intrinsics(number_array(document.get("intrinsics"), (3, 3), "intrinsics", faults))
+    entries = []
     for name, value in poses.items():
         pose = pose_matrix(value, f"world_2_cam.{name}", faults)
-        entries.append(_pinhole(name, sized(path.parent, name, faults), matrix, pose[:, :3], 1000.0 * pose[:, 3]))
+        size = sized(path.parent, name, faults)
+        entries.append(camera_entry(name, size, intrinsics, {}, pose[:, :3], 1000.0 * pose[:, 3]))
     return reading.finish(entries)
-
-
-def _pinhole(
-    name: str, size: tuple[float, float], matrix: np.ndarray, rotation: np.ndarray, translation: np.ndarray
-) -> dict[str, object]:
-    return {
-        "name": name,
-        "width": size[0],
-        "height": size[1],
-        "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
-        "camera_from_world": {"rotation": rotation.tolist(), "translation": translation.tolist()},
-    }
 
 
 def write_transforms(rig: Rig, path: Path) -> None:
@@ -173,17 +165,9 @@ def _entry(
         faults.append(compose("k4-of-no-fisheye", key=f"{name}.k4"))
         lens["k4"] = 0.0
     pose = (matrix[:3, :3] @ OPENGL).T
-    return {
-        "name": name,
-        "width": width,
-        "height": height,
-        "intrinsics": {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5},
-        "distortion": lens_entry(lens, name, faults, fisheye=fisheye),
-        "camera_from_world": {
-            "rotation": pose.tolist(),
-            "translation": (-pose @ (millimetres * matrix[:3, 3])).tolist(),
-        },
-    }
+    found = lens_entry(lens, name, faults, fisheye=fisheye)
+    translation = -pose @ (millimetres * matrix[:3, 3])
+    return camera_entry(name, (width, height), (fx, fy, cx - 0.5, cy - 0.5), found, pose, translation)
 
 
 def _is_fisheye(values: dict[str, Any], name: str, faults: list[Message]) -> bool:
