@@ -9,9 +9,8 @@ from typing import TypedDict
 
 from pipeline.faces.networks import DamagedNetwork, load_networks
 from rig.errors import EigenheadError, InputError, WrongVariable
-from rig.formats.cameras.cameras_file import read_cameras, rig_files
-from rig.formats.captures.capture_folder import SCALE, capture_root, unread_files, unread_pictures
-from rig.formats.captures.shot_files import BESIDE_PICTURES, find_files, listed_pictures
+from rig.formats.captures.capture_folder import SCALE, capture_root, unread_files
+from rig.formats.captures.shot_files import BESIDE_PICTURES, listed_pictures
 from rig.formats.pictures.images import decode_image_file
 from rig.formats.pictures.picture_names import entry
 from rig.messages.message import MessageDocument, compose, documents_of, texts_of
@@ -52,14 +51,12 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
                 document["cameras"], document["will"] = _plan_for_photographs(folder, report)
                 _check_front(chosen.front, document["cameras"])
                 return document
-            document["warnings"] = _file_warnings(capture_root(folder))
             content = check_capture(capture_root(folder), service_settings().image_pixels, report)
             document["cameras"] = [camera.name for camera in content.cameras]
             _check_front(chosen.front, document["cameras"])
             document["front"] = chosen.front or content.front
             shot, rig = read_scaled_capture(folder)
-            outline_warnings = documents_of(check_views(shot, rig, chosen, load_networks(), report=report))
-            document["warnings"] += [warned for warned in outline_warnings if warned not in document["warnings"]]
+            document["warnings"] = documents_of(check_views(shot, rig, chosen, load_networks(), report=report))
     except (DamagedNetwork, WrongVariable, WorkFailed):
         raise
     except InputError as error:
@@ -72,22 +69,6 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
 def _check_front(front: str | None, cameras: list[str]) -> None:
     if front is not None and front not in cameras:
         raise InputError("front", [compose("front-of-other-capture", front=f"{front!r:.80}", cameras=cameras)])
-
-
-def _file_warnings(root: Path) -> list[MessageDocument]:
-    """Returns warnings about the files of a capture folder. It is empty where the cameras cannot be read, since
-    ``check_capture`` reports that fault."""
-    rigs = [*rig_files(root)]
-    try:
-        read = read_cameras(rigs[0]) if rigs else None
-    except InputError:
-        return []
-    if read is None:
-        return []
-    files = find_files(root, read.rig, read.left_out)
-    # Where a picture is missing, that fault names the strays already.
-    strays = () if files.faults else unread_pictures(root, files, read.rig)
-    return documents_of([*read.remarks, *unread_files(root, rigs), *strays])
 
 
 def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:

@@ -46,7 +46,7 @@ from rig.progress import Progress
 from rig.rig import Rig
 from rig.spread_views import spread_views
 
-CAMERAS, FIGURES, PAGE = "cameras.json", "calibration.json", "calibration.html"
+CAMERAS, FIGURES, PAGE, CACHE = "cameras.json", "calibration.json", "calibration.html", ".cache"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,18 +171,18 @@ def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
 
 def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
     """Returns the silhouettes of a capture. If they had to be estimated from the photographs alone, they are also
-    written to masks/ in ``kept``, where a second run finds them."""
+    written to masks/ in ``kept``. A second run finds them in the hidden folder ``CACHE`` there."""
     from pipeline.segmentation.segment import segment
     from server.storage.silhouette_cache import SUFFIX, segment_once
 
     if capture.masks or capture.backgrounds:
         return segment(capture, rig, report=report)
-    masks = kept / "masks"
+    masks, cache = kept / "masks", kept / CACHE
     masks.mkdir(parents=True, exist_ok=True)
     full = read_rig(kept / CAMERAS) if (kept / CAMERAS).is_file() else rig
-    before = set(masks.glob(f"*{SUFFIX}"))
-    found = segment_once(masks, capture, rig, report=report)
-    made = set(masks.glob(f"*{SUFFIX}")) - before
+    before = set(cache.glob(f"*{SUFFIX}"))
+    found = segment_once(cache, capture, rig, report=report)
+    made = set(cache.glob(f"*{SUFFIX}")) - before
     for path in before if made else ():
         path.unlink(missing_ok=True)
     for name, silhouette in found.items():

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -71,11 +72,22 @@ def read_colmap(path: Path) -> CamerasRead:
 
 
 def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = ".png") -> None:
-    """Writes ``cameras``, ``images`` and an empty ``points3D``; images are called ``<camera><suffix>``."""
-    end = ".bin" if binary else ".txt"
-    encode = _binary_model if binary else _text_model
-    for kind, data in zip(("cameras", "images", "points3D"), encode(rig, suffix), strict=True):
-        write_atomically(folder / f"{kind}{end}", data)
+    """Writes ``cameras``, ``images``, ``rigs``, ``frames`` and an empty ``points3D``; images are called
+    ``<camera><suffix>``."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for number, camera in enumerate(rig, start=1):
+        (kind, parameters), k, pose = _colmap_model(camera), camera.intrinsics, camera.camera_from_world
+        lens = pycolmap.Camera(camera_id=number, model=kind, width=k.width, height=k.height, params=parameters)
+        image = pycolmap.Image(name=f"{camera.name}{suffix}", camera_id=number, image_id=number)
+        model.add_camera_with_trivial_rig(lens)
+        posed = pycolmap.Rigid3d(np.column_stack([pose.rotation, pose.translation]))
+        model.add_image_with_trivial_frame(image, posed)
+    with TemporaryDirectory() as scratch:
+        model.write_binary(scratch) if binary else model.write_text(scratch)
+        for path in Path(scratch).iterdir():
+            write_atomically(folder / path.name, path.read_bytes())
 
 
 class _Records:
@@ -245,33 +257,3 @@ def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
     if lens is None:
         return "FULL_OPENCV", [*frame, *k.distortion.opencv().tolist(), 0.0, 0.0, 0.0]
     return "OPENCV_FISHEYE" if lens.model == "kannala-brandt" else "FULL_OPENCV", [*frame, *lens.coefficients]
-
-
-def _colmap_pose(camera: Camera) -> list[float]:
-    *imaginary, real = Rotation.from_matrix(camera.camera_from_world.rotation).as_quat().tolist()
-    return [real, *imaginary, *camera.camera_from_world.translation.tolist()]
-
-
-def _text_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
-    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
-    for number, camera in enumerate(rig, start=1):
-        k = camera.intrinsics
-        model, parameters = _colmap_model(camera)
-        cameras.append(f"{number} {model} {k.width} {k.height} {' '.join(map(repr, parameters))}")
-        images += [f"{number} {' '.join(map(repr, _colmap_pose(camera)))} {number} {camera.name}{suffix}", ""]
-    points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
-    return "\n".join([*cameras, ""]).encode(), "\n".join([*images, ""]).encode(), points.encode()
-
-
-def _binary_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
-    count = struct.pack("<Q", len(rig))
-    cameras, images = [count], [count]
-    for number, camera in enumerate(rig, start=1):
-        k = camera.intrinsics
-        model, parameters = _colmap_model(camera)
-        head = struct.pack("<iiQQ", number, COLMAP_MODELS[model][0], k.width, k.height)
-        cameras.append(head + struct.pack(f"<{len(parameters)}d", *parameters))
-        images.append(struct.pack("<i7di", number, *_colmap_pose(camera), number))
-        images.append(f"{camera.name}{suffix}".encode() + b"\0" + struct.pack("<Q", 0))
-    return b"".join(cameras), b"".join(images), struct.pack("<Q", 0)

@@ -2,6 +2,7 @@
 lenses."""
 
 import codecs
+import csv
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -57,7 +58,7 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
         raise InputError(path.name, [compose("no-file-read", reason=str(error.strerror or error))]) from error
     except struct.error as error:
         raise InputError(path.name, [compose("record-cut-off")]) from error
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError, csv.Error) as error:
         reason = error.message if isinstance(error, Malformed) else str(error)[:400]
         raise InputError(path.name, [compose("file-not-understood", reason=reason)]) from error
 

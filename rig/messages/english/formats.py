@@ -188,7 +188,6 @@ TEMPLATES = {
     "tag-dictionary": "tag.dictionary is {name}, wanted one of OpenCV's, such as 'DICT_4X4_50'",
     "scale-cameras": "cameras: wants the names of two cameras",
     "no-length": "{key} is {value}, wanted a length in millimetres, 0.1 to 100000",
-    "outline-number": "an outline of {camera} has a number that is none",
     "pickle-name-refused": "is a pickle that names {name}, which is no array of numbers: nothing of it was run. Convert the model to .npz (docs/flame.md)",
     "pickle-without-arrays": "holds no dictionary of arrays: give the model's own file, or an .npz of its arrays (docs/flame.md)",
     "flame-array-missing": "has no array {name}",

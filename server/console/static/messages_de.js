@@ -1005,7 +1005,6 @@ export default {
   "tag-dictionary": "tag.dictionary ist {name}, verlangt ist eines von OpenCV wie 'DICT_4X4_50'",
   "scale-cameras": "cameras: verlangt sind die Namen zweier Kameras",
   "no-length": "{key} ist {value}, verlangt ist eine Länge in Millimetern, 0,1 bis 100000",
-  "outline-number": "ein Umriss von {camera} hat eine Zahl, die keine ist",
   "pickle-name-refused": "ist ein Pickle, das {name} nennt, was kein Zahlenfeld ist: nichts daraus wurde ausgeführt. Das Modell in .npz umwandeln (docs/flame.md)",
   "pickle-without-arrays": "enthält kein Verzeichnis von Feldern: die Datei des Modells selbst geben oder eine .npz seiner Felder (docs/flame.md)",
   "flame-array-missing": "hat kein Feld {name}",
