@@ -88,11 +88,6 @@ EXPERIMENTS = {
         "Measures how close wrapping brings a template to scans.",
         {"truths": inputs.chosen_truths},
     ),
-    "hair-shell": Record(
-        "experiments.surface.hair_shells:hair_shells",
-        "Measures how much of the visible hair head_hair.ply can show.",
-        {"captures": inputs.short_haired},
-    ),
     "meshes": Record("experiments.surface.meshes:meshes", "Counts turned, folded and crossing triangles of results."),
     "scaling": Record(
         "experiments.speed.scaling:scaling",
@@ -120,7 +115,6 @@ BENCHMARKS = {
     "console_timings": Record("benchmarks.console_timings:run", "Times the console's pages in Chromium."),
     "database_costs": Record("benchmarks.database_costs:run", "Counts a job's statements and bytes in PostgreSQL."),
     "farm_cuts": Record("benchmarks.farm_cuts:run", "Kills and cuts off workers without a common folder."),
-    "image_stages": Record("benchmarks.image_stages:run", "Times the stages of a job."),
     "large_pictures": Record("benchmarks.large_pictures:run", "Writes, or times, a capture of 24 Mpx pictures."),
     "long_lists": Record("benchmarks.long_lists:run", "Times lists of a hundred thousand captures."),
     "scene_calibration": Record("benchmarks.scene_calibration:run", "Judges calibration from photographs alone."),

@@ -13,7 +13,6 @@ import json
 import os
 import re
 import runpy
-import socket
 import subprocess
 import sys
 import time
@@ -21,11 +20,13 @@ import urllib.request
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
+from unittest import mock
 
 import numpy as np
 
 from rig.formats.meshes.mesh_file import read_mesh
 from tests.laboratory.experiments.markdown import table
+from tests.support.services import free_port
 
 NEAR_MM = 8.0  # heads of the span level lie within 3 mm; heads of wrong poses or scales are off by more than 20
 DOORS = ("check", "upload", "reconstruct", "batch")
@@ -64,14 +65,12 @@ def reports(
     found = sorted(path for path in place.iterdir() if (path / "make.py").is_file())
     rows, wrong = [], 0
     with _service(scratch) if "upload" in doors else contextlib.nullcontext("") as url:
-        for case in found:
-            if cases and not any(case.name.startswith(name) for name in cases):
-                continue
+        for case in (path for path in found if path.name.startswith(tuple(cases or [""]))):
             for name, answers in _answers(case, scratch / case.name, doors, url, inputs):
-                wanted = _wanted(name)
-                judged = {door: _judged(answer, wanted) for door, answer in answers.items()}
+                judged = {door: _judged(answer, name) for door, answer in answers.items()}
                 wrong += list(judged.values()).count("wrong")
                 said = next((answers[d][1] for d, j in judged.items() if j == "wrong"), next(iter(answers.values()))[1])
+                said = " ".join(said.replace(str(scratch), "").split())
                 rows.append([name, *(judged.get(door, "-") for door in (*DOORS, "other")), f"{said:.150}"])
                 sys.stderr.write(" | ".join(rows[-1]) + "\n")
     lines = table(("input", *DOORS, "other", "said"), rows).splitlines()
@@ -81,12 +80,9 @@ def reports(
 Answer = tuple[bool, str]  # whether it succeeded (with a head at its place), and its words
 
 
-def _wanted(name: str) -> str:
-    return next((WANTED[known] for known in sorted(WANTED, key=len, reverse=True) if name.startswith(known)), "")
-
-
-def _judged(answer: Answer, wanted: str) -> str:
+def _judged(answer: Answer, name: str) -> str:
     done, said = answer
+    wanted = next((WANTED[known] for known in sorted(WANTED, key=len, reverse=True) if name.startswith(known)), "")
     if wanted:
         return ("right, told" if done else "refused") if re.search(wanted, said, re.IGNORECASE) else "wrong"
     return "right" if done else "wrong"
@@ -125,29 +121,19 @@ def _made(case: Path, out: Path) -> tuple[dict[str, tuple[Path, Path | None]], d
 
     def run(*words: object) -> Any:
         done = real(*words)
-        if words[0] != "simulate" and str(words[1]) != str(common.BASE / "cameras.json"):
-            is_base = str(words[1]) == str(common.base() / "cameras.json")
-            if not is_base:
-                name = Path(str(words[1])).relative_to(out).as_posix()
-                others[str(words[0]), name] = done.returncode == 0, f"{done.stderr} {done.stdout}".strip()
+        if words[0] != "simulate" and Path(str(words[1])) != common.BASE / "cameras.json":
+            name = Path(str(words[1])).relative_to(out).as_posix()
+            others[str(words[0]), name] = done.returncode == 0, f"{done.stderr} {done.stdout}".strip()
         return done
 
-    changed = {"check": noted, "upload": noted, "reconstruct": noted, "eigenhead": run}
-    before = {name: getattr(common, name) for name in changed}
-    said, arguments = io.StringIO(), sys.argv
-    try:
-        for name, function in changed.items():
-            setattr(common, name, function)
-        sys.argv = [str(case / "make.py"), str(out)]
-        with (
-            contextlib.redirect_stdout(said),
-            contextlib.suppress(FileNotFoundError),
-        ):  # of results that no door made yet
-            runpy.run_path(str(case / "make.py"), run_name="__main__")
-    finally:
-        sys.argv = arguments
-        for name, function in before.items():
-            setattr(common, name, function)
+    said, changed = io.StringIO(), {"check": noted, "upload": noted, "reconstruct": noted, "eigenhead": run}
+    with (
+        mock.patch.multiple(common, **changed),
+        mock.patch.object(sys, "argv", [str(case / "make.py"), str(out)]),
+        contextlib.redirect_stdout(said),
+        contextlib.suppress(FileNotFoundError),  # of results that no door made yet
+    ):
+        runpy.run_path(str(case / "make.py"), run_name="__main__")
     for line in said.getvalue().splitlines() if not folders and not others else ():
         others["read", line.split()[0]] = "refused" not in line, line
     return folders, others
@@ -183,29 +169,22 @@ def _batch(chosen: dict[str, tuple[Path, Path | None]], out: Path) -> dict[str, 
         csv.writer(file).writerows([("capture", "name"), *rows])
     results = out / "batch"
     _command("batch", listed, "--out", results, "--detail", "span", "--surface", "head", "--workers", "1")
-    answers = {}
+    answers, table_of = {}, [line for file in results.glob("heads.csv") for line in file.read_text().splitlines()]
     for name, (_, truth) in chosen.items():
         result = results / name.replace("/", "_")
-        made = (result / "report.json").is_file()
-        whole = made and (truth is None or _distance_mm(result, truth) < NEAR_MM)
-        warnings = json.loads((result / "report.json").read_text())["warnings"] if made else []
-        said = "; ".join(warning["message"] for warning in warnings)
-        answers[name] = whole, said if made else _row_of(results, name.replace("/", "_"))
+        if (result / "report.json").is_file():
+            warnings = json.loads((result / "report.json").read_text())["warnings"]
+            whole = truth is None or _distance_mm(result, truth) < NEAR_MM
+            answers[name] = whole, "; ".join(warning["message"] for warning in warnings)
+        else:
+            answers[name] = False, next((line for line in table_of if result.name in line), "")
     return answers
-
-
-def _row_of(results: Path, name: str) -> str:
-    with contextlib.suppress(OSError), (results / "heads.csv").open(newline="") as file:
-        return next((json.dumps(row) for row in csv.DictReader(file) if name in row.values()), "")
-    return ""
 
 
 @contextlib.contextmanager
 def _service(scratch: Path) -> Iterator[str]:
     """Yields the address of a service without a worker: uploads are checked by it."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     words = [os.environ["EIGENHEAD"], "serve", "--no-worker", "--data", str(scratch / "service"), "--port", str(port)]
     with (scratch / "service.log").open("w") as log:
         process = subprocess.Popen(words, stdout=log, stderr=log)

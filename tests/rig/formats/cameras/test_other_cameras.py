@@ -100,22 +100,6 @@ def test_pycolmap_loads_what_is_exported(binary: bool, tmp_path: Path) -> None:
         np.testing.assert_allclose(theirs - 0.5, camera.project(POINTS), atol=1e-8)
 
 
-@pytest.mark.parametrize("binary", [False, True])
-def test_models_written_by_pycolmap_are_read(binary: bool, tmp_path: Path) -> None:
-    rig = fan()
-    write_colmap(rig, tmp_path / "in")
-    model = pycolmap.Reconstruction(str(tmp_path / "in"))
-    out = tmp_path / "capture" / "sparse" / "0"
-    out.mkdir(parents=True)
-    (model.write_binary if binary else model.write_text)(str(out))
-    path = find_rig_file(tmp_path / "capture")
-    assert path is not None
-    back = read_rig_file(path)
-    assert sorted(back.names) == sorted(rig.names)
-    for camera in rig:
-        np.testing.assert_allclose(back[camera.name].project(POINTS), camera.project(POINTS), atol=1e-8)
-
-
 def bent(lens: RecordedLens) -> Rig:
     """The fan with a foreign lens before every camera."""
     return Rig(
