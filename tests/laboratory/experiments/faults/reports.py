@@ -121,7 +121,7 @@ def _made(case: Path, out: Path) -> tuple[dict[str, tuple[Path, Path | None]], d
 
     def run(*words: object) -> Any:
         done = real(*words)
-        if words[0] != "simulate" and Path(str(words[1])) != common.BASE / "cameras.json":
+        if words[0] != "simulate" and Path(str(words[1])) != common.CAP / "cameras.json":
             name = Path(str(words[1])).relative_to(out).as_posix()
             others[str(words[0]), name] = done.returncode == 0, f"{done.stderr} {done.stdout}".strip()
         return done
