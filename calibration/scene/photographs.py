@@ -15,8 +15,8 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, name_fault
 from rig.formats.captures.capture_folder import capture_root, size_fault
 from rig.formats.captures.capture_masks import mask_subjects
-from rig.formats.captures.shot_files import ASIDE, find_files, picture_folder
-from rig.formats.pictures.images import decode_image_file, is_picture
+from rig.formats.captures.shot_files import ASIDE, find_files, listed_pictures, picture_folder
+from rig.formats.pictures.images import decode_image_file
 from rig.formats.pictures.picture_names import entry, safe_name
 from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
@@ -48,9 +48,9 @@ def find_photographs(folder: Path) -> Photographs:
         raise InputError(folder.name, [compose("no-folder-of-photographs")])
     root = capture_root(folder)
     root = picture_folder(root)
-    flat = _pictures(root)
+    flat = listed_pictures(root)
     beside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name.lower() not in ASIDE]
-    folders = {safe_name(path.name): _pictures(path) for path in beside}
+    folders = {safe_name(path.name): listed_pictures(path) for path in beside}
     folders = {name: files for name, files in folders.items() if files}
     if flat and folders:
         mixed = compose("photographs-beside-folders")
@@ -91,7 +91,3 @@ def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bo
     if faults:
         raise InputError(folder.name, faults)
     return dict(masks)
-
-
-def _pictures(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if is_picture(path))

@@ -5,11 +5,8 @@ suggested. A camera is identified by something that survives a reboot (serial nu
 address), never by an index, since indices change. deploy/rig.example.toml shows every key."""
 
 import dataclasses
-import math
 import re
 import tomllib
-import types
-import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +17,7 @@ from rig.formats.cameras.cameras_json import name_fault
 from rig.formats.captures.shot_files import PLATES_MOST
 from rig.messages.message import Message, compose
 from rig.text import suggest
+from rig.typed_tables import read_fields
 
 FORMAT = "eigenhead-rig/1"
 DriverName = Literal["opencv", "gphoto", "genicam", "replay", "simulated"]
@@ -151,10 +149,8 @@ def read_rig_config(path: Path) -> RigConfig:
 def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject: str = "rig.toml") -> RigConfig:
     """Returns a rig from parsed TOML. Raises InputError that names every fault."""
     faults: list[Message] = []
-    config = _read_table(RigConfig, document, "", faults)
-    if config is not None:
-        faults.extend(_rig_faults(config))
-    if faults or config is None:
+    config = read_fields(RigConfig, document, "", faults)
+    if faults := faults or _rig_faults(config):
         raise InputError(subject, faults)
     return dataclasses.replace(config, folder=folder)
 
@@ -262,71 +258,6 @@ def _shot_faults(shot: ShotConfig) -> list[Message]:
         if values[name] > most:
             faults.append(compose("value-large", key=f"shot.{name}", value=f"{values[name]}", most=most))
     return faults
-
-
-def _read_table(kind: type, table: Any, where: str, faults: list[Message]) -> Any:
-    """Builds a dataclass from a table. Returns None, and appends the faults, if a value is missing or of a wrong
-    type."""
-    if not isinstance(table, Mapping):
-        faults.append(compose("located", where=where or "document", fault=compose("is-no-table")))
-        return None
-    fields = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("key", True)}
-    hints = typing.get_type_hints(kind)
-    prefix = f"{where}." if where else ""
-    before = len(faults)
-    unknown = [key for key in table if key not in fields]
-    faults.extend(_hinted(compose("toml-key-unknown", key=f"{prefix}{key}"), key, fields) for key in unknown)
-    values: dict[str, object] = {}
-    for name, field in fields.items():
-        if name in table:
-            values[name] = _read_value(hints[name], table[name], prefix + name, faults)
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            known = _allowed(hints[name])
-            missing = compose("key-missing", key=f"{prefix}{name}")
-            faults.append(compose("one-of", fault=missing, known=known) if known else missing)
-    return kind(**values) if len(faults) == before else None
-
-
-def _read_value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        if value not in arguments or isinstance(value, bool):
-            fault = compose("value-not-allowed", key=where, value=f"{value!r}")
-            faults.append(_hinted(compose("one-of", fault=fault, known=_allowed(hint)), value, arguments))
-        return value
-    if origin in (types.UnionType, typing.Union):
-        return _read_value(arguments[0], value, where, faults)
-    if origin is tuple:
-        if not isinstance(value, list):
-            faults.append(compose("located", where=where, fault=compose("is-no-list")))
-            return ()
-        return tuple(_read_value(arguments[0], v, _item(where, v, i), faults) for i, v in enumerate(value))
-    if dataclasses.is_dataclass(hint):
-        return _read_table(typing.cast(type, hint), value, where, faults)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        faults.append(compose("value-is-no", key=where, value=f"{value!r}", kind=_KINDS.get(hint, str(hint))))
-    elif isinstance(value, float) and not math.isfinite(value):
-        faults.append(compose("value-not-finite", key=where, value=f"{value}"))
-    return value
-
-
-_KINDS = {
-    str: compose("kind-text"),
-    int: compose("kind-whole-number"),
-    float: compose("kind-number"),
-    bool: compose("kind-switch"),
-}
-
-
-def _item(where: str, value: Any, index: int) -> str:
-    name = value.get("name") if isinstance(value, Mapping) else None
-    return f"{where}.{name}" if isinstance(name, str) else f"{where}[{index}]"
-
-
-def _allowed(hint: Any) -> tuple[str, ...]:
-    return tuple(map(str, typing.get_args(hint))) if typing.get_origin(hint) is Literal else ()
 
 
 def _hinted(fault: Message, word: Any, known: Iterable[Any]) -> Message:

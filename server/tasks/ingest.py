@@ -24,22 +24,13 @@ from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera
 from rig.capture import TEXTURE_SETS, Capture
 from rig.errors import EigenheadError, InputError
-from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, no_rig_fault, read_cameras, rig_file_parts
+from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
-from rig.formats.captures.capture_folder import (
-    FEATURES,
-    SCALE,
-    capture_root,
-    check_folders,
-    has_known_length,
-    read_rig_of,
-    read_shot,
-    size_fault,
-)
+from rig.formats.captures.capture_folder import FEATURES, SCALE, capture_root, has_known_length, read_shot, size_fault
 from rig.formats.captures.features_json import FEATURES_FORMAT, features_from_bytes
-from rig.formats.captures.shot_files import ASIDE, BESIDE_PICTURES, ShotFiles, find_files, picture_folder
+from rig.formats.captures.shot_files import ASIDE, BESIDE_PICTURES, ShotFiles, picture_folder
 from rig.formats.pictures.images import IMAGE_SUFFIXES, picture_size
 from rig.formats.pictures.picture_names import entry
 from rig.formats.pictures.work_size import WORK_PIXELS
@@ -47,7 +38,6 @@ from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb, plates_for
 from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
-from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
@@ -82,20 +72,21 @@ def ingest_archive(
     unpacked = target.with_name(target.name + ".unpacked")
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
-    _name_in_small_letters(root)
     warnings = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
-    _name_by_camera(root)
     networks = _face_networks(context)
     described = check_capture(root, image_pixels, report, networks=networks)
     if warnings is not None:
         described = _with_calibration(described, root, warnings)
     else:
         described = replace(described, warnings=_outline_findings(root, len(described.cameras), networks, report))
+    filed = _filed_names(root)
     for name in described.inputs:
-        (target / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).rename(target / name)
+        path = target / filed.get(name, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        entry(root, name).rename(path)
     shutil.rmtree(unpacked)
-    return described
+    inputs = {filed.get(name, name): digest for name, digest in described.inputs.items()}
+    return replace(described, inputs=dict(sorted(inputs.items())))
 
 
 def _outline_findings(
@@ -164,49 +155,20 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
     return warnings
 
 
-def _name_in_small_letters(root: Path) -> None:
-    """Gives files and folders whose names a capture fixes those names. Raises InputError if two differ in case
-    alone."""
-    for name in (CAMERAS, SCALE, FEATURES, FIGURES, "images", *ASIDE):
-        if (found := entry(root, name)).exists():
-            found.rename(root / name)
-
-
-def _name_by_camera(root: Path) -> None:
-    """Gives files the names by which the service asks for them, images/<camera>.<ext>, masks/<camera>.<ext>,
-    texture_sets/<set>/<camera>.<ext>, background/<camera>.<ext> or background/<camera>/<anything>, wherever the archive
-    has them and those that are called otherwise and can be told. What cannot be told is left to ``check_capture``."""
-    rig_file = find_rig_file(root)
-    try:
-        read = None if rig_file is None else read_cameras(rig_file)
-    except InputError:
-        read = None
-    if read is not None:
-        files = find_files(root, read.rig, read.left_out)
-        for name in () if files.faults else read.rig.names:
-            camera_files = files.of_camera(name)
-            several = sum(kind == "background" for kind, _ in camera_files) > 1
-            for kind, path in camera_files:
-                _move(path, _filed_as(root, kind, name, path, several=several))
-    pictures, images = picture_folder(root), root / "images"
-    images.mkdir(exist_ok=True)
-    for path in [*pictures.iterdir()] if pictures != images else []:  # of a rig that cannot be read, and strays
-        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
-            path.rename(images / path.name)
-
-
-def _filed_as(root: Path, kind: str, name: str, path: Path, *, several: bool) -> Path:
-    if path.parent == root / kind and path.stem == name:
-        return path
-    if kind == "background" and (several or path.parent == root / kind / name):
-        return root / kind / name / path.name
-    return root / kind / (name + path.suffix.lower())
-
-
-def _move(path: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if not target.exists():
-        path.rename(target)
+def _filed_names(root: Path) -> dict[str, str]:
+    """Returns the names by which the service asks for files, by those that they have in the archive:
+    images/<camera>.<ext>, masks/<camera>.<ext>, texture_sets/<set>/<camera>.<ext>, background/<camera>.<ext> or
+    background/<camera>/<anything>."""
+    (rig_file, *_), read, files, _ = open_capture(root)
+    filed = {rig_file.name: CAMERAS} if rig_file == entry(root, CAMERAS) else {}
+    for name in read.rig.names:
+        of_camera = files.of_camera(name)
+        several = sum(kind == "background" for kind, _ in of_camera) > 1
+        for kind, path in of_camera:
+            called = path.name if path.stem == name else name + path.suffix.lower()
+            inside = kind == "background" and (several or path.parent.name == name)
+            filed[path.relative_to(root).as_posix()] = f"{kind}/{name}/{path.name}" if inside else f"{kind}/{called}"
+    return filed
 
 
 def _leave_out(root: Path, rig: Rig) -> None:
@@ -273,16 +235,8 @@ def check_capture(
     ``networks``: look for the subject's face with these. Pictures that belong to no camera are no fault, since a
     reconstruction ignores them with a warning.
     """
-    rig_file = find_rig_file(root)
-    if rig_file is None:
-        raise InputError("capture", [no_rig_fault(root)])
-    read = read_rig_of(rig_file)
-    rig = read.rig
-    check_folders(root, rig)
-    judged = rig_faults(rig, any_unit=has_known_length(root))
-    faults = [compose("located", where=rig_file.name, fault=fault) for fault in judged]
-    files = find_files(root, rig, read.left_out)
-    faults += files.faults
+    rigs, read, files, faults = open_capture(root)
+    rig_file, rig = rigs[0], read.rig
     digests: dict[str, str] = {}
     empty: list[str] = []
     views: dict[str, ViewCheck] = {}

@@ -212,15 +212,9 @@ def _is_of_points(line: str) -> bool:
     10."""
     words = line.split()
     try:
-        return len(words) % 3 == 0 and all(
-            np.isfinite([float(x), float(y), int(i)]).all() for x, y, i in _triples(words)
-        )
+        return len(words) % 3 == 0 and bool(np.isfinite([float(word) for word in words]).all())
     except ValueError:
         return False
-
-
-def _triples(words: list[str]) -> Iterator[tuple[str, str, str]]:
-    return zip(words[0::3], words[1::3], words[2::3], strict=True)
 
 
 def _text_lines(data: bytes) -> Iterator[str]:

@@ -150,6 +150,18 @@ def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: 
     return array
 
 
+def word_numbers(text: str | None, count: int, where: str, faults: list[Message]) -> Float[np.ndarray, " n"]:
+    """Returns the numbers in a text, as ``number_array`` does."""
+    try:
+        values = np.array([float(word) for word in (text or "").split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count:
+        faults.append(compose("no-numbers", key=where, count=count))
+        return np.full(count, np.nan)
+    return values
+
+
 def pose_matrix(value: Any, where: str, faults: list[Message]) -> Float[np.ndarray, "3 4"]:
     """Converts the 4 x 4 numbers of a pose, or their first three rows, as ``number_array`` does."""
     rows = 3 if isinstance(value, list) and len(value) == 3 else 4

@@ -23,6 +23,7 @@ from rig.formats.cameras.foreign import (
     corner_radius,
     lens_entry,
     parsed,
+    word_numbers,
     xml_root,
 )
 from rig.formats.cameras.foreign_keys import METASHAPE
@@ -243,15 +244,7 @@ def _write_sensor(sensors: ElementTree.Element, number: int, camera: Camera) -> 
 
 
 def _numbers(node: ElementTree.Element | None, count: int, where: str, faults: list[Message]) -> np.ndarray:
-    words = (node.text or "").split() if node is not None else []
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        values = np.zeros(0)
-    if len(values) != count:
-        faults.append(compose("no-numbers", key=where, count=count))
-        return np.full(count, np.nan)
-    return values
+    return word_numbers(None if node is None else node.text, count, where, faults)
 
 
 def _size(node: ElementTree.Element | None) -> tuple[int | None, int | None]:

@@ -29,6 +29,7 @@ from rig.formats.cameras.foreign import (
     lens_entry,
     parsed,
     sized,
+    word_numbers,
     xml_root,
 )
 from rig.formats.cameras.foreign_keys import REALITYCAPTURE, REALITYCAPTURE_CSV
@@ -114,7 +115,7 @@ def read_csv(path: Path) -> CamerasRead:
     entries = []
     for name, row in zip(camera_names([str(row["#name"]) for row in rows]), rows, strict=True):
         reading.judge(REALITYCAPTURE_CSV, {str(key): value for key, value in row.items() if key}, name)
-        values = {key: _number(row.get(key, "0"), f"{name}.{key}", faults) for key in COLUMNS[1:]}
+        values = {key: word_numbers(row.get(key, "0"), 1, f"{name}.{key}", faults)[0] for key in COLUMNS[1:]}
         size = sized(path.parent, name, faults)
         side = max(size)
         focal = values["f"] / FILM_MM * side
@@ -172,11 +173,8 @@ def _xmp_values(path: Path) -> dict[str, str]:
 
 
 def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[Message]) -> dict[str, object]:
-    def numbers(key: str, count: int, default: str = "") -> list[float]:
-        found = [_number(word, f"{name}.{key}", faults) for word in values.get(key, default).split()]
-        if len(found) != count:
-            faults.append(compose("no-numbers", key=f"{name}.{key}", count=count))
-        return found if len(found) == count else [np.nan] * count
+    def numbers(key: str, count: int, default: str = "") -> np.ndarray:
+        return word_numbers(values.get(key, default), count, f"{name}.{key}", faults)
 
     model = values.get("DistortionModel", "perspective")
     bent = any(word.strip("0.-+") for word in values.get("DistortionCoeficients", "").split())
@@ -188,8 +186,8 @@ def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[
     aspect = numbers("AspectRatio", 1, "1")[0]
     offset = numbers("PrincipalPointU", 1, "0")[0] * side, numbers("PrincipalPointV", 1, "0")[0] * side
     lens = numbers("DistortionCoeficients", 6, "0 0 0 0 0 0")
-    rotation, position = np.array(numbers("Rotation", 9)).reshape(3, 3), np.array(numbers("Position", 3))
-    named: dict[str, float] = dict(zip(("k1", "k2", "k3", "k4", "t1", "t2"), lens, strict=True))
+    rotation, position = numbers("Rotation", 9).reshape(3, 3), numbers("Position", 3)
+    named: dict[str, float] = dict(zip(("k1", "k2", "k3", "k4", "t1", "t2"), lens.tolist(), strict=True))
     return _entry(name, size, (focal, focal * aspect), offset, named, rotation, position_m=position, faults=faults)
 
 
@@ -225,11 +223,3 @@ def _side(camera: Camera) -> int:
 
 def _words(values: np.ndarray) -> str:
     return " ".join(map(repr, values.tolist()))
-
-
-def _number(word: str | None, where: str, faults: list[Message]) -> float:
-    try:
-        return float(word or "")
-    except ValueError:
-        faults.append(compose("no-number", key=where, value=shown(word)))
-        return np.nan

@@ -131,10 +131,15 @@ def write_transforms(rig: Rig, path: Path) -> None:
 
 def frame_document(camera: Camera, file_path: str) -> dict[str, object]:
     """Returns the frame of one camera, in metres. Raises InputError for a lens that the format does not hold."""
+    return {"file_path": file_path, **_lens(camera), "transform_matrix": opengl_pose(camera)}
+
+
+def opengl_pose(camera: Camera) -> list[list[float]]:
+    """Returns world_from_camera as 4 x 4 numbers, in metres, with OpenGL's axes of the camera."""
     matrix = np.eye(4)
     pose = camera.camera_from_world.inverse()
     matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation / 1000.0
-    return {"file_path": file_path, **_lens(camera), "transform_matrix": matrix.tolist()}
+    return matrix.tolist()
 
 
 def _lens(camera: Camera) -> dict[str, object]:

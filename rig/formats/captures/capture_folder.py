@@ -57,21 +57,9 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     Pictures and feature points of a ``recorded`` lens are undistorted. Pictures of more than ``pixels_most`` pixels are
     reduced, and their cameras with them (``rig.formats.pictures.work_size``). Raises InputError naming every fault of
     the folder."""
-    faults: list[Message] = []
     folder = capture_root(folder)
-    rigs = [*rig_files(folder)]
-    if not rigs:
-        raise InputError(folder.name, [no_rig_fault(folder)])
-    rig_file = rigs[0]
-    read = read_rig_of(rig_file)
-    rig = read.rig
-    check_folders(folder, rig)
-    faults += [
-        compose("located", where=rig_file.name, fault=fault)
-        for fault in rig_faults(rig, any_unit=has_known_length(folder))
-    ]
-    files = find_files(folder, rig, read.left_out)
-    faults += files.faults
+    rigs, read, files, faults = open_capture(folder)
+    rig_file, rig = rigs[0], read.rig
     capture = read_shot(folder, rig, faults, files, pixels_most=pixels_most)
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
@@ -83,6 +71,24 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     ordered = dict(sorted(digests.items()))
     remarks = [*capture.remarks, *read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
     return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
+
+
+def open_capture(folder: Path) -> tuple[list[Path], CamerasRead, ShotFiles, list[Message]]:
+    """Returns the files of cameras in a capture's folder, of which the first is read, its cameras, the files of the
+    shot, and what is wrong with all of them. Raises InputError where no cameras can be read."""
+    rigs = [*rig_files(folder)]
+    if not rigs:
+        raise InputError("capture", [no_rig_fault(folder)])
+    read = read_rig_of(rigs[0])
+    check_folders(folder, read.rig)
+    judged = rig_faults(read.rig, any_unit=has_known_length(folder))
+    files = find_files(folder, read.rig, read.left_out)
+    return (
+        rigs,
+        read,
+        files,
+        [*(compose("located", where=rigs[0].name, fault=fault) for fault in judged), *files.faults],
+    )
 
 
 def read_rig_of(rig_file: Path) -> CamerasRead:

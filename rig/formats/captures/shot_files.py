@@ -13,7 +13,14 @@ from pathlib import Path
 from rig.capture import TEXTURE_SETS
 from rig.formats.captures.serials import pictures_by_serial
 from rig.formats.pictures.images import is_picture
-from rig.formats.pictures.picture_names import UNREAD_PICTURES, entry, is_junk, match_names, picture_stem
+from rig.formats.pictures.picture_names import (
+    UNREAD_PICTURES,
+    entry,
+    has_raw_beside,
+    is_junk,
+    match_names,
+    picture_stem,
+)
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -116,7 +123,7 @@ def listed_pictures(folder: Path) -> list[Path]:
     """Returns the pictures in a folder, sorted; an empty list if the folder does not exist."""
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if is_picture(path))
+    return sorted(path for path in folder.iterdir() if is_picture(path) and not has_raw_beside(path))
 
 
 def stray_sentence(strays: Sequence[str], rig: Rig) -> Message:
@@ -189,6 +196,8 @@ def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> li
 
 
 def _shows_something(path: Path) -> bool:
+    if has_raw_beside(path):
+        return False
     return is_picture(path) or (path.suffix.lower() in UNREAD_PICTURES and not is_junk(path.name) and path.is_file())
 
 

@@ -1,7 +1,5 @@
 """Writes binary glTF with vertex colours or a texture. It does not use trimesh, whose bytes differ between versions."""
 
-import json
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from rig.atomic_write import write_atomically
 from rig.colour_space import linear_from_srgb
+from rig.formats.meshes.glb_document import closed_glb
 from rig.mesh import Mesh
 
 ROUGHNESS = 0.55  # glTF's roughness of skin: 0.4 on an oily nose, 0.7 on a cheek
@@ -85,7 +84,7 @@ def glb_bytes(
         for image in (skin.image, *skin.maps):
             views.append({"buffer": 0, "byteOffset": len(payload), "byteLength": len(image)})
             payload += image
-    return _container(document | {"buffers": [{"byteLength": len(payload)}]}, bytes(payload))
+    return closed_glb(document, payload)
 
 
 Part = tuple[bytes, int, dict[str, Any]]  # data, what they are for, and their accessor
@@ -155,14 +154,3 @@ def _texture(skin: Skin, view: int) -> dict[str, Any]:
 def write_glb(path: Path, mesh: Mesh, **properties: Any) -> None:
     """Writes ``glb_bytes`` to a file, under a temporary name first."""
     write_atomically(path, glb_bytes(mesh, **properties))
-
-
-def _container(document: Mapping[str, object], payload: bytes) -> bytes:
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    payload += b"\0" * (-len(payload) % 4)
-    length = 12 + 8 + len(text) + 8 + len(payload)
-    header = struct.pack("<4sII", b"glTF", 2, length)
-    return (
-        header + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(payload), b"BIN\0") + payload
-    )

@@ -10,7 +10,7 @@ import numpy as np
 
 from rig.colour_space import linear_from_srgb
 from rig.formats.meshes.pivot_glb import quaternion
-from rig.formats.meshes.usdz import check_usd, openusd_module, package
+from rig.formats.meshes.usdz import check_usd, define_mesh, new_stage, openusd_module, package
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 
@@ -47,23 +47,10 @@ def parts_usdz_bytes(parts: Mapping[str, PlacedPart]) -> bytes:
 
 
 def _write_layer(path: Path, parts: Mapping[str, PlacedPart]) -> None:
-    Gf, Usd, UsdGeom, Vt = map(openusd_module, ("Gf", "Usd", "UsdGeom", "Vt"))
-    stage = Usd.Stage.CreateNew(str(path))
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    root = UsdGeom.Xform.Define(stage, "/person")
-    stage.SetDefaultPrim(root.GetPrim())
+    Gf, UsdGeom, Vt = map(openusd_module, ("Gf", "UsdGeom", "Vt"))
+    stage = new_stage(path, "/person")
     for name, part in parts.items():
-        shape = UsdGeom.Mesh.Define(stage, f"/person/{name}")
-        points = np.ascontiguousarray(part.mesh.vertices / 1000.0, np.float32)
-        faces = np.ascontiguousarray(part.mesh.faces, np.int32)
-        shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-        shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-        shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel()))
-        shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-        shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(part.mesh.normals(), np.float32)))
-        shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        shape = define_mesh(stage, f"/person/{name}", part.mesh, part.mesh.normals())
         colours = linear_from_srgb(_colours(part.mesh)).astype(np.float32)
         shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colours))
         x, y, z, w = quaternion(part.place.rotation).tolist()

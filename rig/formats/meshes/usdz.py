@@ -68,17 +68,20 @@ def openusd_module(name: str) -> Any:
     return importlib.import_module(f"pxr.{name}")
 
 
-def _write_layer(
-    path: Path, mesh: Mesh, normals: np.ndarray, uv: np.ndarray, faces_uv: np.ndarray, texture: str
-) -> None:
-    Gf, Sdf, Usd, UsdGeom, UsdShade, Vt = map(openusd_module, ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "Vt"))
-
+def new_stage(path: Path, root: str) -> Any:
+    """Returns a new layer, y up, in metres, with one root."""
+    Usd, UsdGeom = map(openusd_module, ("Usd", "UsdGeom"))
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    root = UsdGeom.Xform.Define(stage, "/head")
-    stage.SetDefaultPrim(root.GetPrim())
-    shape = UsdGeom.Mesh.Define(stage, "/head/mesh")
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, root).GetPrim())
+    return stage
+
+
+def define_mesh(stage: Any, name: str, mesh: Mesh, normals: Float[np.ndarray, "v 3"]) -> Any:
+    """Returns a new mesh of triangles of a layer, from one in millimetres."""
+    UsdGeom, Vt = map(openusd_module, ("UsdGeom", "Vt"))
+    shape = UsdGeom.Mesh.Define(stage, name)
     points = np.ascontiguousarray(mesh.vertices / 1000.0, np.float32)
     shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
@@ -87,6 +90,16 @@ def _write_layer(
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    return shape
+
+
+def _write_layer(
+    path: Path, mesh: Mesh, normals: np.ndarray, uv: np.ndarray, faces_uv: np.ndarray, texture: str
+) -> None:
+    Gf, Sdf, UsdGeom, UsdShade, Vt = map(openusd_module, ("Gf", "Sdf", "UsdGeom", "UsdShade", "Vt"))
+
+    stage = new_stage(path, "/head")
+    shape = define_mesh(stage, "/head/mesh", mesh, normals)
     coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
         "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
     )

@@ -62,6 +62,13 @@ def entry(folder: Path, name: str) -> Path:
     return found[0] if found else folder / name
 
 
+def has_raw_beside(path: Path) -> bool:
+    """Tells whether a camera wrote the picture twice, and its RAW file, which is read, is beside this one."""
+    if path.suffix.lower() not in IMAGE_SUFFIXES or path.suffix.lower() in RAW_SUFFIXES:
+        return False
+    return any(path.with_suffix(cased).is_file() for end in RAW_SUFFIXES for cased in (end, end.upper()))
+
+
 def safe_name(name: str) -> str:
     """Returns a camera's name in letters, digits and ``-_.``, as files and addresses have it: blanks and signs become
     ``_``, accents go, and other letters become their numbers. Names that lead into other folders, or that are hidden,

@@ -150,7 +150,7 @@ def _checked(folder: Path) -> Answer:
 
 def _reconstructed(folder: Path, truth: Path | None) -> Answer:
     out = Path(f"{folder}.out")
-    done = _command("reconstruct", folder, "--out", out, "--detail", "span", "--surface", "head", "--overwrite")
+    done = _command("reconstruct", folder, "--out", out, "--detail", "span", "--surface", "head")
     placed = done.returncode == 0 and (truth is None or _distance_mm(out, truth) < NEAR_MM)
     return placed, done.stderr.strip()
 
