@@ -56,14 +56,11 @@ def _sections_with(key: str, hints: Mapping[str, Any]) -> list[str]:
 
 
 def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return read_fields(typing.cast(type, hint), value, where + ".", faults)
-    options = (
-        typing.get_args(hint)
-        if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
-        else (hint,)
-    )
+    is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+    options = get_args(hint) if is_union else (hint,)
     for option in options:
+        if dataclasses.is_dataclass(option):
+            return read_fields(typing.cast(type, option), value, where + ".", faults)
         if option is type(None) and value is None:
             return None
         if typing.get_origin(option) is Literal and (type(value), value) in [(type(w), w) for w in get_args(option)]:

@@ -28,7 +28,15 @@ from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_cameras
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
-from rig.formats.captures.capture_folder import FEATURES, SCALE, capture_root, has_known_length, read_shot, size_fault
+from rig.formats.captures.capture_folder import (
+    FEATURES,
+    SCALE,
+    capture_root,
+    has_known_length,
+    open_capture,
+    read_shot,
+    size_fault,
+)
 from rig.formats.captures.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.captures.shot_files import ASIDE, BESIDE_PICTURES, ShotFiles, picture_folder
 from rig.formats.pictures.images import IMAGE_SUFFIXES, picture_size

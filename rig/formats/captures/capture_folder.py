@@ -83,12 +83,8 @@ def open_capture(folder: Path) -> tuple[list[Path], CamerasRead, ShotFiles, list
     check_folders(folder, read.rig)
     judged = rig_faults(read.rig, any_unit=has_known_length(folder))
     files = find_files(folder, read.rig, read.left_out)
-    return (
-        rigs,
-        read,
-        files,
-        [*(compose("located", where=rigs[0].name, fault=fault) for fault in judged), *files.faults],
-    )
+    faults = [compose("located", where=rigs[0].name, fault=fault) for fault in judged]
+    return rigs, read, files, [*faults, *files.faults]
 
 
 def read_rig_of(rig_file: Path) -> CamerasRead:
