@@ -105,9 +105,9 @@ def camera_entry(
     }
 
 
-def matrix_intrinsics(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 4"]:
+def matrix_intrinsics(matrix: Float[np.ndarray, "3 3"]) -> list[float]:
     """Returns fx, fy, cx and cy of a camera matrix."""
-    return matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+    return matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
 
 
 def pose_rotation(value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

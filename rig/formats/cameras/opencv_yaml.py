@@ -81,7 +81,7 @@ def read_yaml(path: Path) -> CamerasRead:
         held_lens = lens_entry(dict(zip(keys, lens.tolist(), strict=False)), name, faults, skew=matrix_skew(matrix))
         read.append((name, size, matrix_intrinsics(matrix), held_lens, rotation, translation))
     millimetres = millimetres_of([-rotation.T @ translation for *_, rotation, translation in read])
-    return reading.finish([camera_entry(*camera, millimetres * translation) for *camera, translation in read])
+    return reading.finish([camera_entry(*known, turned, millimetres * moved) for *known, turned, moved in read])
 
 
 def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) -> list[str]:

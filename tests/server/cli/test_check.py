@@ -10,14 +10,17 @@ import pytest
 
 from pipeline.head_model.model import load_model
 from rig.capture import Capture, reassign_images
-from rig.errors import WrongVariable
+from rig.errors import InputError, WrongVariable
 from rig.formats.cameras.cameras_file import write_rig_file
-from rig.formats.captures.archive import pack_folder
+from rig.formats.captures.archive import ArchiveLimits, pack_folder
 from rig.formats.captures.capture_folder import write_capture
+from rig.messages.message import texts_of
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from server.cli.check import Checked, checked, lines
+from server.tasks.child import WorkerContext
+from server.tasks.ingest import ingest_archive
 from tests.server.cli.test_main import run
 from tests.server.http.test_hostile import SPOILT
 from tests.support.services import small_capture
@@ -98,6 +101,21 @@ def test_outlines_name_exchanged_pictures_as_a_warning_or_as_a_fault(
     assert [w for w in found["warnings"] if w["code"] == "cameras-exchanged" and "cam02 and cam07" in w["message"]]
     refused = found_in(tmp_path / "shot", exchanged_pictures="refuse")
     assert [fault for fault in refused["faults"] if "cam02 and cam07" in fault]
+
+
+@pytest.mark.gl
+def test_mirrored_pictures_are_refused_by_an_upload_in_the_same_words(
+    masked: tuple[Capture, Rig], tmp_path: Path
+) -> None:
+    capture, rig = masked
+    kinds = capture.images, capture.masks
+    images, masks = ({name: np.ascontiguousarray(p[:, ::-1]) for name, p in of.items()} for of in kinds)
+    write_capture(tmp_path / "shot", replace(capture, images=images, masks=masks), rig)
+    pack_folder(tmp_path / "shot", tmp_path / "shot.tar")
+    archive = {"archive": str(tmp_path / "shot.tar"), "folder": str(tmp_path / "kept"), "limits": ArchiveLimits()}
+    with pytest.raises(InputError) as refusal:
+        ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=10**8)
+    assert texts_of(refusal.value.faults) == found_in(tmp_path / "shot")["faults"] != []
 
 
 @pytest.mark.gl

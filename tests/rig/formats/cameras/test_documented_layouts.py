@@ -1,7 +1,6 @@
 """Files of other programs as their manuals lay them out: each projects by its own formula, each fault is named."""
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -146,13 +145,8 @@ def test_blender_sees_what_the_camera_sees(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.stack([across, down], 1) - 0.5, camera.project(POINTS), atol=1e-6)
 
 
-def test_a_rotation_vector_of_opencv_yaml_will_do(tmp_path: Path) -> None:
+def test_a_damaged_part_of_an_opencv_yaml_is_named(tmp_path: Path) -> None:
     write_rig_file(fan(), tmp_path, "opencv-yaml")
-    text = (tmp_path / "extri.yml").read_text()
-    (tmp_path / "extri.yml").write_text(re.sub(r"Rot_\w+: !!opencv-matrix.*?\]", "", text, flags=re.S))
-    assert "Rot_" not in (tmp_path / "extri.yml").read_text()
-    back = read_rig_file(tmp_path / "intri.yml")
-    np.testing.assert_allclose(back["cam02"].project(POINTS), fan()["cam02"].project(POINTS), atol=1e-6)
     (tmp_path / "extri.yml").write_text("%YAML:1.0\n---\nnames: [")
     with pytest.raises(InputError, match=r"extri\.yml"):
         read_rig_file(tmp_path / "intri.yml")

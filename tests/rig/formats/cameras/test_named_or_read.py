@@ -14,6 +14,7 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file, read_cameras, rig_files, write_rig_file
 from rig.formats.cameras.unread_programs import program_of
 from rig.formats.captures.capture_folder import read_capture, unread_files, write_capture
+from rig.formats.captures.shot_files import find_files
 from rig.formats.pictures.picture_names import entry, match_names, safe_name
 from rig.rig import Rig
 from tests.support.fan_rig import fan
@@ -88,24 +89,16 @@ def test_a_capture_s_folders_are_found_in_any_case(small: str, called: str, tmp_
         ("calibration.json", '{"Calibration": {"cameras": []}}', "calib.io"),
         ("calib.json", '{"libCalib": 1}', "calib.io"),
         ("blocks.xml", '<?xml version="1.0"?><BlocksExchange version="2.1"/>', "BlocksExchange"),
-        ("cameras.opk", "x", "omega, phi, kappa"),
-        ("CAMERAS.OPK", "x", "omega, phi, kappa"),
-        ("shot.chan", "1 0 0 0", "Nuke"),
-        ("scene.sfm", "{}", "Meshroom"),
-        ("cameras.SFM", "{}", "Meshroom"),
-        ("sfm_data.json", "{}", "OpenMVG"),
-        ("reconstruction.json", '{"sfm_data_version": "0.3"}', "OpenMVG"),
+        ("cameras.opk", "x", "omega, phi, kappa"), ("CAMERAS.OPK", "x", "omega, phi, kappa"),
+        ("shot.chan", "1 0 0 0", "Nuke"), ("scene.sfm", "{}", "Meshroom"), ("cameras.SFM", "{}", "Meshroom"),
+        ("sfm_data.json", "{}", "OpenMVG"), ("reconstruction.json", '{"sfm_data_version": "0.3"}', "OpenMVG"),
         ("camera.json", '{"intrinsic_matrix": [1]}', "Open3D"),
-        ("Transforms_Train.json", "{}", "transforms.json in parts"),
-        ("poses_bounds.npy", "x", "LLFF"),
-        ("cameras_sphere.npz", "x", "NeuS"),
-        ("bundle.rd.out", "x", "Bundler"),
-        ("model.NVM", "x", "VisualSFM"),
-        ("project.psx", "x", "Metashape"),
-        ("project.rcproj", "x", "RealityCapture"),
+        ("Transforms_Train.json", "{}", "transforms.json in parts"), ("poses_bounds.npy", "x", "LLFF"),
+        ("cameras_sphere.npz", "x", "NeuS"), ("bundle.rd.out", "x", "Bundler"), ("model.NVM", "x", "VisualSFM"),
+        ("project.psx", "x", "Metashape"), ("project.rcproj", "x", "RealityCapture"),
         ("stereo.yml", "%YAML:1.0\nM1: 1\n", "OpenCV"),
     ],
-)
+)  # fmt: skip
 def test_the_program_of_a_file_that_is_not_read_is_named(file: str, text: str, program: str, tmp_path: Path) -> None:
     (tmp_path / file).write_bytes(text.encode())
     assert program in (program_of(tmp_path / file) or "")
@@ -247,3 +240,10 @@ def test_a_capture_with_such_names_is_read(name: str, tmp_path: Path) -> None:
     capture, rig = read_capture(tmp_path)
     assert rig.names == (safe_name(name), "b", "c")
     assert capture.images.keys() == {*rig.names}
+
+
+def test_of_a_picture_taken_twice_the_raw_file_is_read(tmp_path: Path) -> None:
+    write_capture(tmp_path, small_capture(), small_rig())
+    (tmp_path / "images" / "a.DNG").write_bytes(b"raw")
+    files = find_files(tmp_path, small_rig())
+    assert (files.images["a"].name, files.strays, files.faults) == ("a.DNG", (), ())
