@@ -69,7 +69,8 @@ def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
             return number
         if typing.get_origin(option) is tuple and isinstance(value, list | tuple):
             one = get_args(option)[0]
-            return tuple(_value(one, item, _item(where, item, i), faults) for i, item in enumerate(value))
+            items = tuple(_value(one, item, _item(where, item, i), faults) for i, item in enumerate(value))
+            return ... if any(item is ... for item in items) else items
         if option in (int, bool) and type(value) is option:
             return value
         if option is str and _is_text(value):

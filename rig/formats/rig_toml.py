@@ -38,12 +38,18 @@ _CAMERA_BOUNDS = {
     "white_balance_k": (1000, 20_000),
 }
 
-_SHOT_MOST = {
-    "timeout_s": 600,
-    "open_timeout_s": 600,
-    "warm_up_frames": 1000,
-    "plates": PLATES_MOST,
-    "plates_over_s": 600,
+_TRIGGER_BOUNDS = {"pulse_us": (1, 500_000), "baud": (300, 4_000_000), "window_s": (0.1, 60)}
+_SHOT_BOUNDS = {
+    "timeout_s": (0.001, 600),
+    "open_timeout_s": (0.001, 600),
+    "warm_up_frames": (1, 1000),
+    "plates": (1, PLATES_MOST),
+    "plates_over_s": (0, 600),
+    "skew_most_ms": (0.001, 60_000),
+    "clipped_most": (1e-6, 1),
+    "dark_below": (1e-6, 100),
+    "blur_most_px": (0.001, 1000),
+    "moved_most_px": (0.001, 1000),
 }
 
 
@@ -189,10 +195,8 @@ def _rig_faults(config: RigConfig) -> list[Message]:
         faults.extend(compose("located", where="trigger", fault=fault) for fault in of_trigger)
     strange = [output for output in config.lights.outputs if output not in range(4)]
     faults.extend(compose("lights-output-unknown", output=output) for output in strange)
-    if not 0 <= config.lights.settle_s <= 60:
-        faults.append(_outside("lights.settle_s", config.lights.settle_s, 0, 60))
-    faults.extend(_shot_faults(config.shot))
-    return faults
+    faults += _outside(config.lights, {"settle_s": (0, 60)}, "lights.")
+    return faults + _outside(config.shot, _SHOT_BOUNDS, "shot.")
 
 
 def _doubles(config: RigConfig, what: str) -> list[Message]:
@@ -221,43 +225,24 @@ def _camera_faults(camera: CameraConfig, trigger: TriggerConfig | None) -> list[
         faults.append(compose("channel-unknown", channel=camera.channel))
     if camera.channel is not None and trigger is None:
         faults.append(compose("channel-without-trigger"))
-    for key, (least, most) in _CAMERA_BOUNDS.items():
-        value = getattr(camera, key)
-        if value is not None and not least <= value <= most:
-            faults.append(_outside(key, value, least, most))
-    return faults
+    return faults + _outside(camera, _CAMERA_BOUNDS)
 
 
 def _trigger_faults(trigger: TriggerConfig) -> list[Message]:
     faults: list[Message] = []
     if _INDEXED_PORT.fullmatch(trigger.port.strip()):
         faults.append(compose("port-by-index", port=f"{trigger.port!r}"))
-    if not 1 <= trigger.pulse_us <= 500_000:
-        faults.append(_outside("pulse_us", trigger.pulse_us, 1, 500_000))
-    if not 300 <= trigger.baud <= 4_000_000:
-        faults.append(_outside("baud", trigger.baud, 300, 4_000_000))
-    if not 0.1 <= trigger.window_s <= 60:
-        faults.append(_outside("window_s", trigger.window_s, 0.1, 60))
-    return faults
+    return faults + _outside(trigger, _TRIGGER_BOUNDS)
 
 
-def _outside(key: str, value: float, least: float, most: float) -> Message:
-    return compose("value-outside", key=key, value=f"{value}", least=f"{least}", most=f"{most}")
-
-
-def _shot_faults(shot: ShotConfig) -> list[Message]:
-    least = {"warm_up_frames": 1, "plates": 1, "plates_over_s": 0}
-    values = {field.name: getattr(shot, field.name) for field in dataclasses.fields(shot)}
-    faults: list[Message] = []
-    for name, value in values.items():
-        if name in least and value < least[name]:
-            faults.append(compose("value-small", key=f"shot.{name}", value=f"{value}", least=least[name]))
-        elif name not in least and value <= 0:
-            faults.append(compose("value-not-positive", key=f"shot.{name}", value=f"{value}"))
-    for name, most in _SHOT_MOST.items():
-        if values[name] > most:
-            faults.append(compose("value-large", key=f"shot.{name}", value=f"{values[name]}", most=most))
-    return faults
+def _outside(table: object, bounds: Mapping[str, tuple[float, float]], where: str = "") -> list[Message]:
+    """Returns a fault for each value of a table that is outside its bounds."""
+    values = {key: getattr(table, key) for key in bounds}
+    return [
+        compose("value-outside", key=where + key, value=f"{value}", least=f"{bounds[key][0]}", most=f"{bounds[key][1]}")
+        for key, value in values.items()
+        if value is not None and not bounds[key][0] <= value <= bounds[key][1]
+    ]
 
 
 def _hinted(fault: Message, word: Any, known: Iterable[Any]) -> Message:

@@ -207,10 +207,7 @@ def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Messag
     for name, where in folded.items():
         if len(where) > 1:
             faults.append(compose("batch-name-twice", name=name, where=where))
-        parents = [parent for parent in map("/".join, _parents(name.split("/"))) if parent in folded]
+        parts = name.split("/")
+        parents = [outer for count in range(1, len(parts)) if (outer := "/".join(parts[:count])) in folded]
         faults += [compose("batch-name-within", name=name, outer=parent) for parent in parents]
     return faults
-
-
-def _parents(parts: list[str]) -> Iterator[list[str]]:
-    yield from (parts[:count] for count in range(1, len(parts)))

@@ -21,14 +21,6 @@ from server.cli.answers import (
 app = typer.Typer(rich_markup_mode=None)
 
 
-def _sources() -> tuple[str, ...]:
-    return ("board", "scene")
-
-
-def _lenses() -> tuple[str, ...]:
-    return ("one", "each")
-
-
 def _formats() -> tuple[str, ...]:
     from rig.formats.cameras.cameras_file import FORMATS
 
@@ -81,11 +73,15 @@ def calibrate(
     out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
     *,
     board: Annotated[Path | None, typer.Option(help="The board.toml.", exists=True, dir_okay=False)] = None,
-    source: Annotated[str, chosen("board, or scene: photographs of anything.", _sources, "--from")] = "board",
+    source: Annotated[
+        str, chosen("board, or scene: photographs of anything.", lambda: ("board", "scene"), "--from")
+    ] = "board",
     scale: Annotated[
         Path | None, typer.Option(help="From a scene: a known length, scale.json.", exists=True, dir_okay=False)
     ] = None,
-    lenses: Annotated[str | None, chosen("From a scene: one (all of one camera) or each; guessed.", _lenses)] = None,
+    lenses: Annotated[
+        str | None, chosen("From a scene: one (all of one camera) or each; guessed.", lambda: ("one", "each"))
+    ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
     anyway: Annotated[

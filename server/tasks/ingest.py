@@ -219,12 +219,8 @@ def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image
         if path.name != "images":
             shutil.rmtree(path) if path.is_dir() else path.unlink()
     files = sorted((root / "images").iterdir())
-    sizes = {}
-    for path in files:
-        sizes[path.stem] = picture_size(path)
-    huge = [f"{name} is {w} x {h} pixels" for name, (w, h) in sizes.items() if w * h > image_pixels]
-    if huge:
-        raise InputError("capture", [f"{fault}; at most {image_pixels:,} are accepted" for fault in huge])
+    check_sizes(files, image_pixels)
+    sizes = {path.stem: picture_size(path) for path in files}
     return CaptureContent(
         cameras=tuple(CameraSize(name, width, height) for name, (width, height) in sizes.items()),
         front=files[0].stem,

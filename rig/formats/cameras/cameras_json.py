@@ -237,12 +237,13 @@ def _is_covariance(matrix: np.ndarray) -> bool:
     return bool(np.abs(correlation - correlation.T).max() < 1e-6 and np.linalg.eigvalsh(correlation).min() > -1e-6)
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Tells whether a decoded value is a finite number of a size that occurs, and no truth value."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12  # NaN fails too
 
 
 def _read_size(value: Any, where: str, faults: list[Message]) -> int:
-    if not _is_number(value) or value != int(value) or not 16 <= value <= PIXELS_MOST:
+    if not is_number(value) or value != int(value) or not 16 <= value <= PIXELS_MOST:
         faults.append(compose("no-pixel-count", key=where, value=f"{value!r:.80}", most=PIXELS_MOST))
         return 0
     return int(value)
@@ -256,9 +257,9 @@ def _read_numbers(
         return [0.0] * len(keys)
     values = [entry.get(key, default) for key in keys]
     for key, value in zip(keys, values, strict=True):
-        if not _is_number(value):
+        if not is_number(value):
             faults.append(compose("no-finite-number", key=f"{where}.{key}", value=f"{value!r:.80}"))
-    return [float(value) if _is_number(value) else 0.0 for value in values]  # type: ignore[arg-type]
+    return [float(value) if is_number(value) else 0.0 for value in values]  # type: ignore[arg-type]
 
 
 def _read_array(value: Any, shape: tuple[int, ...], where: str, faults: list[Message]) -> np.ndarray | None:
@@ -271,7 +272,7 @@ def _read_array(value: Any, shape: tuple[int, ...], where: str, faults: list[Mes
         code = "rotation-vector" if vector else "no-numbers-of-shape"
         faults.append(compose(code, key=where, shape=" x ".join(map(str, shape))))
         return None
-    if not all(_is_number(entry) for entry in array.flat):
+    if not all(is_number(entry) for entry in array.flat):
         faults.append(compose("holds-no-finite-number", key=where))
         return None
     return array.astype(float)

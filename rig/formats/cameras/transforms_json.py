@@ -16,6 +16,7 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
+from rig.formats.cameras.cameras_json import is_number
 from rig.formats.cameras.foreign import (
     camera_entry,
     camera_names,
@@ -222,8 +223,7 @@ def _focal(
 
 
 def _number(value: object, where: str, faults: list[Message]) -> float:
-    # NaN fails the comparison, and so does a whole number too large for a float
-    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12:
-        return value
+    if is_number(value):
+        return float(value)  # type: ignore[arg-type]
     faults.append(compose("no-finite-number", key=where, value=shown(value)))
     return math.nan
