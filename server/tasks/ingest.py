@@ -4,7 +4,6 @@ Files are checked camera by camera, so that a rig of 64 large cameras needs the 
 upload, at the size that jobs work at, or smaller.
 """
 
-import hashlib
 import json
 import shutil
 from collections.abc import Mapping
@@ -57,6 +56,7 @@ from server.tasks.photographs import (
     check_sizes,
     photographs_alone,
     read_scaled_capture,
+    sha256_of,
 )
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ def _leave_out(root: Path, rig: Rig) -> None:
 
 def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportWarning, ...]) -> CaptureContent:
     """With the figures of the calibration, of which a job reads what was said."""
-    inputs = dict(sorted({**found.inputs, FIGURES: _sha256(root / FIGURES)}.items()))
+    inputs = dict(sorted({**found.inputs, FIGURES: sha256_of(root / FIGURES)}.items()))
     return replace(found, inputs=inputs, bytes=found.bytes + (root / FIGURES).stat().st_size, warnings=warnings)
 
 
@@ -224,7 +224,7 @@ def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image
     return CaptureContent(
         cameras=tuple(CameraSize(name, width, height) for name, (width, height) in sizes.items()),
         front=files[0].stem,
-        inputs={path.relative_to(root).as_posix(): _sha256(path) for path in files},
+        inputs={path.relative_to(root).as_posix(): sha256_of(path) for path in files},
         bytes=sum(path.stat().st_size for path in files),
         board=True,
     )
@@ -257,13 +257,15 @@ def check_capture(
                 small[camera.name] = reduce_picture(image, camera, GLANCE_PX)
         faults += [*of_sizes, *of_files]
     if (features := entry(root, FEATURES)).is_file():
-        faults += _features_file_faults(features, rig)
-        digests[FEATURES] = _sha256(features)
+        of_points = feature_faults(features_from_bytes(features.read_bytes(), rig, faults), rig)
+        faults += of_points
+        digests[FEATURES] = sha256_of(features)
     if len(empty) == len(rig):
         faults.append(compose("every-picture-its-plate"))
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
     digests |= _camera_digests(root, rig_file, rig)
+    is_metric = not (has_known_length(root) or (root / FIGURES).is_file())  # no length follows, or was assumed
     return CaptureContent(
         cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
         front=rig.front_camera(),
@@ -271,24 +273,17 @@ def check_capture(
         bytes=sum(entry(root, name).stat().st_size for name in digests),
         faults=tuple(view_faults(views, ShotConfig())),
         checks={name: view.document() for name, view in views.items()},
-        face=_face_of(small, rig, networks, is_metric=_is_metric(root)) if networks is not None and small else None,
+        face=_face_of(small, rig, networks, is_metric=is_metric) if networks is not None and small else None,
     )
 
 
 def _camera_digests(root: Path, rig_file: Path, rig: Rig) -> dict[str, str]:
     """Returns the SHA-256 of the rig's files and of scale.json. Raises InputError for a wrong scale.json."""
-    digests = {path.relative_to(root).as_posix(): _sha256(path) for path in rig_file_parts(rig_file)}
+    digests = {path.relative_to(root).as_posix(): sha256_of(path) for path in rig_file_parts(rig_file)}
     if has_known_length(root):
         read_scale(entry(root, SCALE), rig.names)
-        digests[SCALE] = _sha256(entry(root, SCALE))
+        digests[SCALE] = sha256_of(entry(root, SCALE))
     return digests
-
-
-def _features_file_faults(path: Path, rig: Rig) -> list[Message]:
-    """What is wrong with a features.json, as a file and as points."""
-    of_file: list[Message] = []
-    features = features_from_bytes(path.read_bytes(), rig, of_file)
-    return [*of_file, *feature_faults(features, rig)]
 
 
 def _face_of(
@@ -299,11 +294,6 @@ def _face_of(
     reduced = Rig(tuple(camera for _, camera in small.values()))
     limits = EYE_DISTANCE_MM if is_metric else None
     return sight_face(images, reduced, networks, front=rig.front_camera(), eye_distance_mm=limits)
-
-
-def _is_metric(root: Path) -> bool:
-    """Whether cameras.json is in millimetres: not where a length follows, or was assumed."""
-    return not has_known_length(root) and not (root / FIGURES).is_file()
 
 
 def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
@@ -376,7 +366,3 @@ def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int
             compose("camera-pixels-many", camera=camera.name, pixels=pixels, most=PICTURES_MOST * image_pixels)
         )
     return faults
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -87,7 +87,7 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
     warnings += tuple(unread_pictures(root, files, rig))
-    digests = {**capture.digests, CAMERAS: _sha256(kept / CAMERAS)}
+    digests = {**capture.digests, CAMERAS: sha256_of(kept / CAMERAS)}
     return Prepared(replace(capture, digests=dict(sorted(digests.items()))), work_rig(rig, WORK_PIXELS), warnings)
 
 
@@ -141,7 +141,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     write_scene_report(found, kept / PAGE)
     document = {
         "made_of": made_of,
-        "cameras_sha256": _sha256(kept / CAMERAS),
+        "cameras_sha256": sha256_of(kept / CAMERAS),
         "told": documents_of(warnings),
         **found.document(),
     }
@@ -155,7 +155,7 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
     with suppress(OSError, ValueError, KeyError, TypeError):
         document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
         same = made_of is None or document["made_of"] == made_of
-        if same and document["cameras_sha256"] == _sha256(kept / CAMERAS):
+        if same and document["cameras_sha256"] == sha256_of(kept / CAMERAS):
             return tuple(map(read_message, document["told"]))
     return None
 
@@ -204,9 +204,10 @@ def _made_of(root: Path, front: str | None) -> dict[str, str]:
     files = [path for path in sorted(picture_folder(root).rglob("*")) if is_picture(path)]
     files += [path for path in sorted(entry(root, "masks").glob("*")) if is_picture(path)]
     files += [path for path in (entry(root, SCALE),) if path.is_file()]
-    digests = {path.relative_to(root).as_posix(): _sha256(path) for path in files}
+    digests = {path.relative_to(root).as_posix(): sha256_of(path) for path in files}
     return {**digests, "front": front or "", "version": version("eigenhead"), "pycolmap": version("pycolmap")}
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """Returns the SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

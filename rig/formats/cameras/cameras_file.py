@@ -223,19 +223,11 @@ def _unread(document: Any) -> Iterator[tuple[str, str]]:
     """Yields the place and name of each key that is not read."""
     if not isinstance(document, Mapping) or document.get("format") != FORMAT:
         return
-    yield from _beside(document, "")
-    cameras = document.get("cameras")
+    cameras, tables = document.get("cameras"), list[tuple[str, Any]]([("", document)])
     for camera in cameras if isinstance(cameras, list) else []:
-        if isinstance(camera, Mapping):
-            yield from _beside(camera, "cameras")
-            yield from _beside(camera.get("intrinsics"), "cameras.intrinsics")
-            yield from _beside(camera.get("camera_from_world"), "cameras.camera_from_world")
-            lens = camera.get("distortion")
-            if isinstance(lens, Mapping):
-                known = LENS_MODELS.get(str(lens.get("model", "brown-conrady")), set(lens))  # others are refused
-                yield from (("cameras.distortion", key) for key in lens if key not in known)
-
-
-def _beside(entry: Any, place: str) -> Iterator[tuple[str, str]]:
-    if isinstance(entry, Mapping):
-        yield from ((place, key) for key in entry if key not in READ[place])
+        inner = ("intrinsics", "camera_from_world", "distortion") if isinstance(camera, Mapping) else ()
+        tables += [("cameras", camera), *((f"cameras.{key}", camera.get(key)) for key in inner)]
+    for place, table in tables:
+        if isinstance(table, Mapping):
+            lens = LENS_MODELS.get(str(table.get("model", "brown-conrady")), set(table))  # others are refused
+            yield from ((place, key) for key in table if key not in READ.get(place, lens))
