@@ -115,7 +115,7 @@ def multiplied(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndar
 
 
 def _factor_image(layout: Layout, factors: Float[np.ndarray, "v 3"]) -> Float32[np.ndarray, "s s 3"]:
-    """The vertices' factors over the layout; beside it, those of the nearest texel."""
+    """Spreads the vertices' factors over the layout; texels outside get the factor of the nearest one."""
     texels, ones = FACTORS_PX * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, FACTORS_PX, FACTORS_PX)
     image = interpolate(shown, texels, ones, layout.faces, factors[layout.source].astype(np.float32))

@@ -110,9 +110,9 @@ class Service:
         return job
 
     def deliver(self, job_id: str, to: str | None = None) -> Job:
-        """Delivers the result of a job to a place in an object store, None: the one that it was submitted with. Raises
-        NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a job without
-        result and while it is being delivered."""
+        """Delivers the result of a job to a place in an object store, by default the place that the job was submitted
+        with. Raises NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a
+        job without result and while it is being delivered."""
         self.jobs.files(job_id)
         request = self.jobs.request(job_id) or {}
         if (place := to or request.get("deliver_to")) is None:

@@ -56,7 +56,7 @@ TEMPLATES = {
     "lens-views-too-few": "{camera}: {views} good views of the board; at least {needed}, better 10, are needed",
     "camera-mirrored": "{camera} is mirrored: turn off mirroring in the camera or its software, and take the shots again",
     "front-of-other-rig": "{front} is no camera of the rig ({cameras})",
-    "board-in-no-picture": "no picture shows it: is board.toml the board that was used, and is it in the pictures whole?",
+    "board-in-no-picture": "no picture shows the board: check that board.toml describes it, and that the pictures show it whole",
     "no-picture-of-board": "no picture shows the board",
     "camera-without-board": "{camera} never sees the board ({why})",
     "views-contradict": "{camera} contradicts the other cameras in {count} of {all} shots: see whether its pictures are mirrored or of other moments, and whether it moved",

@@ -6,17 +6,12 @@ import pytest
 from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.measurements import DISTANCES, landmarks, measurements
 from pipeline.head_model.gaussian_process import SCALES
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 
 COUNT = 8
 SIZE = COUNT + 7  # coefficients, rotation, translation, log scale
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 def fit_at(parameters: np.ndarray, covariance: np.ndarray | None = None) -> Fit:

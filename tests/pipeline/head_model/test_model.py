@@ -14,11 +14,6 @@ from pipeline.head_model.subdivision import boundary_loops, check_manifold
 from rig.mesh import face_normals, vertex_normals
 
 
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
-
-
 def test_the_database_is_the_papers(model: HeadModel) -> None:
     assert model.name == "makehuman-138"
     assert dict(model.subjects) == {"total": 138, "male": 97, "female": 41}

@@ -61,7 +61,7 @@ class Farm:
 class Prices:
     """Holds list prices in US dollars, without tax and discounts: those of Amazon in Virginia, to be replaced by one's
     own. A worker and the service have two virtual cores and 4 GB (c5.large), the database two and 8 GB (RDS,
-    db.m6g.large). docs/scale.md says who states each, and when."""
+    db.m6g.large). docs/service.md says who states each, and when."""
 
     worker_hour: float = 0.085
     database_hour: float = 0.159

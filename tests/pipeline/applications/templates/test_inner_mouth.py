@@ -14,15 +14,10 @@ from pipeline.applications.templates.pivots import hinge, jaw_motions
 from pipeline.applications.templates.write.shapes import animated_glb
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.head_model.inner_mouth_file import load_inner_mouth
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.formats.meshes.glb_document import opened_glb
 from rig.mesh import boundary_edges
 from tests.support.ready_templates import parted_faces
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from pipeline.applications.templates.names import UnknownTemplate, WrongName, li
 from pipeline.applications.templates.template_file import Template, read_template, save_template
 from pipeline.applications.templates.write.mesh import write_template
 from pipeline.head_model.data_folder import DATA
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from pipeline.settings import Settings, settings_from_document
 from pipeline.texturing.layout.model_layout import model_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
@@ -22,11 +22,6 @@ from rig.errors import InputError
 from rig.formats.meshes.polygon_obj import PolygonMesh, read_polygons
 from rig.mesh import Mesh
 from tests.support.made_up_results import PLACE, textured_result
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @pytest.fixture

@@ -25,11 +25,6 @@ from tests.support.landmark_files import write_landmarks
 SUBJECTS = (4, 40, 100, 120)
 
 
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
-
-
 def scanned(model: HeadModel, subject: int, spacing_mm: float) -> Scan:
     head = model.vertices(model.scores[subject].astype(float))
     scanner = Scanner(spacing_mm=spacing_mm)
