@@ -50,7 +50,6 @@ TEMPLATES = {
     "no-object-of": "{key} is missing or no object: wanted are {names} by name",
     "no-finite-number": "{key} is {value}, wanted a finite number",
     "no-positive-number": "{key} is {value}, wanted a positive number",
-    "no-number": "{key} is {value}, wanted a number",
     "no-table": "{key} is no table",
     "file-large": "is larger than {most_mib} MiB",
     "record-cut-off": "ends in the middle of a record: it is truncated or no COLMAP file",

@@ -940,7 +940,6 @@ export default {
   "no-object-of": "{key} fehlt oder ist kein Objekt: verlangt sind {names} mit Namen",
   "no-finite-number": "{key} ist {value}, verlangt ist eine endliche Zahl",
   "no-positive-number": "{key} ist {value}, verlangt ist eine positive Zahl",
-  "no-number": "{key} ist {value}, verlangt ist eine Zahl",
   "no-table": "{key} ist keine Tabelle",
   "file-large": "ist größer als {most_mib} MiB",
   "record-cut-off": "endet mitten in einem Eintrag: Die Datei ist abgeschnitten oder keine von COLMAP",
