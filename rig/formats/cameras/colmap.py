@@ -13,7 +13,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
@@ -232,6 +231,8 @@ def _model_fault(model: str | Message, number: Any) -> Message:
 
 
 def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[Message]) -> dict[str, object]:
+    from scipy.spatial.transform import Rotation
+
     parameters = dict(zip(COLMAP_MODELS[camera.model][1], camera.values, strict=True))
     focal = parameters.get("f", 0.0)
     fx, fy = parameters.get("fx", focal), parameters.get("fy", focal)

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
@@ -141,6 +140,8 @@ def write_csv(rig: Rig, path: Path) -> None:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS)
+    from scipy.spatial.transform import Rotation
+
     for camera in _held(rig, "realitycapture-csv"):
         k, d, side = camera.intrinsics, camera.intrinsics.distortion, _side(camera)
         if abs(k.fx / k.fy - 1) * side > 0.02:
@@ -159,6 +160,8 @@ def write_csv(rig: Rig, path: Path) -> None:
 def _attitude(values: Mapping[str, float]) -> Float[np.ndarray, "3 3"]:
     """Returns ``world_from_camera`` in the CSV's axes: heading about z, clockwise, then pitch about x, then roll about
     y."""
+    from scipy.spatial.transform import Rotation
+
     angles = [-values["heading"], values["pitch"], values["roll"]]
     return Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
 
