@@ -224,7 +224,7 @@ def convert(
         read_cameras,
         write_rig_file,
     )
-    from rig.formats.captures.capture_folder import has_known_length
+    from rig.formats.pictures.picture_names import entry
     from rig.plausibility import rig_faults
 
     file = find_rig_file(source) if source.is_dir() else source
@@ -232,7 +232,7 @@ def convert(
         raise InputError(str(source), [no_rig_fault(source)])
     read = read_cameras(file)
     rig = read.rig
-    if faults := rig_faults(rig, any_unit=has_known_length(file.parent)):
+    if faults := rig_faults(rig, any_unit=entry(file.parent, "scale.json").is_file()):
         raise InputError(file.name, faults)
     for remark in read.remarks:
         warn(f"{remark.code}: {remark}")
