@@ -7,7 +7,7 @@ from their middle as the model's mean head is from its own; hair, a neck and the
 an assumption wherever they are shown.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -122,33 +122,28 @@ Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
 def find_tags(photographs: Photographs, known: TagSize) -> Tags:
     """Finds the tags of a dictionary in all photographs. Returns their corners (px) by (shot, number of the tag), then
     by camera."""
-    detector = _tag_detector(known)
-    tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
-    for camera, shots in photographs.files.items():
-        for shot, path in shots.items():
-            pixels, _, _ = decode_image_file(path, path.name, "grey")
-            assert pixels is not None  # matching has read it
-            for number, corners in _tags_in(pixels, detector).items():
-                tags.setdefault((shot, number), {})[camera] = corners
-    return tags
+    files = ((camera, shot, path) for camera, shots in photographs.files.items() for shot, path in shots.items())
+    decoded = ((camera, shot, decode_image_file(path, path.name, "grey")[0]) for camera, shot, path in files)
+    return _tags_of(((camera, shot, grey) for camera, shot, grey in decoded if grey is not None), known)
 
 
 def find_tags_of_shot(images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], known: TagSize) -> Tags:
     """Finds the tags of a dictionary in the pictures of one shot. Returns their corners (px) by tag, then by camera.
     The key of a tag is ("", its number), since the shot has no name."""
-    detector = _tag_detector(known)
-    tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
-    for camera, image in images.items():
-        for number, corners in _tags_in(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), detector).items():
-            tags.setdefault(("", number), {})[camera] = corners
-    return tags
+    grey = ((camera, "", np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))) for camera, image in images.items())
+    return _tags_of(grey, known)
 
 
-def _tag_detector(known: TagSize) -> cv2.aruco.ArucoDetector:
+def _tags_of(pictures: Iterable[tuple[str, str, UInt8[np.ndarray, "h w"]]], known: TagSize) -> Tags:
+    """Finds tags in grey pictures of (camera, shot)."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     dictionary = cv2.aruco.getPredefinedDictionary(dictionaries()[known.dictionary])
-    return cv2.aruco.ArucoDetector(dictionary, parameters)
+    detector, tags = cv2.aruco.ArucoDetector(dictionary, parameters), dict[tuple[str, int], dict[str, np.ndarray]]()
+    for camera, shot, grey in pictures:
+        for number, corners in _tags_in(grey, detector).items():
+            tags.setdefault((shot, number), {})[camera] = corners
+    return tags
 
 
 def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) -> dict[int, Float[np.ndarray, "4 2"]]:

@@ -13,7 +13,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from pipeline.imaging.silhouette import Silhouette
+from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.view_checks.camera_assignment import FITTING_MISFIT, own_misfit
 from pipeline.view_checks.camera_drift import find_drift
 from pipeline.view_checks.guards import STRICT, Guards
 from pipeline.view_checks.head_size import find_low_crowns, judge_head_size
@@ -101,7 +102,7 @@ def usable_views(
     find_face = cache(lambda: guards.find_face(assigned.capture.images, rig))
     overruled: list[ReportWarning] = []
     doubted = [name for name, s in assigned.silhouettes.items() if s.quality.warnings or not s.quality.usable]
-    silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted)
+    silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted, rig)
     usable = sum(silhouette.quality.usable for silhouette in silhouettes.values())
     by_face = MIN_VIEWS_OF_FACE <= usable < MIN_VIEWS <= len(silhouettes) and find_face() is not None
     if usable < MIN_VIEWS and not by_face:
@@ -113,7 +114,7 @@ def usable_views(
     crowns = [compose("crown-low", camera=name, low_mm=mm) for name, mm in low.items()]
     silhouettes, moved = without_moved_cameras(silhouettes, rig)
     unexplained = silhouettes
-    silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys())
+    silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys(), rig)
     moved_warnings = [warning for name, warning in moved.items() if silhouettes[name] is unexplained[name]]
     masks_given = bool(assigned.capture.masks)
     size = judge_head_size(silhouettes, rig, find_face, guards=guards, masks_given=masks_given)
@@ -187,6 +188,7 @@ def _doubt(remark: Message) -> ReportWarning:
 
 MIN_TURNED = 0.5  # share of a picture that its turned plate explains: 0.65 to 0.69, and 0.55 to 0.79 of right ones ...
 TURNED_GAIN = 1.5  # ... and how many times what the plate explains as it is: 1.7 to 4, and 0.95 at most of right ones
+MISFIT_GAIN = 1.2  # how many times the misfit of the right turn that as it is must be: 1.26 to 1.6 if upside down
 FINE_PX, COARSE_PX = 1.0, 2.0  # blurs between which a picture's fine detail lies: noise of single pixels is below
 DETAIL_QUANTILE = 0.9  # of the subject's pixels: eyes, hair and clothes, not flat skin
 MAX_BLURRED = 0.45  # of the median view's detail: 0.39 at a blur of 3 px, 0.28 in motion over 60; 0.57 and more in
@@ -198,14 +200,14 @@ MIN_PIXELS, MIN_COMPARED = 500, 3  # of a subject, and views, that tell anything
 
 
 def with_picture_faults(
-    silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str]
+    silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str], rig: Rig
 ) -> dict[str, Silhouette]:
     """Returns silhouettes in which the fault of a suspect's picture replaces the warnings that follow from it. Views
     with a turned picture are not usable."""
     found = dict(silhouettes)
     blurred = blurred_views(capture.images, silhouettes) if suspects else {}
     for name in suspects:
-        fault = turned_against_plate(capture, name)
+        fault = turned_against_plate(capture, name) or turned_against_others(silhouettes, name, rig)
         usable = silhouettes[name].quality.usable and fault is None
         fault = fault or blurred.get(name)
         if fault is not None:
@@ -230,6 +232,29 @@ def turned_against_plate(capture: Capture, name: str) -> Message | None:
     if share < max(MIN_TURNED, TURNED_GAIN * common_share(picture, plate)):
         return None
     return compose("picture-turned-to-plate", turn=turn)
+
+
+def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig: Rig) -> Message | None:
+    """Returns the fault of a picture, turned together with its plate, whose outline agrees with those of the other
+    cameras only once it is turned by 180 degrees or flipped."""
+    others = {camera: s for camera, s in silhouettes.items() if s.quality.usable and camera != name}
+    if len(others) < MIN_COMPARED or not silhouettes[name].mask.any():
+        return None
+
+    def misfit(mask: np.ndarray) -> float:
+        return own_misfit({**others, name: silhouette_from_mask(np.ascontiguousarray(mask))}, rig)[name]
+
+    mask = silhouettes[name].mask
+    turns = {
+        compose("turned-half"): mask[::-1, ::-1],
+        compose("flip-across"): mask[:, ::-1],
+        compose("flip-down"): mask[::-1],
+    }
+    misfits = {turn: misfit(turned) for turn, turned in turns.items()}
+    turn, least = min(misfits.items(), key=lambda one: one[1])
+    if not least < FITTING_MISFIT < misfit(mask) or misfit(mask) < MISFIT_GAIN * least:
+        return None
+    return compose("picture-turned-to-others", turn=turn)
 
 
 def blurred_views(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette]) -> dict[str, Message]:

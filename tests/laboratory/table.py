@@ -93,11 +93,6 @@ EXPERIMENTS = {
         "Measures how close wrapping brings a template to scans.",
         {"truths": inputs.chosen_truths},
     ),
-    "hair-shell": Record(
-        "experiments.surface.hair_shells:hair_shells",
-        "Measures how much of the visible hair head_hair.ply can show.",
-        {"captures": inputs.short_haired},
-    ),
     "meshes": Record("experiments.surface.meshes:meshes", "Counts turned, folded and crossing triangles of results."),
     "scaling": Record(
         "experiments.speed.scaling:scaling",
@@ -115,6 +110,7 @@ EXPERIMENTS = {
         "Judges heads from real photographs by views that were not used.",
         {"folders": inputs.photograph_folders},
     ),
+    "reports": Record("experiments.faults.reports:reports", "Judges what each door answers to the shared reports."),
 }
 
 BENCHMARKS = {

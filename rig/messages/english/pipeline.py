@@ -48,6 +48,7 @@ TEMPLATES = {
     "detail-missing": "the picture is blurred: its subject has {share:.0%} of the fine detail of the other views; focus the camera, light it for a shorter exposure, and have the subject sit still",
     "picture-turned-to-plate": "the picture is {turn} against its clean plate: turn it back, and leave the rows as the camera delivers them (programs obey EXIF's orientation or drop it)",
     "masks-turned": "the masks are {turn} against the photographs: write them with the photographs' own rows and columns",
+    "picture-turned-to-others": "the picture is {turn} (upside down, or mirrored) against those of the other cameras: does the camera hang so, or did a program turn its pictures? Turn its pictures and plates back",
     "turned-half": "turned by 180 degrees",
     "flip-across": "flipped left to right",
     "flip-down": "flipped upside down",

@@ -135,5 +135,7 @@ def test_an_unsure_scale_moves_landmarks_and_lengths_as_a_larger_head_would(mode
         assert wide == pytest.approx(np.hypot(lengths[name].value_mm - length.value_mm, length.std_mm or 0.0), rel=1e-3)
     marks = landmarks(model, larger)
     for name, mark in landmarks(model, sure).items():
-        moved, before = marks[name].position_mm - mark.position_mm, mark.std_mm
-        np.testing.assert_allclose(mark.widen_by_scale(sigma, origin).std_mm, np.hypot(moved, before), atol=1e-3)
+        moved, wide = marks[name].position_mm - mark.position_mm, mark.widen_by_scale(sigma, origin)
+        assert mark.std_mm is not None
+        assert wide.std_mm is not None
+        np.testing.assert_allclose(wide.std_mm, np.hypot(moved, mark.std_mm), atol=1e-3)

@@ -29,6 +29,7 @@ from rig.messages.message import compose
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
+from tests.support.scenes import fan
 from tests.support.silhouette_subjects import dressed_head
 
 pytestmark = pytest.mark.gl
@@ -148,6 +149,7 @@ def test_only_the_end_opposite_to_the_shoulders_is_a_crown() -> None:
 
 
 HEIGHT, WIDTH = 192, 256
+RIG = Rig(tuple(replace(camera, name=name) for name, camera in zip("abcd", fan(WIDTH, HEIGHT), strict=False)))
 NAMES = ("a", "b", "c", "d")
 ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
 SUBJECT = np.hypot(COLUMNS - 128, ROWS - 96) < 60
@@ -177,7 +179,7 @@ def outlines() -> dict[str, Silhouette]:
 def test_nothing_is_said_of_good_pictures(capture: Capture, outlines: dict[str, Silhouette]) -> None:
     assert blurred_views(capture.images, outlines) == {}
     assert [turned_against_plate(capture, name) for name in NAMES] == [None] * 4
-    assert with_picture_faults(outlines, capture, NAMES) == outlines
+    assert with_picture_faults(outlines, capture, NAMES, RIG) == outlines
 
 
 @pytest.mark.parametrize("sigma", [3.0, 12.0])
@@ -187,7 +189,7 @@ def test_a_blurred_picture_is_named_instead_of_what_follows_from_it(
     blurred = replace(capture, images={**capture.images, "c": cv2.GaussianBlur(capture.images["c"], (0, 0), sigma)})
     weak = replace(outlines["c"].quality, warnings=(compose("outline-weak", share=0.3),))
     doubted = {**outlines, "c": replace(outlines["c"], quality=weak)}
-    found = with_picture_faults(doubted, blurred, ["c"])
+    found = with_picture_faults(doubted, blurred, ["c"], RIG)
     assert [fault.code for fault in found["c"].quality.warnings] == ["detail-missing"]
     assert found["c"].quality.usable
     assert all(found[name] is outlines[name] for name in "abd")
@@ -203,7 +205,7 @@ def test_a_blurred_picture_is_named_instead_of_what_follows_from_it(
 )
 def test_a_turned_picture_is_named_and_left_out(capture: Capture, outlines: dict, turned, word: str) -> None:
     pictures = {**capture.images, "b": np.ascontiguousarray(turned(capture.images["b"]))}
-    found = with_picture_faults(outlines, replace(capture, images=pictures), ["b"])
+    found = with_picture_faults(outlines, replace(capture, images=pictures), ["b"], RIG)
     assert not found["b"].quality.usable
     (fault,) = found["b"].quality.warnings
     assert word in fault.text

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.multiview.spread_views import spread_views
+from rig.spread_views import spread_views
 from tests.support.textured_wedge import wedge_rig
 
 

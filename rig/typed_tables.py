@@ -5,7 +5,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 from rig.errors import InputError
 from rig.messages.message import Message, compose
@@ -26,10 +26,10 @@ def read_table(kind: type[T], document: Mapping[str, Any], subject: str) -> T:
 
 def read_fields(kind: type[T], document: Any, where: str, faults: list[Message]) -> T:
     """Returns the dataclass ``kind`` from decoded JSON or TOML, with its defaults where a key is missing or wrong, and
-    adds what is wrong to ``faults``. ``where`` comes before the names in them."""
+    adds what is wrong to ``faults``: then it may be an ellipsis. ``where`` comes before the names in them."""
     if not isinstance(document, Mapping):
-        faults.append(compose("setting-no-object", where=where or "settings"))
-        return kind()
+        faults.append(compose("setting-no-object", where=where.rstrip(".") or "settings"))
+        return typing.cast(T, ...)
     types = typing.get_type_hints(kind)
     fields = dataclasses.fields(typing.cast(Any, kind))
     hints = {field.name: types[field.name] for field in fields if field.metadata.get("key", True)}
@@ -43,7 +43,10 @@ def read_fields(kind: type[T], document: Any, where: str, faults: list[Message])
                 else compose("setting-unknown", key=shown)
             )
     values = {key: _value(hints[key], document[key], where + key, faults) for key in hints if key in document}
-    return kind(**{key: value for key, value in values.items() if value is not ...})
+    needed = [field.name for field in fields if field.default is field.default_factory is dataclasses.MISSING]
+    faults += [compose("key-missing", key=where + key) for key in needed if key not in document]
+    right = {key: value for key, value in values.items() if value is not ...}
+    return kind(**right) if right.keys() >= {*needed} else typing.cast(T, ...)
 
 
 def _sections_with(key: str, hints: Mapping[str, Any]) -> list[str]:
@@ -53,22 +56,21 @@ def _sections_with(key: str, hints: Mapping[str, Any]) -> list[str]:
 
 
 def _value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return read_fields(typing.cast(type, hint), value, where + ".", faults)
-    options = (
-        typing.get_args(hint)
-        if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
-        else (hint,)
-    )
+    is_union = isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union
+    options = get_args(hint) if is_union else (hint,)
     for option in options:
+        if dataclasses.is_dataclass(option):
+            return read_fields(typing.cast(type, option), value, where + ".", faults)
         if option is type(None) and value is None:
             return None
-        if typing.get_origin(option) is Literal and isinstance(value, str) and value in typing.get_args(option):
+        if typing.get_origin(option) is Literal and (type(value), value) in [(type(w), w) for w in get_args(option)]:
             return value
         if option is float and (number := _number(value)) is not None:
             return number
-        if typing.get_origin(option) is tuple and _are_texts(value):
-            return tuple(typing.cast(list, value))
+        if typing.get_origin(option) is tuple and isinstance(value, list | tuple):
+            one = get_args(option)[0]
+            items = tuple(_value(one, item, _item(where, item, i), faults) for i, item in enumerate(value))
+            return ... if any(item is ... for item in items) else items
         if option in (int, bool) and type(value) is option:
             return value
         if option is str and _is_text(value):
@@ -92,8 +94,9 @@ def _is_text(value: Any) -> bool:
     return isinstance(value, str) and is_encodable(value)
 
 
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(map(_is_text, value))
+def _item(where: str, value: Any, index: int) -> str:
+    name = value.get("name") if isinstance(value, Mapping) else None
+    return f"{where}.{name}" if isinstance(name, str) else f"{where}[{index}]"
 
 
 def _shown(value: Any) -> Message | str:
@@ -110,7 +113,7 @@ def _wanted(options: tuple[Any, ...]) -> str:
         if typing.get_origin(option) is Literal:
             words += [repr(word) for word in typing.get_args(option)]
         elif typing.get_origin(option) is tuple:
-            words.append("a list of texts")
+            words.append("a list of texts" if get_args(option)[0] is str else "a list")
         else:
             words.append(
                 {float: "a finite number", int: "a whole number", bool: "true or false", str: "a text"}.get(
