@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences
-from pipeline.fusion.hair_outline import STRAND_SHARE, grown_to_outlines
+from pipeline.fusion.hair import STRAND_SHARE, grown_to_outlines, parts_over_head, smooth_hair
 from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
 from pipeline.fusion.refinement import Measured, refine_vertices
@@ -85,6 +85,7 @@ def fuse(
     spacing_mm: float,
     report: Progress,
     hair: SilentHair | None = None,
+    parts: PartVotes | None = None,
 ) -> DepthSurface:
     """Fuses the depth maps to one closed surface.
 
@@ -97,6 +98,7 @@ def fuse(
         spacing_mm: distance of the vertices.
         report: called with the stage's progress.
         hair: of which the depth maps say nothing; None if there is none.
+        parts: which part each point shows (``parts_over_head``); None counts all as skin.
 
     Raises:
         NoSurface: fewer than three views have any depth, or they contradict each other.
@@ -106,7 +108,7 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level = solve(maps, views, head_world, spacing_mm, hair)
+    level = solve(maps, views, head_world, spacing_mm, hair, parts)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)
@@ -139,13 +141,15 @@ def finished(
     """
     mesh, measured = surface.mesh_world, surface.measured
     seen = measured.views > 0
-    shares = None if votes is None else part_shares(votes, mesh.vertices)
-    shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
+    shares, shown = np.tile([1.0, 0.0, 0.0], (len(seen), 1)), np.full(len(seen), Part.SKIN, np.uint8)
+    if votes is not None:
+        shown = part_codes(votes, mesh.vertices)
+        shares = part_shares(votes if head is None else parts_over_head(votes, head.mesh_world), mesh.vertices)
+    skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
     if head is not None:
-        skin = 1.0 if shares is None else shares[:, Part.SKIN.channel]
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured))
-    moved_mm = np.zeros(len(seen))
-    if shares is not None and surface.shell_deviation_mm is None:
+    mesh = smooth_hair(mesh, skin, seen)
+    if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, shares[:, Part.HAIR.channel], silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))
     clean = without_coincidences(Mesh(smooth_spots(mesh.vertices, topology, surface.safe_world), mesh.faces))

@@ -29,6 +29,10 @@ class Grid:
     def __len__(self) -> int:
         return len(self.index)
 
+    def places(self, rows: np.ndarray | slice = slice(None)) -> Float[np.ndarray, "m 3"]:
+        """Returns where nodes lie (world frame, mm)."""
+        return self.corner + self.step_mm * self.index[rows]
+
 
 def whole_box(corner: Float[np.ndarray, " 3"], edges_mm: Float[np.ndarray, " 3"], step_mm: float) -> Grid:
     """Returns the grid with every node of a box, from its corner, edges and step (mm, world frame)."""

@@ -7,7 +7,7 @@ and that distance is smooth. The fitted head, with a thickness above it, says no
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -25,7 +25,6 @@ from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
 from pipeline.part_labels.votes import PartVotes, part_shares
 from pipeline.stereo.depth_map import DepthMap, placing, points_world
-from rig.mesh import Mesh
 from rig.rig import Rig
 
 # Share of the pixels of hair with a known depth, below which hair is silent: 0.25 of long strands, 0.53 of short ones
@@ -33,7 +32,6 @@ from rig.rig import Rig
 SILENT_SHARE = 0.4
 MIN_HAIR = 0.2  # of what is not clothes; with less, hair is not worth it
 LIKELY = 0.5  # probability from which on a place counts as a part
-OFF_HEAD_MM = 8.0  # from the fitted head there is no skin: strands that hang before it have skin's colours in shade
 # Share of the pixels about one whose depth must be known, for skin and for clothes to count. Specks amid hair are
 # chance; the face, which shows between the strands, and the shirt below them are known more evenly.
 DENSE_SKIN, DENSE_CLOTHES, WINDOW_MM = 0.5, 0.4, 15.0
@@ -57,27 +55,25 @@ class SilentHair:
 
 @traced
 def find_silent_hair(
-    depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig, head_world: Mesh
+    depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig
 ) -> tuple[SilentHair | None, Sequence[DepthMap]]:
     """Tells whether the subject has long hair of which the photographs hardly show the depth.
 
     Args:
         depth_maps: of the views.
         parts: the part maps by camera, in pixels of the photographs.
-        votes: which part each point of the depth maps shows; without it there is no such hair.
+        votes: which part each point of the depth maps shows (``parts_over_head``); without it there is no such hair.
         rig: the cameras as calibrated, world frame.
-        head_world: the fitted head (mm).
 
     Returns:
         The hair and the depth maps without what they say of it, or None and the same depth maps.
     """
     if votes is None or known_share(depth_maps, parts, rig) >= SILENT_SHARE:
         return None, depth_maps
-    hair = replace(votes, probability=hair_off_head(votes, head_world))
 
     def split(depth_map: DepthMap) -> tuple[Float[np.ndarray, "n 3"], DepthMap]:
         points, known = points_world(depth_map), depth_map.known
-        share = part_shares(hair, points) >= LIKELY
+        share = part_shares(votes, points) >= LIKELY
         clothes = share[:, Part.CLOTHES.channel]
         about = local_share(depth_map, parts, rig)[known]
         silent = share[:, Part.HAIR.channel] | (about < np.where(clothes, DENSE_CLOTHES, DENSE_SKIN))
@@ -145,16 +141,6 @@ def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> 
     return np.asarray(cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
-def hair_off_head(votes: PartVotes, head_world: Mesh) -> Float[np.ndarray, "g 3"]:
-    """Returns the probabilities of the votes' cells, with hair in place of skin where that is off the fitted head."""
-    off = nearest(PointTree.of(head_world.vertices), votes.places)[0] > OFF_HEAD_MM
-    skin, hair = Part.SKIN.channel, Part.HAIR.channel
-    out = votes.probability.copy()
-    out[off, hair] += out[off, skin]
-    out[off, skin] = 0.0
-    return out
-
-
 @traced
 def distance_to_shell(
     hair: SilentHair, views: ViewStack, box: Grid
@@ -163,7 +149,7 @@ def distance_to_shell(
     photograph shows its outside there, 0 to 1: what all cameras see from behind, no silhouette bounds."""
     from scipy.ndimage import gaussian_filter  # only such hair needs it
 
-    places = box.corner + box.step_mm * box.index
+    places = box.places()
     hull, (known, deep) = distance_to_hull(places, views), depth_inside(hair, views)
     band = np.flatnonzero(np.abs(hull) < DEEPEST_MM + 2.0 * box.step_mm)
     inset = np.full(len(hull), np.median(deep))

@@ -85,7 +85,7 @@ def head() -> Mesh:
 def split(made: Scene, above: Part) -> tuple[SilentHair | None, Sequence[DepthMap], PartVotes | None]:
     parts = labels(made, above)
     votes = vote_parts(made.maps, parts, made.rig)
-    return *find_silent_hair(made.maps, parts, votes, made.rig, head()), votes
+    return *find_silent_hair(made.maps, parts, votes, made.rig), votes
 
 
 def test_specks_become_a_smooth_shell_that_counts_as_unseen(strands: Scene) -> None:

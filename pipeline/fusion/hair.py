@@ -1,4 +1,8 @@
-"""Moves the hair of the fused surface out to the silhouettes.
+"""Decides what counts as hair, and makes the surface of hair and clothes as smooth as pictures resolve it.
+
+Two cameras see other strands and other threads, so that windows match chance patterns: what depth says of them scatters
+over millimetres and leaves gravel with pockets and handles. That is noise, not relief. Its votes are therefore weak in
+the signed distance (``firmness``), which leaves no pockets, and its vertices take the mean of those about them.
 
 Strands are thinner than a pixel and let through what lies behind them, so that windows match the dense core of the
 hair, millimetres deeper than the strands that a photograph shows. Outlines show how much is missing: where the surface
@@ -7,6 +11,7 @@ interpolated. Hair that has a surface, as a helmet has, reaches its outlines and
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,19 +19,29 @@ from jaxtyping import Bool, Float
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
+from pipeline.fusion.quality import EDGE_MM, guessed_deviation_mm
 from pipeline.fusion.refinement import neighbours
-from pipeline.fusion.skin import mean_around
+from pipeline.fusion.refinement_kernels import blurred_over_mesh
+from pipeline.fusion.skin import mean_around, skin_share
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import Silhouette
+from pipeline.part_labels.codes import Part
+from pipeline.part_labels.votes import PartVotes
 from rig.camera import Camera
-from rig.mesh import Mesh
+from rig.mesh import Mesh, face_normals
 from rig.rig import Rig
 
+# Height (mm) over the head up to which hair is skin with hair's colour (stubble, brows, a beard), and from which on it
+# is hair: the cells of beard-smile's beard lie 0.6 mm over the head in the median, those of its hair 3.5.
+STUBBLE_MM = (1.0, 3.0)
+CELLS = 64  # about a cell, whose mean height counts: 12 mm about it
+RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair and clothes takes: gravel is 2 to 5 mm wide
+STEP_SHARE = 0.46  # variance of one step of a mean, by the area of a vertex
+OFF_HEAD_MM = 8.0  # from the head there is no skin: strands that hang before it have skin's colours in shade
 # Median thickness that hair lacks at its rims, from which on it counts as strands, and counts whole: 0.14 and 0.15 mm
 # of two captures of solid hair, 3.4 and 5.3 of two of strands.
 STRANDS_MM = (1.0, 2.0)
-FEW_VIEWS = 4  # tell solid hair, with which nothing else is to be done
 SURELY = 0.5  # probability from which on a vertex of a rim counts as hair
 EVERY = 4  # pixel of a rim is measured
 RIM_PX = 0.5  # by which the pixels of a rim lie inside the outline
@@ -39,6 +54,39 @@ NEAREST, EVEN_MM = 8, 8.0  # of them count at a vertex, and the distance within 
 MIN_PLACES = 2 * ABOUT  # for a measurement
 ROUNDS, SHARE = 2, 0.7  # the rim of what has been moved is another one: what is still missing is measured again
 STRAND_SHARE = 0.5  # standard deviation of a moved vertex, by its way: strands lie between core and outline
+
+
+def parts_over_head(votes: PartVotes, head_world: Mesh) -> PartVotes:
+    """Returns the votes with the cells' heights over a head considered: hair that lies on its skin counts as skin, and
+    skin that lies off it as hair."""
+    skin, hair = Part.SKIN.channel, Part.HAIR.channel
+    both, out = votes.probability[:, skin] + votes.probability[:, hair], votes.probability.copy()
+    far, near = nearest(PointTree.of(head_world.vertices), votes.places)
+    height = ((votes.places - head_world.vertices[near]) * head_world.normals()[near]).sum(axis=1)
+    alike = nearest(PointTree.of(votes.places), votes.places, count=min(CELLS, len(height)))[1]
+    weight = out[alike, hair] + 1e-9
+    mean_mm = (weight * height[alike]).sum(axis=1) / weight.sum(axis=1)
+    over = np.clip((mean_mm - STUBBLE_MM[0]) / (STUBBLE_MM[1] - STUBBLE_MM[0]), 0.0, 1.0)
+    out[:, hair] = np.where(far > OFF_HEAD_MM, both, over * out[:, hair])
+    out[:, skin] = both - out[:, hair]
+    return replace(votes, probability=out)
+
+
+@traced
+def smooth_hair(mesh_world: Mesh, skin: Float[np.ndarray, " v"], seen: Bool[np.ndarray, " v"]) -> Mesh:
+    """Returns the mesh with its vertices moved to the mean of their surroundings, as far as they are not skin.
+
+    Args:
+        mesh_world: closed, mm.
+        skin: probability that a vertex shows skin.
+        seen: by a view; the others are what is seen next to them.
+    """
+    beside = neighbours(mesh_world.faces, len(seen))
+    share = skin_share(beside, mesh_world.vertices, skin, seen)
+    share = (share * EDGE_MM / np.maximum(guessed_deviation_mm(mesh_world.vertices, seen), EDGE_MM))[:, None]
+    area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / len(seen)
+    mean = blurred_over_mesh(mesh_world.vertices, *beside, round(RESOLVED_MM**2 / (STEP_SHARE * area_mm2)))
+    return Mesh(share * mesh_world.vertices + (1.0 - share) * mean, mesh_world.faces)
 
 
 @traced
@@ -60,14 +108,11 @@ def grown_to_outlines(
     rig = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
     if not sure.any() or not len(rig):
         return mesh_world, np.zeros(len(hair))
-    few = rig.subset(rig.names[:: -(-len(rig) // FEW_VIEWS)])
-    trust = strands_share(rims(mesh_world, sure, silhouettes, few)[1])
-    if trust == 0.0:
-        return mesh_world, np.zeros(len(hair))
-    mesh, beside = mesh_world, neighbours(mesh_world.faces, len(hair))
+    mesh, beside, trust = mesh_world, neighbours(mesh_world.faces, len(hair)), None
     for _ in range(ROUNDS):
         places, missing_mm = rims(mesh, sure, silhouettes, rig)
-        if len(places) < MIN_PLACES:
+        trust = strands_share(missing_mm) if trust is None else trust
+        if len(places) < MIN_PLACES or trust == 0.0:
             break
         outwards = np.zeros(len(hair))
         outwards[hair > 0.0] = missing_thickness(mesh.vertices[hair > 0.0], places, missing_mm)
