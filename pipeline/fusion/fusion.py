@@ -7,7 +7,7 @@ for each vertex. A signed distance is computed on a grid (``signed_distance``); 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -17,7 +17,7 @@ from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences
 from pipeline.fusion.hair import STRAND_SHARE, grown_to_outlines, parts_over_head, smooth_hair
 from pipeline.fusion.net_kernels import component_of, compose_well
-from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
+from pipeline.fusion.quality import MAX_MM, deviation_mm, seen_deviation_mm, without_islands
 from pipeline.fusion.refinement import Measured, refine_vertices
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
 from pipeline.fusion.silent_hair import SilentHair, shell_deviation_mm
@@ -72,6 +72,7 @@ class DepthSurface:
     safe_world: Float[np.ndarray, "v 3"]  # places (mm) with which the mesh cannot cross itself
     measured: Measured
     warnings: tuple[ReportWarning, ...]
+    capped: Bool[np.ndarray, " v"]  # vertices of the cut that ends the bust
     shell_deviation_mm: float | None = None  # of hair that is a guess inside its outlines; None without such hair
 
 
@@ -108,17 +109,18 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level = solve(maps, views, head_world, spacing_mm, hair, parts)
+    level, cut = solve(maps, views, head_world, spacing_mm, hair, parts)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)
     mesh, measured = refine_vertices(net, views, spacing_mm)
-    measured = without_islands(mesh, measured)
+    capped = cut.distance_mm(mesh.vertices) > -0.5 * spacing_mm
+    measured = without_islands(mesh, replace(measured, views=np.where(capped, 0, measured.views).astype(np.uint8)))
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(mask_warnings(names, contradicted))
     straight = without_bias(mesh, measured.views > 0, bias)
     shell_mm = None if hair is None else shell_deviation_mm(hair, views)
-    return DepthSurface(straight, safe, measured, warnings, shell_mm)
+    return DepthSurface(straight, safe, measured, warnings, capped, shell_mm)
 
 
 @traced
@@ -145,12 +147,12 @@ def finished(
     if votes is not None:
         shown = part_codes(votes, mesh.vertices)
         shares = part_shares(votes if head is None else parts_over_head(votes, head.mesh_world), mesh.vertices)
-    skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
+    skin, hair, moved_mm = shares[:, Part.SKIN.channel], shares[:, Part.HAIR.channel], np.zeros(len(seen))
     if head is not None:
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured))
-    mesh = smooth_hair(mesh, skin, seen)
+    mesh = smooth_hair(mesh, hair, seen, surface.capped)
     if surface.shell_deviation_mm is None:
-        mesh, moved_mm = grown_to_outlines(mesh, shares[:, Part.HAIR.channel], silhouettes, rig)
+        mesh, moved_mm = grown_to_outlines(mesh, hair, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))
     clean = without_coincidences(Mesh(smooth_spots(mesh.vertices, topology, surface.safe_world), mesh.faces))
     mended_mm = np.linalg.norm(clean.vertices - mesh.vertices, axis=1)
@@ -160,6 +162,7 @@ def finished(
     if surface.shell_deviation_mm is not None:
         guessed = ~seen & facing_a_camera(mesh, rig)
         deviation[guessed] = np.minimum(deviation[guessed], surface.shell_deviation_mm)
+    deviation[surface.capped] = MAX_MM
     faults = mesh_faults(mesh.vertices.astype(np.float32).astype(float), topology)
     return BustSurface(mesh, deviation, part, measured.views, surface.warnings, faults)
 

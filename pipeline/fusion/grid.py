@@ -66,6 +66,17 @@ def marked_box(grid: Grid, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "
     return box
 
 
+def at_points(box: Grid, values: Float[np.ndarray, " n"], points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
+    """Returns the values of a whole box's nodes, interpolated linearly at points."""
+    at = np.clip((points - box.corner) / box.step_mm, 0.0, np.array(box.shape) - 1.001)
+    low = at.astype(int)
+    share, total, volume = at - low, np.zeros(len(points)), values.reshape(box.shape)
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, share, 1.0 - share).prod(axis=1)
+        total += weight * volume[tuple((low + corner).T)]
+    return total
+
+
 def _linked(
     corner: Float[np.ndarray, " 3"], step_mm: float, shape: tuple[int, int, int], index: Int32[np.ndarray, "n 3"]
 ) -> Grid:

@@ -52,6 +52,7 @@ FARTHEST_MM = 30.0  # beyond that the outline is something else's
 ABOUT, QUANTILE = 24, 0.35
 NEAREST, EVEN_MM = 8, 8.0  # of them count at a vertex, and the distance within which they count alike
 MIN_PLACES = 2 * ABOUT  # for a measurement
+DENSE = 4  # power of hair's probability: where scalp shows between strands, the surface stays between the two
 ROUNDS, SHARE = 2, 0.7  # the rim of what has been moved is another one: what is still missing is measured again
 STRAND_SHARE = 0.5  # standard deviation of a moved vertex, by its way: strands lie between core and outline
 
@@ -73,17 +74,22 @@ def parts_over_head(votes: PartVotes, head_world: Mesh) -> PartVotes:
 
 
 @traced
-def smooth_hair(mesh_world: Mesh, skin: Float[np.ndarray, " v"], seen: Bool[np.ndarray, " v"]) -> Mesh:
-    """Returns the mesh with its vertices moved to the mean of their surroundings, as far as they are not skin.
+def smooth_hair(
+    mesh_world: Mesh, hair: Float[np.ndarray, " v"], seen: Bool[np.ndarray, " v"], held: Bool[np.ndarray, " v"]
+) -> Mesh:
+    """Returns the mesh with the vertices of hair, and those far from all that is seen, moved to the mean of their
+    surroundings.
 
     Args:
         mesh_world: closed, mm.
-        skin: probability that a vertex shows skin.
+        hair: probability that a vertex shows hair.
         seen: by a view; the others are what is seen next to them.
+        held: vertices that stay.
     """
     beside = neighbours(mesh_world.faces, len(seen))
-    share = skin_share(beside, mesh_world.vertices, skin, seen)
-    share = (share * EDGE_MM / np.maximum(guessed_deviation_mm(mesh_world.vertices, seen), EDGE_MM))[:, None]
+    share = skin_share(beside, mesh_world.vertices, 1.0 - hair, seen)
+    share *= EDGE_MM / np.maximum(guessed_deviation_mm(mesh_world.vertices, seen), EDGE_MM)
+    share = np.where(held, 1.0, share)[:, None]
     area_mm2 = 0.5 * np.linalg.norm(face_normals(mesh_world.vertices, mesh_world.faces), axis=1).sum() / len(seen)
     mean = blurred_over_mesh(mesh_world.vertices, *beside, round(RESOLVED_MM**2 / (STEP_SHARE * area_mm2)))
     return Mesh(share * mesh_world.vertices + (1.0 - share) * mean, mesh_world.faces)
@@ -116,7 +122,7 @@ def grown_to_outlines(
             break
         outwards = np.zeros(len(hair))
         outwards[hair > 0.0] = missing_thickness(mesh.vertices[hair > 0.0], places, missing_mm)
-        way = (SHARE * trust * hair * outwards)[:, None] * mesh.normals()
+        way = (SHARE * trust * hair**DENSE * outwards)[:, None] * mesh.normals()
         smooth = [mean_around(beside, way[:, axis], np.ones(len(way))) for axis in range(3)]
         mesh = Mesh(mesh.vertices + np.stack(smooth, axis=1), mesh.faces)
     return mesh, np.linalg.norm(mesh.vertices - mesh_world.vertices, axis=1)

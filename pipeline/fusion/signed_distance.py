@@ -13,7 +13,7 @@ are inequalities, and the membrane fills holes.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -23,7 +23,8 @@ from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
 from pipeline.fusion.exclusion_kernels import BLOCK, mark_excluded
-from pipeline.fusion.grid import Grid, everywhere, marked_box, refined, whole_box
+from pipeline.fusion.cut import Cut, find_cut
+from pipeline.fusion.grid import Grid, at_points, everywhere, marked_box, refined, whole_box
 from pipeline.fusion.prior import SeenSurface, distance_to_subject
 from pipeline.fusion.relaxation_kernels import Membrane, relax
 from pipeline.fusion.silent_hair import SilentHair, distance_to_shell
@@ -126,6 +127,13 @@ def votes_in_box(box: Grid, views: ViewStack) -> Votes:
     return Votes(value, weight, bound)
 
 
+def ended(votes: Votes, grid: Grid, cut: Cut) -> Votes:
+    """Returns the votes with the end of the bust among the bounds."""
+    reach = REACH * grid.step_mm
+    beyond = np.clip(cut.distance_mm(grid.places()), -reach, reach).astype(np.float32)
+    return replace(votes, bound=np.maximum(votes.bound, beyond))
+
+
 def excluded_by_outlines(box: Grid, views: ViewStack, reach_mm: float) -> Bool[np.ndarray, " n"]:
     """Tells which nodes of a whole box lie in a block that is more than ``reach_mm`` outside two silhouettes."""
     excluded, packed = np.zeros(len(box), bool), views.packed()
@@ -157,7 +165,7 @@ def solve(
     spacing_mm: float,
     hair: SilentHair | None = None,
     parts: PartVotes | None = None,
-) -> Level:
+) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
     fine. ``hair`` is what the depth maps do not show, ``parts`` which part each point shows."""
     halvings = 1
@@ -170,10 +178,11 @@ def solve(
         shown = np.concatenate([seen, hair.places])
         agreed = np.concatenate([agreed, np.full(len(hair.places), VIEWS_SURE)])
     grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
-    votes = votes_in_box(grid, views)
-    known = shown[::THINNED]
+    votes, known = votes_in_box(grid, views), shown[::THINNED]
+    hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
+    votes = ended(votes, grid, cut)
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
-    guess = _prior(grid, votes, head_world, SeenSurface(known, at_points(grid, votes.bound, known), weight))
+    guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight))
     if hair is not None:
         guess = _with_shell(guess, votes, grid, hair, views)
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
@@ -181,10 +190,10 @@ def solve(
     firm = partial(at_points, grid, firmness(grid, level.field, parts))
     for halving in range(halvings):
         wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
-        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, firm)
+        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, firm, cut)
         if halving < halvings - 1:
             box = everywhere(level.grid, level.field, box)
-    return level
+    return level, cut
 
 
 def firmness(grid: Grid, field: Field, parts: PartVotes | None) -> Field:
@@ -204,6 +213,7 @@ def _finer(
     wanted: Bool[np.ndarray, "nx ny nz"],
     views: ViewStack,
     firm: Callable[[Points], Field],
+    cut: Cut,
 ) -> Level:
     """Computes the signed distance at half the step about the ``wanted`` nodes. ``firm`` tells by how much votes count
     at places. The grid is widened while the surface
@@ -211,7 +221,8 @@ def _finer(
     for _ in range(WIDENINGS + 1):
         grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)
-        level = solve_level(grid, votes_at(grid, views), start, FINE_SWEEPS, FINE_FACTOR, firm(grid.places()))
+        votes = ended(votes_at(grid, views), grid, cut)
+        level = solve_level(grid, votes, start, FINE_SWEEPS, FINE_FACTOR, firm(grid.places()))
         if not grid_kernels.crossed_at_rim(level.field, grid.neighbours, grid.outer):
             return level
         wanted = grid_kernels.grown(wanted)
@@ -254,17 +265,6 @@ def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: SilentHair, views:
     reach = REACH * grid.step_mm
     mixed = shown * np.maximum(shell, votes.bound) + (1.0 - shown) * guess
     return np.where(grid.outer | (votes.weight >= WEAK), guess, np.clip(mixed, -reach, reach)).astype(np.float32)
-
-
-def at_points(box: Grid, values: Field, points: Points) -> Float[np.ndarray, " m"]:
-    """Returns the values of a whole box's nodes, interpolated linearly at points."""
-    at = np.clip((points - box.corner) / box.step_mm, 0.0, np.array(box.shape) - 1.001)
-    low = at.astype(int)
-    share, total, volume = at - low, np.zeros(len(points)), values.reshape(box.shape)
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, share, 1.0 - share).prod(axis=1)
-        total += weight * volume[tuple((low + corner).T)]
-    return total
 
 
 def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:

@@ -66,7 +66,6 @@ def vote(
         hull, hull_next = -1e9, -1e9  # largest and second largest distance outside a silhouette
         guess = -1e9  # the largest one with silhouettes that go on, widening, beyond their photographs
         hidden = 1e9  # smallest depth behind a surface that is seen
-        framed, framed_next = 1e9, 1e9  # smallest and second smallest distance outside a photograph
         for v in range(len(cameras)):
             depth, column, row = seen_at(cameras[v], place)
             if depth <= NEAREST_MM:
@@ -75,7 +74,6 @@ def vote(
             at += starts[v]
             scale = depth / cameras[v, LENS]
             edge, off = (PIXEL_STEP * shown[at, FRAME] + beyond) * scale, PIXEL_STEP * shown[at, OUTLINE] * scale
-            framed, framed_next = min(framed, edge), min(framed_next, max(framed, edge))
             guess = max(guess, off - WIDENING * beyond * scale)
             if edge > 0.0:
                 continue
@@ -96,7 +94,6 @@ def vote(
             votes[count] = min(max(before, PLANE_SHARE * (depths[at] - depth)), reach)
             weights[count] = share
             count += 1
-        hull = max(hull, framed_next)
         bound[n] = min(max(hull, -reach), reach)
         value[n], weight[n] = agreed(votes, weights, count, agreement)
         if hull_next > reach:  # whatever views before those two say
