@@ -15,13 +15,14 @@ from pipeline.compute.trace import traced
 from pipeline.fusion.grid import Grid, at_points
 from pipeline.fusion.prior import near_rim
 from pipeline.fusion.view_stack import ViewStack
-from pipeline.fusion.vote_kernels import CENTRE, FRAME, PIXEL_STEP
+from pipeline.fusion.vote_kernels import CENTRE, FRAME, OUTLINE, PIXEL_STEP
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.projection_kernels import LENS
 from rig.mesh import Mesh
 
-ROUND_MM = 20.0  # standard deviation of the blur that rounds the edges between photographs' ends
-INSET_MM = 3.0  # from the photographs' ends: windows that reach over them match badly
+ROUND_MM = 12.0  # standard deviation of the blur that rounds the edges between photographs' ends
+INSET_MM = 5.0  # from the ends of masks: windows reach over them
+FACING_DOWN = 0.7
 FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
 BEHIND_QUANTILE = 0.99  # of seen points: single ones lie anywhere
@@ -50,30 +51,41 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
         seen: points of the surface that is seen, world frame, mm.
         head_world: the fitted head; without it nothing is cut behind the subject.
     """
-    from scipy.ndimage import gaussian_filter  # 0.05 s, and only a bust needs it
-
     places = box.places()
-    frames = gaussian_filter(outside_photographs(places, views).reshape(box.shape), ROUND_MM / box.step_mm)
-    beyond = frames.ravel() + INSET_MM
-    towards = views.cameras[:, CENTRE:] - np.median(seen, axis=0)
-    back = -(towards / np.linalg.norm(towards, axis=1, keepdims=True)).mean(axis=0)
-    if head_world is None or np.linalg.norm(back) < ONE_SIDED:
+    photographs, outlines = (rounded(each, box) for each in outside_views(places, views))
+    beyond = photographs.ravel()
+    if head_world is None:
         return Cut(box, beyond)
-    back /= np.linalg.norm(back)
     vertices = head_world.vertices[::EVERY]
     tree, low = PointTree.of(vertices), near_rim(head_world, vertices)
-    below = low[nearest(tree, seen)[1]]
-    if not low.any() or not below.any():
+    below, under = low[nearest(tree, seen)[1]], low[nearest(tree, places)[1]]
+    if not below.any():
         return Cut(box, beyond)
-    end = max(float(np.quantile(seen[below] @ back, BEHIND_QUANTILE)), float((vertices[low] @ back).max()))
-    under = low[nearest(tree, places)[1]]
-    return Cut(box, np.where(under, np.maximum(beyond, places @ back - end), beyond))
+    down = vertices[low].mean(axis=0) - vertices.mean(axis=0)
+    slope = np.tensordot(down / np.linalg.norm(down), np.gradient(outlines, box.step_mm), axes=1).ravel()
+    base = under & (slope > FACING_DOWN)
+    beyond[base] = np.maximum(beyond[base], outlines.ravel()[base] + INSET_MM)
+    towards = views.cameras[:, CENTRE:] - np.median(seen, axis=0)
+    back = -(towards / np.linalg.norm(towards, axis=1, keepdims=True)).mean(axis=0)
+    if np.linalg.norm(back) > ONE_SIDED:
+        back /= np.linalg.norm(back)
+        end = max(np.quantile(seen[below] @ back, BEHIND_QUANTILE), (vertices[low] @ back).max())
+        beyond[under] = np.maximum(beyond[under], places[under] @ back - end)
+    return Cut(box, beyond)
 
 
-def outside_photographs(places: Float[np.ndarray, "n 3"], views: ViewStack) -> Float[np.ndarray, " n"]:
-    """Returns how far (mm, negative inside) points lie outside the photographs of all cameras but one."""
+def rounded(field: Float[np.ndarray, " n"], box: Grid) -> Float[np.ndarray, "nx ny nz"]:
+    """Returns a field over a whole box with its edges rounded."""
+    from scipy.ndimage import gaussian_filter  # 0.05 s, and only a bust needs it
 
-    def outside(view: int) -> Float[np.ndarray, " n"]:
+    return gaussian_filter(field.reshape(box.shape), ROUND_MM / box.step_mm)
+
+
+def outside_views(places: Float[np.ndarray, "n 3"], views: ViewStack) -> Float[np.ndarray, "2 n"]:
+    """Returns how far (mm, negative inside) points lie outside the photographs of all cameras but one, and outside the
+    silhouettes of at least two."""
+
+    def outside(view: int) -> Float[np.ndarray, "2 n"]:
         camera, size = views.cameras[view], views.sizes[view][::-1]
         x, y, z = camera[:9].reshape(3, 3) @ places.T + camera[9:12, None]
         fx, fy, cx, cy = camera[LENS : LENS + 4]
@@ -81,9 +93,14 @@ def outside_photographs(places: Float[np.ndarray, "n 3"], views: ViewStack) -> F
         pixel = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=1)
         within = np.clip(pixel, 0, size - 1.0)
         column, row = (within + 0.5).astype(int).T
-        edge = PIXEL_STEP * views.shown[views.starts[view] + row * size[0] + column, FRAME]
-        return np.where(z > 1.0, (edge + np.linalg.norm(pixel - within, axis=1)) * depth / fx, FAR_MM)
+        shown = PIXEL_STEP * views.shown[views.starts[view] + row * size[0] + column]
+        edge = np.where(z > 1.0, (shown[:, FRAME] + np.linalg.norm(pixel - within, axis=1)) * depth / fx, FAR_MM)
+        return np.stack([edge, np.where(edge > 0.0, -FAR_MM, shown[:, OUTLINE] * depth / fx)])
 
-    edges = np.stack(map_in_threads(outside, len(views.cameras)))
-    second = np.partition(edges, min(1, len(edges) - 1), axis=0)[min(1, len(edges) - 1)]
-    return np.clip(second, -FAR_MM, FAR_MM)
+    each = np.stack(map_in_threads(outside, len(views.cameras)))
+    second = min(1, len(each) - 1)
+    photographs, outlines = (
+        np.partition(each[:, 0], second, axis=0)[second],
+        np.partition(each[:, 1], -1 - second, axis=0)[-1 - second],
+    )
+    return np.clip([photographs, outlines], -FAR_MM, FAR_MM)

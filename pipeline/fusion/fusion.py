@@ -38,6 +38,7 @@ from rig.progress import Progress
 from rig.rig import Rig
 
 TURNED_TO = 0.01  # steps from the surface at which a node that is turned over lies
+CAP_STEPS = 0.5  # from the bust's end within which a vertex belongs to its cap
 MIN_VIEWS = 3
 HEAD_STRIDE = 7  # every seventh vertex of the fitted head says which piece is the subject
 CONTRADICTED_TIMES, CONTRADICTED_SOFT = 3.0, 0.03  # of the views' median, and at most: soft masks that other programs
@@ -73,6 +74,7 @@ class DepthSurface:
     measured: Measured
     warnings: tuple[ReportWarning, ...]
     capped: Bool[np.ndarray, " v"]  # vertices of the cut that ends the bust
+    scatter: float  # how far (0 to 1) the depth of hair is noise
     shell_deviation_mm: float | None = None  # of hair that is a guess inside its outlines; None without such hair
 
 
@@ -87,6 +89,7 @@ def fuse(
     report: Progress,
     hair: SilentHair | None = None,
     parts: PartVotes | None = None,
+    scatter: float = 0.0,
 ) -> DepthSurface:
     """Fuses the depth maps to one closed surface.
 
@@ -100,6 +103,7 @@ def fuse(
         report: called with the stage's progress.
         hair: of which the depth maps say nothing; None if there is none.
         parts: which part each point shows (``parts_over_head``); None counts all as skin.
+        scatter: how far (0 to 1) the depth of hair is noise.
 
     Raises:
         NoSurface: fewer than three views have any depth, or they contradict each other.
@@ -107,20 +111,21 @@ def fuse(
     maps = [depth_map for depth_map in depth_maps if depth_map.known.any()]
     if len(maps) < MIN_VIEWS:
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
-    views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
+    whole = stack_views(maps, silhouettes, rig)
+    views, contradicted = silence_contradicted(whole)
     report("bust", 0.1)
-    level, cut = solve(maps, views, head_world, spacing_mm, hair, parts)
+    level, cut = solve(maps, views, whole, head_world, spacing_mm, hair, parts, scatter)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)
     mesh, measured = refine_vertices(net, views, spacing_mm)
-    capped = cut.distance_mm(mesh.vertices) > -0.5 * spacing_mm
+    capped = cut.distance_mm(mesh.vertices) > -CAP_STEPS * spacing_mm
     measured = without_islands(mesh, replace(measured, views=np.where(capped, 0, measured.views).astype(np.uint8)))
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(mask_warnings(names, contradicted))
     straight = without_bias(mesh, measured.views > 0, bias)
     shell_mm = None if hair is None else shell_deviation_mm(hair, views)
-    return DepthSurface(straight, safe, measured, warnings, capped, shell_mm)
+    return DepthSurface(straight, safe, measured, warnings, capped, scatter, shell_mm)
 
 
 @traced
@@ -150,7 +155,7 @@ def finished(
     skin, hair, moved_mm = shares[:, Part.SKIN.channel], shares[:, Part.HAIR.channel], np.zeros(len(seen))
     if head is not None:
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured))
-    mesh = smooth_hair(mesh, hair, seen, surface.capped)
+    mesh = smooth_hair(mesh, surface.scatter * hair, seen, surface.capped)
     if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, hair, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))

@@ -22,8 +22,8 @@ from jaxtyping import Bool, Float, Float32, Int32
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
-from pipeline.fusion.exclusion_kernels import BLOCK, mark_excluded
 from pipeline.fusion.cut import Cut, find_cut
+from pipeline.fusion.exclusion_kernels import BLOCK, mark_excluded
 from pipeline.fusion.grid import Grid, at_points, everywhere, marked_box, refined, whole_box
 from pipeline.fusion.prior import SeenSurface, distance_to_subject
 from pipeline.fusion.relaxation_kernels import Membrane, relax
@@ -161,13 +161,16 @@ def _votes(index: Int32[np.ndarray, "n 3"], corner: Float[np.ndarray, " 3"], ste
 def solve(
     depth_maps: Sequence[DepthMap],
     views: ViewStack,
+    whole: ViewStack,
     head_world: Mesh | None,
     spacing_mm: float,
     hair: SilentHair | None = None,
     parts: PartVotes | None = None,
+    scatter: float = 0.0,
 ) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
-    fine. ``hair`` is what the depth maps do not show, ``parts`` which part each point shows."""
+    fine. ``hair`` is what the depth maps do not show, ``parts`` which part each point shows, ``scatter`` how far (0 to
+    1) depth of hair is noise."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
@@ -179,7 +182,7 @@ def solve(
         agreed = np.concatenate([agreed, np.full(len(hair.places), VIEWS_SURE)])
     grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
     votes, known = votes_in_box(grid, views), shown[::THINNED]
-    hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
+    hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, whole, known, head_world)
     votes = ended(votes, grid, cut)
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
     guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight))
@@ -187,7 +190,7 @@ def solve(
         guess = _with_shell(guess, votes, grid, hair, views)
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
-    firm = partial(at_points, grid, firmness(grid, level.field, parts))
+    firm = partial(at_points, grid, firmness(grid, level.field, parts, scatter))
     for halving in range(halvings):
         wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
         level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, firm, cut)
@@ -196,14 +199,14 @@ def solve(
     return level, cut
 
 
-def firmness(grid: Grid, field: Field, parts: PartVotes | None) -> Field:
+def firmness(grid: Grid, field: Field, parts: PartVotes | None, scatter: float) -> Field:
     """Returns by how much each vote counts at the nodes of a whole box, from the parts about its surface: 1, and
     ``SCATTERED_WEIGHT`` in hair."""
     out = np.ones(len(grid), np.float32)
-    if parts is not None:
+    if parts is not None and scatter > 0.0:
         near = np.flatnonzero(np.abs(field) < REACH * grid.step_mm)
         hair = part_shares(parts, grid.places(near))[:, Part.HAIR.channel]
-        out[near] -= (1.0 - SCATTERED_WEIGHT) * hair
+        out[near] -= scatter * (1.0 - SCATTERED_WEIGHT) * hair
     return out
 
 

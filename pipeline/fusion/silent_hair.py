@@ -30,6 +30,7 @@ from rig.rig import Rig
 # Share of the pixels of hair with a known depth, below which hair is silent: 0.25 of long strands, 0.53 of short ones
 # and a beard, 0.82 and 0.84 of solid hair.
 SILENT_SHARE = 0.4
+SCATTERED_SHARE = (0.8, 0.7)  # the same, below which what is known scatters, and scatters wholly
 MIN_HAIR = 0.2  # of what is not clothes; with less, hair is not worth it
 LIKELY = 0.5  # probability from which on a place counts as a part
 # Share of the pixels about one whose depth must be known, for skin and for clothes to count. Specks amid hair are
@@ -55,7 +56,7 @@ class SilentHair:
 
 @traced
 def find_silent_hair(
-    depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig
+    depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig, known: float
 ) -> tuple[SilentHair | None, Sequence[DepthMap]]:
     """Tells whether the subject has long hair of which the photographs hardly show the depth.
 
@@ -64,11 +65,12 @@ def find_silent_hair(
         parts: the part maps by camera, in pixels of the photographs.
         votes: which part each point of the depth maps shows (``parts_over_head``); without it there is no such hair.
         rig: the cameras as calibrated, world frame.
+        known: share of the hair's pixels with a known depth (``known_share``).
 
     Returns:
         The hair and the depth maps without what they say of it, or None and the same depth maps.
     """
-    if votes is None or known_share(depth_maps, parts, rig) >= SILENT_SHARE:
+    if votes is None or known >= SILENT_SHARE:
         return None, depth_maps
 
     def split(depth_map: DepthMap) -> tuple[Float[np.ndarray, "n 3"], DepthMap]:
@@ -128,6 +130,11 @@ def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], ri
     counts = map_in_threads(lambda k: count(depth_maps[k]), len(depth_maps))
     known, hair, body = np.sum([np.zeros(3), *counts], axis=0)
     return 1.0 if hair <= MIN_HAIR * body else float(known / hair)
+
+
+def scatter_of(known: float) -> float:
+    """Returns how far (0 to 1) the depth of hair is noise, from the share of its pixels with a known depth."""
+    return float(np.clip((SCATTERED_SHARE[0] - known) / (SCATTERED_SHARE[0] - SCATTERED_SHARE[1]), 0.0, 1.0))
 
 
 def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float32[np.ndarray, "h w"]:

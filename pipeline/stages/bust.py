@@ -9,7 +9,7 @@ from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
 from pipeline.fusion.hair import parts_over_head
 from pipeline.fusion.signed_distance import NoSurface
-from pipeline.fusion.silent_hair import find_silent_hair
+from pipeline.fusion.silent_hair import find_silent_hair, known_share, scatter_of
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.raster import depth_maps
@@ -75,7 +75,8 @@ def fuse_depth(
     if settings.outputs.surface == "head":
         return Staged(None)
     parts = None if depth.votes is None else parts_over_head(depth.votes, head_world)
-    hair, maps = find_silent_hair(depth.maps, labels.maps, parts, context.rig)
+    known = known_share(depth.maps, labels.maps, context.rig)
+    hair, maps = find_silent_hair(depth.maps, labels.maps, parts, context.rig, known)
     try:
         surface = fuse(
             maps,
@@ -87,6 +88,7 @@ def fuse_depth(
             report=context.progress,
             hair=hair,
             parts=parts,
+            scatter=scatter_of(known),
         )
     except NoSurface as reason:
         return Staged(None, [compose("no-bust", reason=reason.message)])
