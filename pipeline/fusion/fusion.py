@@ -111,10 +111,9 @@ def fuse(
     maps = [depth_map for depth_map in depth_maps if depth_map.known.any()]
     if len(maps) < MIN_VIEWS:
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
-    whole = stack_views(maps, silhouettes, rig)
-    views, contradicted = silence_contradicted(whole)
+    views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level, cut = solve(maps, views, whole, head_world, spacing_mm, hair, parts, scatter)
+    level, cut = solve(maps, views, head_world, spacing_mm, hair, parts, scatter)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)

@@ -161,7 +161,6 @@ def _votes(index: Int32[np.ndarray, "n 3"], corner: Float[np.ndarray, " 3"], ste
 def solve(
     depth_maps: Sequence[DepthMap],
     views: ViewStack,
-    whole: ViewStack,
     head_world: Mesh | None,
     spacing_mm: float,
     hair: SilentHair | None = None,
@@ -182,7 +181,7 @@ def solve(
         agreed = np.concatenate([agreed, np.full(len(hair.places), VIEWS_SURE)])
     grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
     votes, known = votes_in_box(grid, views), shown[::THINNED]
-    hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, whole, known, head_world)
+    hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
     votes = ended(votes, grid, cut)
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
     guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight))
@@ -196,6 +195,7 @@ def solve(
         level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, firm, cut)
         if halving < halvings - 1:
             box = everywhere(level.grid, level.field, box)
+            cut = cut.without_rags(level.grid, box)
     return level, cut
 
 
