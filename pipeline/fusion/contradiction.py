@@ -45,7 +45,7 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
     for start, mask in zip(views.starts, wrong, strict=True):
         if mask is not None:
             shown[start : start + mask.size, OUTLINE][mask.ravel()] = SILENT_PX / PIXEL_STEP
-    return replace(views, shown=shown, steady=shares == 0.0), shares
+    return replace(views, shown=shown), shares
 
 
 def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -23,7 +23,7 @@ from rig.mesh import Mesh
 
 ROUND_MM = 12.0  # standard deviation of the blur that rounds the edges between photographs' ends
 THIN_MM, SPARED_MM = 6.0, 4.0  # radius, and by how much more a place must stand out: a step of the grid is no rag
-BASE_QUANTILE = 0.7
+BASE_QUANTILE = 0.7  # of the seen points below the head, by height: what lies lower is the base
 FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
 BEHIND_QUANTILE = 0.99  # of seen points: single ones lie anywhere
@@ -36,7 +36,7 @@ class Cut:
 
     box: Grid
     beyond_mm: Float[np.ndarray, " n"]
-    base: Bool[np.ndarray, " n"]  # nodes in the lower half of what is below the head
+    base: Bool[np.ndarray, " n"]  # nodes in the lowest part of what is seen below the head
 
     def distance_mm(self, places: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
         """Returns how far (mm, negative inside) points lie beyond the bust's end."""
@@ -48,7 +48,8 @@ class Cut:
         over the whole of ``box``."""
         from scipy.ndimage import distance_transform_edt, gaussian_filter  # 0.3 s, and only a bust needs it
 
-        beyond, base = (doubled(each.astype(np.float32).reshape(self.box.shape)) for each in (self.beyond_mm, self.base))
+        shape = self.box.shape
+        beyond, base = (doubled(each.astype(np.float32).reshape(shape)) for each in (self.beyond_mm, self.base))
         core = np.asarray(distance_transform_edt(field < 0.0)) > THIN_MM / box.step_mm
         thin = gaussian_filter(box.step_mm * np.asarray(distance_transform_edt(~core)), 1.0) - THIN_MM - SPARED_MM
         return Cut(box, np.where(base > 0.5, np.maximum(beyond, thin), beyond).ravel(), base.ravel() > 0.5)
@@ -62,18 +63,19 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
         box: a whole box of nodes.
         views: the cameras and their photographs' edges.
         seen: points of the surface that is seen, world frame, mm.
-        head_world: the fitted head; without it nothing is cut behind the subject.
+        head_world: the fitted head; without it only photographs' ends count.
     """
+    from scipy.ndimage import gaussian_filter  # 0.05 s, and only a bust needs it
+
     places = box.places()
-    beyond = rounded(outside_photographs(places, views), box).ravel()
-    nowhere = np.zeros(len(beyond), bool)
-    if head_world is None:
-        return Cut(box, beyond, nowhere)
-    vertices = head_world.vertices[::EVERY]
-    tree, low = PointTree.of(vertices), near_rim(head_world, vertices)
+    photographs = outside_photographs(places, views).reshape(box.shape)
+    beyond, low = gaussian_filter(photographs, ROUND_MM / box.step_mm).ravel(), np.zeros(0, bool)
+    if head_world is not None:
+        vertices = head_world.vertices[::EVERY]
+        tree, low = PointTree.of(vertices), near_rim(head_world, vertices)
+    if not low.any() or not low[nearest(tree, seen)[1]].any():
+        return Cut(box, beyond, np.zeros(len(beyond), bool))
     below, under = low[nearest(tree, seen)[1]], low[nearest(tree, places)[1]]
-    if not below.any():
-        return Cut(box, beyond, nowhere)
     down = vertices[low].mean(axis=0) - vertices.mean(axis=0)
     base = under & (places @ down > np.quantile(seen[below] @ down, BASE_QUANTILE))
     towards = views.cameras[:, CENTRE:] - np.median(seen, axis=0)
@@ -83,13 +85,6 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
         end = max(np.quantile(seen[below] @ back, BEHIND_QUANTILE), (vertices[low] @ back).max())
         beyond[under] = np.maximum(beyond[under], places[under] @ back - end)
     return Cut(box, beyond, base)
-
-
-def rounded(field: Float[np.ndarray, " n"], box: Grid) -> Float[np.ndarray, "nx ny nz"]:
-    """Returns a field over a whole box with its edges rounded."""
-    from scipy.ndimage import gaussian_filter  # 0.05 s, and only a bust needs it
-
-    return gaussian_filter(field.reshape(box.shape), ROUND_MM / box.step_mm)
 
 
 def outside_photographs(places: Float[np.ndarray, "n 3"], views: ViewStack) -> Float[np.ndarray, " n"]:

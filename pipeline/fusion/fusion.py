@@ -15,12 +15,18 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences
-from pipeline.fusion.hair import STRAND_SHARE, grown_to_outlines, parts_over_head, smooth_hair
+from pipeline.fusion.hair import (
+    STRAND_SHARE,
+    SilentHair,
+    grown_to_outlines,
+    parts_over_head,
+    shell_deviation_mm,
+    smooth_hair,
+)
 from pipeline.fusion.net_kernels import component_of, compose_well
 from pipeline.fusion.quality import MAX_MM, deviation_mm, seen_deviation_mm, without_islands
 from pipeline.fusion.refinement import Measured, refine_vertices
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
-from pipeline.fusion.silent_hair import SilentHair, shell_deviation_mm
 from pipeline.fusion.skin import HeadSkin, combine_with_head
 from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, smooth_spots, topology_of
 from pipeline.fusion.view_stack import stack_views
@@ -113,7 +119,7 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level, cut = solve(maps, views, head_world, spacing_mm, hair, parts, scatter)
+    level, cut = solve(maps, views, head_world, spacing_mm, hair, parts if scatter > 0.0 else None)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)

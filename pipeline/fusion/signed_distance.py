@@ -17,17 +17,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
 from pipeline.fusion.cut import Cut, find_cut
-from pipeline.fusion.exclusion_kernels import BLOCK, mark_excluded
 from pipeline.fusion.grid import Grid, at_points, everywhere, marked_box, refined, whole_box
+from pipeline.fusion.hair import SilentHair, distance_to_shell
 from pipeline.fusion.prior import SeenSurface, distance_to_subject
 from pipeline.fusion.relaxation_kernels import Membrane, relax
-from pipeline.fusion.silent_hair import SilentHair, distance_to_shell
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE, ViewStack
 from pipeline.fusion.vote_kernels import vote
 from pipeline.part_labels.codes import Part
@@ -113,17 +112,15 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
 
 def votes_at(grid: Grid, views: ViewStack) -> Votes:
     """Combines the views at every node of the grid."""
-    return _votes(grid.index, grid.corner, grid.step_mm, views)
+    step = grid.step_mm
+    value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
+    limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
+    packed = views.packed()
 
+    def fill(first: int, last: int) -> None:
+        vote(grid.index, grid.corner, step, packed, limits, value, weight, bound, first, last)
 
-def votes_in_box(box: Grid, views: ViewStack) -> Votes:
-    """Combines the views at every node of a whole box. Blocks of nodes that two silhouettes exclude by more than the
-    reach of a vote are decided at once: that is most of a box."""
-    reach = REACH * box.step_mm
-    near = np.flatnonzero(~excluded_by_outlines(box, views, reach))
-    votes = _votes(box.index[near], box.corner, box.step_mm, views)
-    value, weight, bound = (np.full(len(box), at, np.float32) for at in (reach, 0.0, reach))
-    value[near], weight[near], bound[near] = votes.value, votes.weight, votes.bound
+    in_threads(len(grid), fill)
     return Votes(value, weight, bound)
 
 
@@ -134,29 +131,6 @@ def ended(votes: Votes, grid: Grid, cut: Cut) -> Votes:
     return replace(votes, bound=np.maximum(votes.bound, beyond))
 
 
-def excluded_by_outlines(box: Grid, views: ViewStack, reach_mm: float) -> Bool[np.ndarray, " n"]:
-    """Tells which nodes of a whole box lie in a block that is more than ``reach_mm`` outside two silhouettes."""
-    excluded, packed = np.zeros(len(box), bool), views.packed()
-
-    def mark(first: int, last: int) -> None:
-        mark_excluded(box.shape, box.corner, box.step_mm, packed, views.steady, reach_mm, excluded, first, last)
-
-    in_threads(-(-box.shape[0] // BLOCK), mark)
-    return excluded
-
-
-def _votes(index: Int32[np.ndarray, "n 3"], corner: Float[np.ndarray, " 3"], step: float, views: ViewStack) -> Votes:
-    value, weight, bound = (np.zeros(len(index), np.float32) for _ in range(3))
-    limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
-    packed = views.packed()
-
-    def fill(first: int, last: int) -> None:
-        vote(index, corner, step, packed, limits, value, weight, bound, first, last)
-
-    in_threads(len(index), fill)
-    return Votes(value, weight, bound)
-
-
 @traced
 def solve(
     depth_maps: Sequence[DepthMap],
@@ -165,11 +139,10 @@ def solve(
     spacing_mm: float,
     hair: SilentHair | None = None,
     parts: PartVotes | None = None,
-    scatter: float = 0.0,
 ) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
-    fine. ``hair`` is what the depth maps do not show, ``parts`` which part each point shows, ``scatter`` how far (0 to
-    1) depth of hair is noise."""
+    fine. ``hair`` is what the depth maps do not show, ``parts`` which part each point shows where
+    depth of hair is noise."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
@@ -180,7 +153,7 @@ def solve(
         shown = np.concatenate([seen, hair.places])
         agreed = np.concatenate([agreed, np.full(len(hair.places), VIEWS_SURE)])
     grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
-    votes, known = votes_in_box(grid, views), shown[::THINNED]
+    votes, known = votes_at(grid, views), shown[::THINNED]
     hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
     votes = ended(votes, grid, cut)
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
@@ -189,7 +162,7 @@ def solve(
         guess = _with_shell(guess, votes, grid, hair, views)
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
-    firm = partial(at_points, grid, firmness(grid, level.field, parts, scatter))
+    firm = partial(at_points, grid, firmness(grid, level.field, parts))
     for halving in range(halvings):
         wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
         level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, firm, cut)
@@ -199,14 +172,14 @@ def solve(
     return level, cut
 
 
-def firmness(grid: Grid, field: Field, parts: PartVotes | None, scatter: float) -> Field:
+def firmness(grid: Grid, field: Field, parts: PartVotes | None) -> Field:
     """Returns by how much each vote counts at the nodes of a whole box, from the parts about its surface: 1, and
     ``SCATTERED_WEIGHT`` in hair."""
     out = np.ones(len(grid), np.float32)
-    if parts is not None and scatter > 0.0:
+    if parts is not None:
         near = np.flatnonzero(np.abs(field) < REACH * grid.step_mm)
         hair = part_shares(parts, grid.places(near))[:, Part.HAIR.channel]
-        out[near] -= scatter * (1.0 - SCATTERED_WEIGHT) * hair
+        out[near] -= (1.0 - SCATTERED_WEIGHT) * hair
     return out
 
 
@@ -219,8 +192,8 @@ def _finer(
     cut: Cut,
 ) -> Level:
     """Computes the signed distance at half the step about the ``wanted`` nodes. ``firm`` tells by how much votes count
-    at places. The grid is widened while the surface
-    would leave it; raises NoSurface if it still does after ``WIDENINGS``."""
+    at places, ``cut`` where the bust ends. The grid is widened while the surface would leave it; raises NoSurface if it
+    still does after ``WIDENINGS``."""
     for _ in range(WIDENINGS + 1):
         grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int16, Int64
+from jaxtyping import Float, Float32, Int16, Int64
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.fusion.view_stack_kernels import write_outline
@@ -27,8 +27,7 @@ class ViewStack:
     ``cameras`` has a row for each view: rotation (9), translation (3), fx fy cx cy, and the centre in the world frame
     (3). ``shown`` has a row for each pixel, in the steps of ``vote_kernels``: normal (3, world frame, towards the
     camera), standard deviation of the depth, and signed distances (negative inside) to the silhouette's contour and to
-    the edge of the photograph. With the depth these are 16 bytes a pixel. ``steady`` tells of which views the distance
-    to the contour changes by no more than the way from pixel to pixel.
+    the edge of the photograph. With the depth these are 16 bytes a pixel.
     """
 
     cameras: Float[np.ndarray, "k 19"]
@@ -36,7 +35,6 @@ class ViewStack:
     starts: Int64[np.ndarray, " k"]
     depth_mm: Float32[np.ndarray, " p"]  # 0 where nothing is known
     shown: Int16[np.ndarray, "p 6"]
-    steady: Bool[np.ndarray, " k"]
 
     def packed(self) -> Pixels:
         """Returns the same arrays as a named tuple that compiled loops accept."""
@@ -67,7 +65,7 @@ def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhou
 
     map_in_threads(fill, len(depth_maps))
     cameras = np.stack([_packed(depth_map.camera) for depth_map in depth_maps])
-    return ViewStack(cameras, sizes, starts[:-1], depth_mm, shown, np.ones(len(depth_maps), bool))
+    return ViewStack(cameras, sizes, starts[:-1], depth_mm, shown)
 
 
 def _packed(camera: Camera) -> Float[np.ndarray, " 19"]:

@@ -7,9 +7,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
-from pipeline.fusion.hair import parts_over_head
+from pipeline.fusion.hair import find_silent_hair, known_share, parts_over_head, scatter_of
 from pipeline.fusion.signed_distance import NoSurface
-from pipeline.fusion.silent_hair import find_silent_hair, known_share, scatter_of
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.raster import depth_maps

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from pipeline.fusion.fusion import finished, fuse
-from pipeline.fusion.silent_hair import SilentHair, distance_to_hull, find_silent_hair, local_share, only_where
+from pipeline.fusion.hair import SilentHair, distance_to_hull, find_silent_hair, local_share, only_where
 from pipeline.fusion.view_stack import stack_views
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
