@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
@@ -31,13 +31,12 @@ from pipeline.fusion.skin import mean_around, skin_share
 from pipeline.fusion.view_stack import ViewStack
 from pipeline.fusion.vote_kernels import CENTRE, FRAME, OUTLINE, PIXEL_STEP
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.projection import project_points
 from pipeline.geometry.projection_kernels import LENS
 from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
-from pipeline.part_labels.votes import PartVotes, part_shares
+from pipeline.part_labels.votes import PartVotes, part_shares, parts_shown
 from pipeline.stereo.depth_map import DepthMap, placing, points_world
 from rig.camera import Camera
 from rig.mesh import Mesh, face_normals
@@ -141,28 +140,24 @@ def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
     )
 
 
-def shown_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> UInt8[np.ndarray, "r c 3"]:
-    """Returns the probabilities (255ths) of skin, hair and clothes at every ``PIXEL_EVERY``-th pixel of a crop, in
-    either direction; 0 where there is no part map."""
+def shown_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float[np.ndarray, "r c 3"]:
+    """Returns the probabilities of skin, hair and clothes at every ``PIXEL_EVERY``-th pixel of a crop, in either
+    direction; 0 where there is no part map."""
     (fx, fy, cx, cy), turn, shift = placing(depth_map.camera)
     height, width = depth_map.depth_mm.shape
     row, column = np.mgrid[:height:PIXEL_EVERY, :width:PIXEL_EVERY]
-    out = np.zeros((row.size, 3), np.uint8)
-    if depth_map.camera.name in parts:
-        shown = parts[depth_map.camera.name].of_255
-        rays = np.stack([(column.ravel() - cx) / fx, (row.ravel() - cy) / fy, np.ones(row.size)], axis=1)
-        pixels = np.rint(project_points(rig[depth_map.camera.name], FAR_MM * rays @ turn.T + shift))
-        framed = ((pixels >= 0) & (pixels < shown.shape[1::-1])).all(axis=1)
-        at = pixels[framed].astype(int)
-        out[framed] = shown[at[:, 1], at[:, 0]]
-    return out.reshape(*row.shape, 3)
+    if depth_map.camera.name not in parts:
+        return np.zeros((*row.shape, 3))
+    rays = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(row.shape)], axis=-1).reshape(-1, 3)
+    shown = parts_shown(FAR_MM * rays @ turn.T + shift, parts[depth_map.camera.name], rig)
+    return shown.reshape(*row.shape, 3)
 
 
 def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig: Rig) -> float:
     """Returns the share of the pixels of hair whose depth is known; 1 where there is hardly any hair."""
 
     def count(depth_map: DepthMap) -> Float[np.ndarray, " 3"]:
-        skin, hair, _ = np.moveaxis(shown_parts(depth_map, parts, rig) > 255 * LIKELY, 2, 0)
+        skin, hair, _ = np.moveaxis(shown_parts(depth_map, parts, rig) > LIKELY, 2, 0)
         known = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY]
         return np.array([(hair & known).sum(), hair.sum(), (hair | skin).sum()], float)
 
@@ -178,7 +173,7 @@ def scatter_of(known: float) -> float:
 
 def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float32[np.ndarray, "h w"]:
     """Returns, for each pixel of a crop, the share of the subject's pixels about it whose depth is known."""
-    body = (shown_parts(depth_map, parts, rig).sum(axis=2) > 255 * LIKELY).astype(np.float32)
+    body = (shown_parts(depth_map, parts, rig).sum(axis=2) > LIKELY).astype(np.float32)
     known = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY] * body
     distance_mm = float(np.median(depth_map.depth_mm[depth_map.known])) if depth_map.known.any() else FAR_MM
     side = max(3, round(WINDOW_MM * depth_map.camera.intrinsics.fx / (PIXEL_EVERY * distance_mm)))

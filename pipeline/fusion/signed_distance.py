@@ -56,7 +56,6 @@ EVERY = 7  # known pixel is used to tell where a surface may be
 THINNED = 10  # of these tell how far the surface lies from head and hull
 WIDENINGS = 4  # of a grid by one coarse step
 STRAYS = 0.1  # per cent of these that may lie outside of the box
-HORN_MM, AWAY_MM = 30.0, 20.0  # radius of what a guess must hold, and how far from all that is seen it must
 UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
 
 
@@ -231,7 +230,7 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface)
         guess = distance_to_subject(places, hull, head_world, seen)
         prior[guessed] = np.where(weak[guessed] & np.isneginf(guess), prior[guessed], np.maximum(hull, guess))
     prior[grid.outer] = REACH * grid.step_mm
-    return without_horns(prior, votes, grid).astype(np.float32)
+    return prior.astype(np.float32)
 
 
 def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: SilentHair, views: ViewStack) -> Field:
@@ -241,19 +240,6 @@ def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: SilentHair, views:
     reach = REACH * grid.step_mm
     mixed = shown * np.maximum(shell, votes.bound) + (1.0 - shown) * guess
     return np.where(grid.outer | (votes.weight >= WEAK), guess, np.clip(mixed, -reach, reach)).astype(np.float32)
-
-
-def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
-    """Removes thin fins and horns, into which no ball of radius ``HORN_MM`` fits, from the signed distance ``guess``
-    (mm, negative inside) on a whole box. They arise where no silhouette limits how far the subject may extend along the
-    lines of sight. Within ``AWAY_MM`` of points that a view sees, the guess is kept."""
-    from scipy.ndimage import distance_transform_edt  # 0.05 s, and only a bust needs it
-
-    radius = HORN_MM / grid.step_mm
-    core = np.asarray(distance_transform_edt((guess < 0).reshape(grid.shape))) > radius
-    filled = np.asarray(distance_transform_edt(~core)) <= radius
-    away = np.asarray(distance_transform_edt((votes.weight <= 0).reshape(grid.shape))) > AWAY_MM / grid.step_mm
-    return np.where((away & ~filled).ravel(), np.maximum(guess, 0.5 * grid.step_mm), guess)
 
 
 def _near_points(grid: Grid, points: Points) -> Bool[np.ndarray, "nx ny nz"]:

@@ -54,7 +54,7 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
 
     def cloud(k: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         points = points_world(voting[k])
-        return points, _shown(points, parts[voting[k].camera.name], rig)
+        return points, parts_shown(points, parts[voting[k].camera.name], rig)
 
     points, shown = (np.concatenate(part) for part in zip(*map_in_threads(cloud, len(voting)), strict=True))
     corner = points.min(axis=0)
@@ -72,7 +72,8 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
     return PartVotes(corner, size, keys, mean(points), mean(shown))
 
 
-def _shown(points: Float[np.ndarray, "n 3"], part: PartMap, rig: Rig) -> Float[np.ndarray, "n 3"]:
+def parts_shown(points: Float[np.ndarray, "n 3"], part: PartMap, rig: Rig) -> Float[np.ndarray, "n 3"]:
+    """Returns the probabilities that a photograph shows at points (world, mm); 0 outside of it."""
     height, width = part.of_255.shape[:2]
     column, row = np.rint(np.nan_to_num(project_points(rig[part.camera], points), nan=-1.0)).astype(int).T
     framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
