@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
-from pipeline.fusion.contradiction_kernels import BLOCK, mark_contradicted
 from pipeline.fusion.view_stack import ViewStack
+from pipeline.fusion.view_stack_kernels import BLOCK, mark_contradicted
 from pipeline.fusion.vote_kernels import OUTLINE, PIXEL_STEP
 
 MIN_VIEWS = 2  # that see something solid

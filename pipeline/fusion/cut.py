@@ -10,15 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.grid import Grid, at_points
 from pipeline.fusion.grid_kernels import doubled
 from pipeline.fusion.prior import near_rim
 from pipeline.fusion.view_stack import ViewStack
-from pipeline.fusion.vote_kernels import CENTRE, FRAME, PIXEL_STEP
+from pipeline.fusion.vote_kernels import CENTRE
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.projection_kernels import LENS
 from rig.mesh import Mesh
 
 ROUND_MM = 12.0  # standard deviation of the blur that rounds the edges between photographs' ends
@@ -68,8 +66,10 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
     from scipy.ndimage import gaussian_filter  # 0.05 s, and only a bust needs it
 
     places = box.places()
-    photographs = outside_photographs(places, views).reshape(box.shape)
-    beyond, low = gaussian_filter(photographs, ROUND_MM / box.step_mm).ravel(), np.zeros(0, bool)
+    edges_mm = np.sort(views.outside(places)[0], axis=0)
+    frames = np.clip(edges_mm[min(1, len(edges_mm) - 1)], -FAR_MM, FAR_MM)  # of all cameras but one
+    beyond = gaussian_filter(frames.reshape(box.shape), ROUND_MM / box.step_mm).ravel()
+    low = np.zeros(0, bool)
     if head_world is not None:
         vertices = head_world.vertices[::EVERY]
         tree, low = PointTree.of(vertices), near_rim(head_world, vertices)
@@ -85,21 +85,3 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
         end = max(np.quantile(seen[below] @ back, BEHIND_QUANTILE), (vertices[low] @ back).max())
         beyond[under] = np.maximum(beyond[under], places[under] @ back - end)
     return Cut(box, beyond, base)
-
-
-def outside_photographs(places: Float[np.ndarray, "n 3"], views: ViewStack) -> Float[np.ndarray, " n"]:
-    """Returns how far (mm, negative inside) points lie outside the photographs of all cameras but one."""
-
-    def outside(view: int) -> Float[np.ndarray, " n"]:
-        camera, size = views.cameras[view], views.sizes[view][::-1]
-        x, y, z = camera[:9].reshape(3, 3) @ places.T + camera[9:12, None]
-        fx, fy, cx, cy = camera[LENS : LENS + 4]
-        depth = np.maximum(z, 1.0)
-        pixel = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=1)
-        within = np.clip(pixel, 0, size - 1.0)
-        column, row = (within + 0.5).astype(int).T
-        edge = PIXEL_STEP * views.shown[views.starts[view] + row * size[0] + column, FRAME]
-        return np.where(z > 1.0, (edge + np.linalg.norm(pixel - within, axis=1)) * depth / fx, FAR_MM)
-
-    edges = map_in_threads(outside, len(views.cameras))
-    return np.clip(np.sort(edges, axis=0)[min(1, len(edges) - 1)], -FAR_MM, FAR_MM)

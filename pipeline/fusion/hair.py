@@ -29,9 +29,8 @@ from pipeline.fusion.refinement import neighbours
 from pipeline.fusion.refinement_kernels import blurred_over_mesh
 from pipeline.fusion.skin import mean_around, skin_share
 from pipeline.fusion.view_stack import ViewStack
-from pipeline.fusion.vote_kernels import CENTRE, FRAME, OUTLINE, PIXEL_STEP
+from pipeline.fusion.vote_kernels import CENTRE
 from pipeline.geometry.nearest import PointTree, nearest
-from pipeline.geometry.projection_kernels import LENS
 from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
@@ -222,19 +221,8 @@ def shell_deviation_mm(hair: SilentHair, views: ViewStack) -> float:
 
 def distance_to_hull(places: Float[np.ndarray, "n 3"], views: ViewStack) -> Float[np.ndarray, " n"]:
     """Returns how far (mm, negative inside) points lie outside the visual hull; -inf where no photograph reaches."""
-
-    def outside(view: int) -> Float[np.ndarray, " n"]:
-        camera, (height, width) = views.cameras[view], views.sizes[view]
-        x, y, z = camera[:9].reshape(3, 3) @ places.T + camera[9:12, None]
-        depth = np.maximum(z, 1.0)
-        fx, fy, cx, cy = camera[LENS : LENS + 4]
-        column, row = np.rint(fx * x / depth + cx), np.rint(fy * y / depth + cy)
-        framed = (z > 1.0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        at = views.starts[view] + np.where(framed, row * width + column, 0).astype(int)
-        framed &= views.shown[at, FRAME] <= 0
-        return np.where(framed, PIXEL_STEP * views.shown[at, OUTLINE] * depth / fx, -np.inf)
-
-    return np.max(map_in_threads(outside, len(views.cameras)), axis=0)
+    edges_mm, outlines_mm = views.outside(places)
+    return np.where(edges_mm > 0.0, -np.inf, outlines_mm).max(axis=0)
 
 
 def parts_over_head(votes: PartVotes, head_world: Mesh) -> PartVotes:

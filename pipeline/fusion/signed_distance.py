@@ -4,7 +4,7 @@ fitted head.
 It goes from a coarse box around the subject down to the requested spacing. Every view votes at every node
 (``vote_kernels``): with the distance to the surface that it sees there, and free space in front of it; it says nothing
 of what lies behind. Silhouettes bound the body from outside. Between votes a membrane interpolates
-(``relaxation_kernels``); what no camera sees is drawn to the fitted head with its hair and to the visual hull. The
+(``grid_kernels``); what no camera sees is drawn to the fitted head with its hair and to the visual hull. The
 coarsest level decides what is inside; each finer level is solved around the surface of the one before.
 
 Volumetric fusion with free space: Curless and Levoy, *A volumetric method for building complex models from range
@@ -24,9 +24,9 @@ from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
 from pipeline.fusion.cut import Cut, find_cut
 from pipeline.fusion.grid import Grid, at_points, everywhere, marked_box, refined, whole_box
+from pipeline.fusion.grid_kernels import Membrane, relax
 from pipeline.fusion.hair import SilentHair, distance_to_shell
 from pipeline.fusion.prior import SeenSurface, distance_to_subject
-from pipeline.fusion.relaxation_kernels import Membrane, relax
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE, ViewStack
 from pipeline.fusion.vote_kernels import vote
 from pipeline.part_labels.codes import Part

@@ -108,8 +108,10 @@ def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
     rng, mesh = np.random.default_rng(0), ball(OUTLINE_MM)
     noisy = Mesh(mesh.vertices * (1.0 + rng.normal(0.0, 1.0 / OUTLINE_MM, (len(mesh.vertices), 1))), mesh.faces)
     side = mesh.vertices[:, 0]
-    smooth = smooth_hair(noisy, (side > 0.0).astype(float), np.ones(len(side), bool))
-    off = radii(smooth)[side < -20.0] - OUTLINE_MM
+    held = mesh.vertices[:, 2] > 40.0
+    smooth = smooth_hair(noisy, (side <= 0.0).astype(float), np.ones(len(side), bool), held)
+    assert np.array_equal(smooth.vertices[held], noisy.vertices[held])
+    off = radii(smooth)[(side < -20.0) & ~held] - OUTLINE_MM
     assert off.std() < 0.25  # of 1 mm: the 45 vertices about one leave a seventh, and near ones count more
     assert np.median(off) == pytest.approx(0.0, abs=0.5)
     assert smooth.vertices[side > 20.0] == pytest.approx(noisy.vertices[side > 20.0], abs=0.05)
@@ -124,7 +126,7 @@ def test_scattered_votes_make_handles_of_skin_and_none_of_hair(outlines: Scene) 
         labels = {c.name: PartMap(c.name, np.tile(shown, (300, 400, 1))) for c in outlines.rig}
         surface = fuse(
             maps, outlines.silhouettes, outlines.rig, None, bias=WindowBias(), spacing_mm=1.5,
-            report=discard_progress, parts=vote_parts(maps, labels, outlines.rig),
+            report=discard_progress, parts=vote_parts(maps, labels, outlines.rig), scatter=1.0,
         )  # fmt: skip
         mesh = surface.mesh_world
         handles.append(1 - (len(mesh.vertices) - len(mesh.faces) // 2) // 2)
