@@ -20,11 +20,11 @@ from pipeline.geometry.nearest import PointTree, nearest
 from rig.mesh import Mesh
 
 ROUND_MM = 12.0  # standard deviation of the blur that rounds the edges between photographs' ends
-THIN_MM, SPARED_MM = 6.0, 4.0  # radius, and by how much more a place must stand out: a step of the grid is no rag
+THIN_MM, SPARED_MM = 8.0, 4.0  # radius, and by how much more a place must stand out: a step of the grid is no rag
 BASE_QUANTILE = 0.7  # of the seen points below the head, by height: what lies lower is the base
 FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
-BEHIND_QUANTILE = 0.99  # of seen points: single ones lie anywhere
+BEHIND_QUANTILE, THICK_QUANTILE = 0.99, 0.9  # of seen points, and of their distances to the head: its hair
 EVERY = 4  # vertices of the head stand for the others
 
 
@@ -73,9 +73,10 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
     if head_world is not None:
         vertices = head_world.vertices[::EVERY]
         tree, low = PointTree.of(vertices), near_rim(head_world, vertices)
-    if not low.any() or not low[nearest(tree, seen)[1]].any():
+        far, near = nearest(tree, seen)
+    if not low.any() or low[near].all() or not low[near].any():
         return Cut(box, beyond, np.zeros(len(beyond), bool))
-    below, under = low[nearest(tree, seen)[1]], low[nearest(tree, places)[1]]
+    below, under = low[near], low[nearest(tree, places)[1]]
     down = vertices[low].mean(axis=0) - vertices.mean(axis=0)
     base = under & (places @ down > np.quantile(seen[below] @ down, BASE_QUANTILE))
     towards = views.cameras[:, CENTRE:] - np.median(seen, axis=0)
@@ -83,5 +84,6 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
     if np.linalg.norm(back) > ONE_SIDED:
         back /= np.linalg.norm(back)
         end = max(np.quantile(seen[below] @ back, BEHIND_QUANTILE), (vertices[low] @ back).max())
-        beyond[under] = np.maximum(beyond[under], places[under] @ back - end)
+        head_end = (vertices @ back).max() + np.quantile(far[~below], THICK_QUANTILE)
+        beyond = np.maximum(beyond, places @ back - np.where(under, end, head_end))
     return Cut(box, beyond, base)

@@ -94,7 +94,6 @@ def fuse(
     spacing_mm: float,
     report: Progress,
     hair: SilentHair | None = None,
-    parts: PartVotes | None = None,
     scatter: float = 0.0,
 ) -> DepthSurface:
     """Fuses the depth maps to one closed surface.
@@ -108,7 +107,6 @@ def fuse(
         spacing_mm: distance of the vertices.
         report: called with the stage's progress.
         hair: of which the depth maps say nothing; None if there is none.
-        parts: which part each point shows (``parts_over_head``); None counts all as skin.
         scatter: how far (0 to 1) the depth of hair is noise.
 
     Raises:
@@ -119,7 +117,7 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level, cut = solve(maps, views, head_world, spacing_mm, hair, parts if scatter > 0.0 else None)
+    level, cut = solve(maps, views, head_world, spacing_mm, hair)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)

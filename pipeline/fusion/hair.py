@@ -67,6 +67,7 @@ STRAND_SHARE = 0.5  # standard deviation of a moved vertex, by its way: strands 
 # Share of the pixels of hair with a known depth, below which hair is silent: 0.25 of long strands, 0.53 of short ones
 # and a beard, 0.82 and 0.84 of solid hair.
 SILENT_SHARE = 0.4
+LOOSER = 6.0  # by what the deviation of strands' depth is multiplied: the membrane bridges their pockets
 SCATTERED_SHARE = (0.8, 0.7)  # the same, below which what is known scatters, and scatters wholly
 MIN_HAIR = 0.2  # of what is not clothes; with less, hair is not worth it
 LIKELY = 0.5  # probability from which on a place counts as a part
@@ -108,7 +109,8 @@ def find_silent_hair(
         The hair and the depth maps without what they say of it, or None and the same depth maps.
     """
     if votes is None or known >= SILENT_SHARE:
-        return None, depth_maps
+        scatter = scatter_of(known)
+        return None, [loosened(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps
 
     def split(depth_map: DepthMap) -> tuple[Float[np.ndarray, "n 3"], DepthMap]:
         points, known = points_world(depth_map), depth_map.known
@@ -168,6 +170,14 @@ def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], ri
 def scatter_of(known: float) -> float:
     """Returns how far (0 to 1) the depth of hair is noise, from the share of its pixels with a known depth."""
     return float(np.clip((SCATTERED_SHARE[0] - known) / (SCATTERED_SHARE[0] - SCATTERED_SHARE[1]), 0.0, 1.0))
+
+
+def loosened(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig, scatter: float) -> DepthMap:
+    """Returns the depth map with larger deviations of hair, as far as its depth is noise (``scatter``)."""
+    height, width = depth_map.depth_mm.shape
+    hair = np.asarray(cv2.resize(shown_parts(depth_map, parts, rig)[..., Part.HAIR.channel], (width, height)))
+    looser = 1.0 + (LOOSER - 1.0) * scatter * hair
+    return replace(depth_map, deviation_mm=(depth_map.deviation_mm * looser).astype(np.float32))
 
 
 def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float32[np.ndarray, "h w"]:

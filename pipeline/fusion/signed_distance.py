@@ -12,9 +12,8 @@ images*, SIGGRAPH 1996. Departures: votes are combined robustly (the median, and
 are inequalities, and the membrane fills holes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -29,8 +28,6 @@ from pipeline.fusion.hair import SilentHair, distance_to_shell
 from pipeline.fusion.prior import SeenSurface, distance_to_subject
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE, ViewStack
 from pipeline.fusion.vote_kernels import vote
-from pipeline.part_labels.codes import Part
-from pipeline.part_labels.votes import PartVotes, part_shares
 from pipeline.stereo.depth_map import DepthMap, points_world
 from rig.errors import EigenheadError
 from rig.mesh import Mesh
@@ -45,8 +42,7 @@ COARSEST_MM = 5.0  # the first level's step is at least this: the whole box then
 REACH, BEHIND = 1.5, 2.5
 AGREEMENT = 1.0  # steps (and at least a millimetre) within which votes are of one surface
 UNIT_STEPS, FLOOR_MM = 1 / 3, 0.1  # a vote of the first deviation weighs one; none is better than the second
-DATA_WEIGHT = 10.0  # of a vote, by that of one edge of the membrane ...
-SCATTERED_WEIGHT = 0.03  # ... and of this, votes for strands: the membrane bridges their pockets
+DATA_WEIGHT = 10.0  # of a vote, by that of one edge of the membrane
 BLEND_MM = 1.5  # from the edge of what is seen to where the guess prevails: its weight is (step / that)^2
 UNDECIDED_BLEND_MM = 150.0  # the same where there is hardly a guess
 SWEEPS, FINE_SWEEPS = 60, 16
@@ -84,15 +80,15 @@ class Level:
     weight: Field
 
 
-def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float, firm: float | Field = 1.0) -> Level:
+def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
     """Computes the signed distance on one grid. It follows the votes where there are some, stays outside the
     silhouettes, and is drawn to ``start``, which prevails where no view sees a node, or hardly. ``sweeps`` and
-    ``factor`` are those of the relaxation; votes count by ``firm``."""
+    ``factor`` are those of the relaxation."""
     reach = np.float32(REACH * grid.step_mm)
     start = np.clip(start, -reach, reach)
     blend = np.where(votes.weight < 0, UNDECIDED_BLEND_MM, BLEND_MM)
     held = np.where(votes.weight < WEAK, (grid.step_mm / blend) ** 2, 0.0)
-    data = DATA_WEIGHT * firm * np.maximum(votes.weight, 0.0)
+    data = DATA_WEIGHT * np.maximum(votes.weight, 0.0)
     pull = (held + data).astype(np.float32)
     target = ((held * start + data * votes.value) / pull).astype(np.float32)
     field = np.where(grid.outer, start, np.maximum(target, votes.bound)).astype(np.float32)
@@ -137,11 +133,9 @@ def solve(
     head_world: Mesh | None,
     spacing_mm: float,
     hair: SilentHair | None = None,
-    parts: PartVotes | None = None,
 ) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
-    fine. ``hair`` is what the depth maps do not show, ``parts`` which part each point shows where
-    depth of hair is noise."""
+    fine. ``hair`` is what the depth maps do not show."""
     halvings = 1
     while spacing_mm * 2**halvings < COARSEST_MM:
         halvings += 1
@@ -161,43 +155,26 @@ def solve(
         guess = _with_shell(guess, votes, grid, hair, views)
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
-    firm = partial(at_points, grid, firmness(grid, level.field, parts))
     for halving in range(halvings):
         wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
-        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, firm, cut)
+        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, cut)
         if halving < halvings - 1:
             box = everywhere(level.grid, level.field, box)
             cut = cut.without_rags(level.grid, box)
     return level, cut
 
 
-def firmness(grid: Grid, field: Field, parts: PartVotes | None) -> Field:
-    """Returns by how much each vote counts at the nodes of a whole box, from the parts about its surface: 1, and
-    ``SCATTERED_WEIGHT`` in hair."""
-    out = np.ones(len(grid), np.float32)
-    if parts is not None:
-        near = np.flatnonzero(np.abs(field) < REACH * grid.step_mm)
-        hair = part_shares(parts, grid.places(near))[:, Part.HAIR.channel]
-        out[near] -= (1.0 - SCATTERED_WEIGHT) * hair
-    return out
-
-
 def _finer(
-    coarse: Grid,
-    box: Float32[np.ndarray, "nx ny nz"],
-    wanted: Bool[np.ndarray, "nx ny nz"],
-    views: ViewStack,
-    firm: Callable[[Points], Field],
-    cut: Cut,
+    coarse: Grid, box: Float32[np.ndarray, "nx ny nz"], wanted: Bool[np.ndarray, "nx ny nz"], views: ViewStack, cut: Cut
 ) -> Level:
-    """Computes the signed distance at half the step about the ``wanted`` nodes. ``firm`` tells by how much votes count
-    at places, ``cut`` where the bust ends. The grid is widened while the surface would leave it; raises NoSurface if it
+    """Computes the signed distance at half the step about the ``wanted`` nodes. ``cut`` tells where the bust
+    ends. The grid is widened while the surface would leave it; raises NoSurface if it
     still does after ``WIDENINGS``."""
     for _ in range(WIDENINGS + 1):
         grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)
         votes = ended(votes_at(grid, views), grid, cut)
-        level = solve_level(grid, votes, start, FINE_SWEEPS, FINE_FACTOR, firm(grid.places()))
+        level = solve_level(grid, votes, start, FINE_SWEEPS, FINE_FACTOR)
         if not grid_kernels.crossed_at_rim(level.field, grid.neighbours, grid.outer):
             return level
         wanted = grid_kernels.grown(wanted)

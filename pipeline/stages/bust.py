@@ -86,7 +86,6 @@ def fuse_depth(
             spacing_mm=settings.bust.spacing_mm,
             report=context.progress,
             hair=hair,
-            parts=parts,
             scatter=scatter_of(known),
         )
     except NoSurface as reason:
