@@ -17,7 +17,7 @@ from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences
 from pipeline.fusion.hair import (
     STRAND_SHARE,
-    SilentHair,
+    Places,
     grown_to_outlines,
     parts_over_head,
     shell_deviation_mm,
@@ -93,7 +93,7 @@ def fuse(
     bias: WindowBias,
     spacing_mm: float,
     report: Progress,
-    hair: SilentHair | None = None,
+    hair: Places | None = None,
     scatter: float = 0.0,
 ) -> DepthSurface:
     """Fuses the depth maps to one closed surface.
@@ -155,12 +155,13 @@ def finished(
     if votes is not None:
         shown = part_codes(votes, mesh.vertices)
         shares = part_shares(votes if head is None else parts_over_head(votes, head.mesh_world), mesh.vertices)
-    skin, hair, moved_mm = shares[:, Part.SKIN.channel], shares[:, Part.HAIR.channel], np.zeros(len(seen))
+    skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
+    strands = surface.scatter * shares[:, Part.HAIR.channel]
     if head is not None:
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured))
-    mesh = smooth_hair(mesh, surface.scatter * hair, seen, surface.capped)
+    mesh = smooth_hair(mesh, strands, seen, surface.capped)
     if surface.shell_deviation_mm is None:
-        mesh, moved_mm = grown_to_outlines(mesh, hair, silhouettes, rig)
+        mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))
     clean = without_coincidences(Mesh(smooth_spots(mesh.vertices, topology, surface.safe_world), mesh.faces))
     mended_mm = np.linalg.norm(clean.vertices - mesh.vertices, axis=1)

@@ -7,7 +7,7 @@ the signed distance (``firmness``), which leaves no pockets, and its vertices ta
 Strands are thinner than a pixel and let through what lies behind them, so that windows match the dense core of the
 hair, millimetres deeper than the strands that a photograph shows. Outlines show how much is missing: where the surface
 turns away from a camera, its outline lies as far inside the silhouette. Between these rims the missing thickness is
-interpolated. Hair that has a surface, as a helmet has, reaches its outlines and stays as it is.
+interpolated. Hair that has a surface, as a helmet has, has depth nearly everywhere, and stays as it is.
 
 Long hair of strands, whose depth photographs hardly show, is a smooth shell inside the visual hull. Places that match
 here and there tell together how deep inside the hull the hair lies, and that distance is smooth. The fitted head, with
@@ -15,7 +15,7 @@ a thickness above it, says nothing of hair that hangs free.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -41,6 +41,8 @@ from rig.camera import Camera
 from rig.mesh import Mesh, face_normals
 from rig.rig import Rig
 
+Places = Float[np.ndarray, "n 3"]
+
 # Height (mm) over the head up to which hair is skin with hair's colour (stubble, brows, a beard), and from which on it
 # is hair: the cells of beard-smile's beard lie 0.6 mm over the head in the median, those of its hair 3.5.
 STUBBLE_MM = (1.0, 3.0)
@@ -48,9 +50,6 @@ CELLS = 64  # about a cell, whose mean height counts: 12 mm about it
 RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair and clothes takes: gravel is 2 to 5 mm wide
 STEP_SHARE = 0.46  # variance of one step of a mean, by the area of a vertex
 OFF_HEAD_MM = 8.0  # from the head there is no skin: strands that hang before it have skin's colours in shade
-# Median thickness that hair lacks at its rims, from which on it counts as strands, and counts whole: 0.14 and 0.15 mm
-# of two captures of solid hair, 3.4 and 5.3 of two of strands.
-STRANDS_MM = (1.0, 2.0)
 SURELY = 0.5  # probability from which on a vertex of a rim counts as hair
 EVERY = 4  # pixel of a rim is measured
 RIM_PX = 0.5  # by which the pixels of a rim lie inside the outline
@@ -84,18 +83,10 @@ SHELL_STEPS, DEPTH_STEPS = 1.0, 2.5  # of the grid: standard deviations of the b
 FAR_MM = 1000.0  # a length along the crop's rays, any
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SilentHair:
-    """Holds what is known of hair whose depth is hardly known: ``places`` (world, mm) on which some views agree. They
-    scatter, and only taken together tell how deep inside the hull the hair lies."""
-
-    places: Float[np.ndarray, "n 3"]
-
-
 @traced
 def find_silent_hair(
     depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig, known: float
-) -> tuple[SilentHair | None, Sequence[DepthMap]]:
+) -> tuple[Places | None, Sequence[DepthMap]]:
     """Tells whether the subject has long hair of which the photographs hardly show the depth.
 
     Args:
@@ -106,7 +97,8 @@ def find_silent_hair(
         known: share of the hair's pixels with a known depth (``known_share``).
 
     Returns:
-        The hair and the depth maps without what they say of it, or None and the same depth maps.
+        Places (world, mm) of the hair on which some views agree, which only taken together tell how deep inside the
+        hull it lies, and the depth maps without it; or None and the depth maps, whose hair counts less if it scatters.
     """
     if votes is None or known >= SILENT_SHARE:
         scatter = scatter_of(known)
@@ -127,7 +119,7 @@ def find_silent_hair(
     places = np.concatenate([points for points, _ in found])
     if len(places) < SHELL_AROUND:
         return None, depth_maps
-    return SilentHair(places[:: -(-len(places) // MAX_PLACES)]), [each for _, each in found]
+    return places[:: -(-len(places) // MAX_PLACES)], [each for _, each in found]
 
 
 def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
@@ -193,7 +185,7 @@ def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> 
 
 @traced
 def distance_to_shell(
-    hair: SilentHair, views: ViewStack, box: Grid
+    hair: Places, views: ViewStack, box: Grid
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Returns, at the nodes of a whole box, the signed distance (mm, positive outside) to the shell, and how far a
     photograph shows its outside there, 0 to 1: what all cameras see from behind, no silhouette bounds."""
@@ -216,14 +208,14 @@ def distance_to_shell(
     return gaussian_filter(field, SHELL_STEPS).ravel(), shown
 
 
-def depth_inside(hair: SilentHair, views: ViewStack) -> tuple[PointTree, Float[np.ndarray, " n"]]:
+def depth_inside(hair: Places, views: ViewStack) -> tuple[PointTree, Float[np.ndarray, " n"]]:
     """Returns the places of the hair, and how deep (mm) inside the hull each lies."""
-    deep = -distance_to_hull(hair.places, views)
+    deep = -distance_to_hull(hair, views)
     within = (deep > 0.0) & (deep < DEEPEST_MM)
-    return PointTree.of(hair.places[within]), deep[within]
+    return PointTree.of(hair[within]), deep[within]
 
 
-def shell_deviation_mm(hair: SilentHair, views: ViewStack) -> float:
+def shell_deviation_mm(hair: Places, views: ViewStack) -> float:
     """Returns the standard deviation (mm) of the shell: that of the depth inside the hull over all of the hair. Places
     next to each other err alike (2 mm about their median, where true strands are 7 mm off)."""
     return float(depth_inside(hair, views)[1].std())
@@ -281,7 +273,7 @@ def grown_to_outlines(
 
     Args:
         mesh_world: the fused surface, closed, mm.
-        hair: probability that a vertex shows hair.
+        hair: probability that a vertex shows hair of strands.
         silhouettes: by camera; those that are not usable are left out.
         rig: the cameras as calibrated, world frame.
 
@@ -292,25 +284,17 @@ def grown_to_outlines(
     rig = rig.subset(name for name in rig.names if name in silhouettes and silhouettes[name].quality.usable)
     if not sure.any() or not len(rig):
         return mesh_world, np.zeros(len(hair))
-    mesh, beside, trust = mesh_world, neighbours(mesh_world.faces, len(hair)), None
+    mesh, beside = mesh_world, neighbours(mesh_world.faces, len(hair))
     for _ in range(ROUNDS):
         places, missing_mm = rims(mesh, sure, silhouettes, rig)
-        trust = strands_share(missing_mm) if trust is None else trust
-        if len(places) < MIN_PLACES or trust == 0.0:
+        if len(places) < MIN_PLACES:
             break
         outwards = np.zeros(len(hair))
         outwards[hair > 0.0] = missing_thickness(mesh.vertices[hair > 0.0], places, missing_mm)
-        way = (SHARE * trust * hair**DENSE * outwards)[:, None] * mesh.normals()
+        way = (SHARE * hair**DENSE * outwards)[:, None] * mesh.normals()
         smooth = [mean_around(beside, way[:, axis], np.ones(len(way))) for axis in range(3)]
         mesh = Mesh(mesh.vertices + np.stack(smooth, axis=1), mesh.faces)
     return mesh, np.linalg.norm(mesh.vertices - mesh_world.vertices, axis=1)
-
-
-def strands_share(missing_mm: Float[np.ndarray, " n"]) -> float:
-    """Returns how far hair counts as strands, 0 to 1, from the thickness that it lacks at its rims."""
-    if len(missing_mm) < MIN_PLACES:
-        return 0.0
-    return float(np.clip((np.median(missing_mm) - STRANDS_MM[0]) / (STRANDS_MM[1] - STRANDS_MM[0]), 0.0, 1.0))
 
 
 def rims(

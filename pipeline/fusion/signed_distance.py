@@ -24,7 +24,7 @@ from pipeline.fusion import grid_kernels
 from pipeline.fusion.cut import Cut, find_cut
 from pipeline.fusion.grid import Grid, at_points, everywhere, marked_box, refined, whole_box
 from pipeline.fusion.grid_kernels import Membrane, relax
-from pipeline.fusion.hair import SilentHair, distance_to_shell
+from pipeline.fusion.hair import Places, distance_to_shell
 from pipeline.fusion.prior import SeenSurface, distance_to_subject
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE, ViewStack
 from pipeline.fusion.vote_kernels import vote
@@ -72,12 +72,10 @@ class Votes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds the solution on one grid: at each node the signed distance (mm, negative inside) and the weight of the
-    votes there."""
+    """Holds the solution on one grid: at each node the signed distance (mm, negative inside)."""
 
     grid: Grid
     field: Field
-    weight: Field
 
 
 def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
@@ -102,7 +100,7 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
             relax(field, membrane, rows, grid.neighbours, factor, first, last)
 
         in_threads(len(rows), sweep_nodes)
-    return Level(grid, field, votes.weight)
+    return Level(grid, field)
 
 
 def votes_at(grid: Grid, views: ViewStack) -> Votes:
@@ -132,7 +130,7 @@ def solve(
     views: ViewStack,
     head_world: Mesh | None,
     spacing_mm: float,
-    hair: SilentHair | None = None,
+    hair: Places | None = None,
 ) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
     fine. ``hair`` is what the depth maps do not show."""
@@ -143,8 +141,8 @@ def solve(
     agreed = np.concatenate([depth_map.views[depth_map.known][::EVERY] for depth_map in depth_maps])
     shown = seen
     if hair is not None:
-        shown = np.concatenate([seen, hair.places])
-        agreed = np.concatenate([agreed, np.full(len(hair.places), VIEWS_SURE)])
+        shown = np.concatenate([seen, hair])
+        agreed = np.concatenate([agreed, np.full(len(hair), VIEWS_SURE)])
     grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
     votes, known = votes_at(grid, views), shown[::THINNED]
     hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
@@ -210,7 +208,7 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface)
     return prior.astype(np.float32)
 
 
-def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: SilentHair, views: ViewStack) -> Field:
+def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: Places, views: ViewStack) -> Field:
     """Returns the first guess with the shell of hair that no depth is known of, where photographs show its
     outside."""
     shell, shown = distance_to_shell(hair, views, grid)

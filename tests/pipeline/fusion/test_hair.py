@@ -7,11 +7,19 @@ import pytest
 import trimesh
 
 from pipeline.fusion.fusion import fuse
-from pipeline.fusion.hair import OFF_HEAD_MM, STUBBLE_MM, grown_to_outlines, parts_over_head, smooth_hair
+from pipeline.fusion.hair import (
+    OFF_HEAD_MM,
+    STUBBLE_MM,
+    grown_to_outlines,
+    loosened,
+    parts_over_head,
+    scatter_of,
+    smooth_hair,
+)
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
-from pipeline.part_labels.votes import PartVotes, vote_parts
+from pipeline.part_labels.votes import PartVotes
 from pipeline.stereo.window_bias import WindowBias
 from rig.mesh import Mesh
 from rig.progress import discard_progress
@@ -42,13 +50,6 @@ def test_core_of_strands_grows_to_the_outline(outlines: Scene) -> None:
     assert np.median(radii(grown)) == pytest.approx(59.6, abs=0.1)
     assert radii(grown) == pytest.approx(59.6, abs=0.6)
     assert moved_mm == pytest.approx(3.6, abs=0.6)
-
-
-def test_hair_that_reaches_its_outline_stays(outlines: Scene) -> None:
-    solid = ball(59.8)
-    grown, moved_mm = grown_to_outlines(solid, np.ones(len(solid.vertices)), outlines.silhouettes, outlines.rig)
-    assert grown is solid
-    assert not moved_mm.any()
 
 
 def test_skin_beside_hair_stays(outlines: Scene) -> None:
@@ -117,17 +118,21 @@ def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
     assert smooth.vertices[side > 20.0] == pytest.approx(noisy.vertices[side > 20.0], abs=0.05)
 
 
-def test_scattered_votes_make_handles_of_skin_and_none_of_hair(outlines: Scene) -> None:
+def test_scattered_depth_makes_handles_and_loosened_depth_of_hair_none(outlines: Scene) -> None:
     rng, handles = np.random.default_rng(0), []
     noise = [np.where(each.known, rng.normal(0.0, 4.0, each.known.shape), 0.0) for each in outlines.maps]
     maps = [replace(each, depth_mm=each.depth_mm + off) for each, off in zip(outlines.maps, noise, strict=True)]
-    for part in (Part.SKIN, Part.HAIR):
-        shown = np.where(np.arange(3) == part.channel, 255, 0).astype(np.uint8)
-        labels = {c.name: PartMap(c.name, np.tile(shown, (300, 400, 1))) for c in outlines.rig}
-        surface = fuse(
-            maps, outlines.silhouettes, outlines.rig, None, bias=WindowBias(), spacing_mm=1.5,
-            report=discard_progress, parts=vote_parts(maps, labels, outlines.rig), scatter=1.0,
-        )  # fmt: skip
-        mesh = surface.mesh_world
+    shown = np.where(np.arange(3) == Part.HAIR.channel, 255, 0).astype(np.uint8)
+    labels = {c.name: PartMap(c.name, np.tile(shown, (300, 400, 1))) for c in outlines.rig}
+    for scatter in (0.0, 1.0):
+        loose = [loosened(each, labels, outlines.rig, scatter) for each in maps]
+        mesh = fuse(
+            loose, outlines.silhouettes, outlines.rig, None, bias=WindowBias(), spacing_mm=1.5, report=discard_progress
+        ).mesh_world
         handles.append(1 - (len(mesh.vertices) - len(mesh.faces) // 2) // 2)
-    assert handles[1] <= 2 < 20 < handles[0]
+    assert 3 * handles[1] < handles[0]
+
+
+@pytest.mark.parametrize(("known", "scatter"), [(0.53, 1.0), (0.75, 0.5), (0.82, 0.0)])
+def test_hair_whose_depth_is_known_is_solid(known: float, scatter: float) -> None:
+    assert scatter_of(known) == pytest.approx(scatter)
