@@ -20,7 +20,7 @@ from pipeline.geometry.nearest import PointTree, nearest
 from rig.mesh import Mesh
 
 ROUND_MM = 12.0  # standard deviation of the blur that rounds the edges between photographs' ends
-THIN_MM, SPARED_MM = 6.0, 4.0  # radius, and by how much more a place must stand out: a step of the grid is no rag
+THIN_MM, SPARED_MM = 6.0, 4.0  # radius, and by how much a place must stand out: a step of the grid is no rag
 BASE_QUANTILE = 0.7  # of the seen points below the head, by height: what lies lower is the base
 FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
@@ -68,7 +68,7 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
     places = box.places()
     edges_mm = np.sort(views.outside(places)[0], axis=0)
     frames = np.clip(edges_mm[min(1, len(edges_mm) - 1)], -FAR_MM, FAR_MM)  # of all cameras but one
-    beyond = gaussian_filter(frames.reshape(box.shape), ROUND_MM / box.step_mm).ravel()
+    beyond = gaussian_filter(frames.reshape(box.shape), ROUND_MM / box.step_mm).ravel() - SPARED_MM
     low = np.zeros(0, bool)
     if head_world is not None:
         vertices = head_world.vertices[::EVERY]

@@ -60,7 +60,7 @@ FARTHEST_MM = 30.0  # beyond that the outline is something else's
 ABOUT, QUANTILE = 24, 0.35
 NEAREST, EVEN_MM = 8, 8.0  # of them count at a vertex, and the distance within which they count alike
 MIN_PLACES = 2 * ABOUT  # for a measurement
-DENSE = 4  # power of hair's probability: where scalp shows between strands, the surface stays between the two
+DENSE = 8  # power of hair's probability: where scalp shows between strands, the surface stays between the two
 ROUNDS, SHARE = 2, 0.7  # the rim of what has been moved is another one: what is still missing is measured again
 STRAND_SHARE = 0.5  # standard deviation of a moved vertex, by its way: strands lie between core and outline
 # Share of the pixels of hair with a known depth, below which hair is silent: 0.25 of long strands, 0.53 of short ones

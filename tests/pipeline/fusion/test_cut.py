@@ -34,7 +34,8 @@ def test_nothing_lies_behind_what_cameras_see_and_the_end_is_a_plane(views: View
 
 
 def test_bust_ends_where_all_photographs_but_one_end(views: ViewStack) -> None:
-    box = whole_box(np.full(3, -FAR_MM), np.full(3, 200.0), 6.0)
-    cut = find_cut(box, views, np.zeros((9, 3)), None)
-    second = np.sort(views.outside(np.array([[0.0, 95.0, 0.0], [0.0, 0.0, 0.0]]))[0], axis=0)[1]
-    assert cut.distance_mm(np.array([[0.0, 95.0, 0.0], [0.0, 0.0, 0.0]])) == pytest.approx(second, abs=6.0)
+    box = whole_box(np.full(3, -400.0), np.full(3, 800.0), 12.0)
+    places = np.array([[0.0, 210.0, 0.0], [0.0, 180.0, 0.0]])
+    second = np.sort(views.outside(places)[0], axis=0)[1]
+    assert (np.abs(second) < FAR_MM / 2).all()
+    assert find_cut(box, views, np.zeros((9, 3)), None).distance_mm(places) == pytest.approx(second, abs=12.0)
