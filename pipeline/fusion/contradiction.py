@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.view_stack import ViewStack
-from pipeline.fusion.view_stack_kernels import BLOCK, mark_contradicted
-from pipeline.fusion.vote_kernels import OUTLINE, PIXEL_STEP
+from pipeline.fusion.vote_kernels import BLOCK, OUTLINE, PIXEL_STEP, mark_contradicted
 
 MIN_VIEWS = 2  # that see something solid
 WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines

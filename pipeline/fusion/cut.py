@@ -24,7 +24,7 @@ THIN_MM, SPARED_MM = 6.0, 4.0  # radius, and by how much a place must stand out:
 BASE_QUANTILE = 0.7  # of the seen points below the head, by height: what lies lower is the base
 FAR_MM = 100.0  # distances count up to this one
 ONE_SIDED = 0.3  # length of the mean direction to the cameras above which nobody stands behind the subject
-BEHIND_QUANTILE, THICK_QUANTILE = 0.99, 0.9  # of seen points, and of their distances to the head: its hair
+BEHIND_QUANTILE, THICK_QUANTILE = 0.998, 0.9  # of seen points, and of their distances to the head: its hair
 EVERY = 4  # vertices of the head stand for the others
 
 

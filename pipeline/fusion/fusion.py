@@ -24,8 +24,14 @@ from pipeline.fusion.hair import (
     smooth_hair,
 )
 from pipeline.fusion.net_kernels import component_of, compose_well
-from pipeline.fusion.quality import MAX_MM, deviation_mm, seen_deviation_mm, without_islands
-from pipeline.fusion.refinement import Measured, refine_vertices
+from pipeline.fusion.refinement import (
+    MAX_MM,
+    Measured,
+    deviation_mm,
+    refine_vertices,
+    seen_deviation_mm,
+    without_islands,
+)
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
 from pipeline.fusion.skin import HeadSkin, combine_with_head
 from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, smooth_spots, topology_of
@@ -127,8 +133,9 @@ def fuse(
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(mask_warnings(names, contradicted))
     straight = without_bias(mesh, measured.views > 0, bias)
-    shell_mm = None if hair is None else shell_deviation_mm(hair, views)
-    return DepthSurface(straight, safe, measured, warnings, capped, scatter, shell_mm)
+    return DepthSurface(
+        straight, safe, measured, warnings, capped, scatter, hair if hair is None else shell_deviation_mm(hair, views)
+    )
 
 
 @traced

@@ -1,8 +1,8 @@
-"""Decides what counts as hair, and makes the surface of hair and clothes as smooth as pictures resolve it.
+"""Decides what counts as hair, and makes its surface as smooth as pictures resolve it.
 
-Two cameras see other strands and other threads, so that windows match chance patterns: what depth says of them scatters
+Two cameras see other strands, so that windows match chance patterns: what depth says of them scatters
 over millimetres and leaves gravel with pockets and handles. That is noise, not relief. Its votes are therefore weak in
-the signed distance (``firmness``), which leaves no pockets, and its vertices take the mean of those about them.
+the signed distance (``loosened``), which leaves no pockets, and its vertices take the mean of those about them.
 
 Strands are thinner than a pixel and let through what lies behind them, so that windows match the dense core of the
 hair, millimetres deeper than the strands that a photograph shows. Outlines show how much is missing: where the surface
@@ -24,8 +24,7 @@ from jaxtyping import Bool, Float, Float32
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion.grid import Grid
-from pipeline.fusion.quality import EDGE_MM, guessed_deviation_mm
-from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.refinement import EDGE_MM, guessed_deviation_mm, neighbours
 from pipeline.fusion.refinement_kernels import blurred_over_mesh
 from pipeline.fusion.skin import mean_around, skin_share
 from pipeline.fusion.view_stack import ViewStack
@@ -47,7 +46,7 @@ Places = Float[np.ndarray, "n 3"]
 # is hair: the cells of beard-smile's beard lie 0.6 mm over the head in the median, those of its hair 3.5.
 STUBBLE_MM = (1.0, 3.0)
 CELLS = 64  # about a cell, whose mean height counts: 12 mm about it
-RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair and clothes takes: gravel is 2 to 5 mm wide
+RESOLVED_MM = 4.0  # standard deviation of the mean that a vertex of hair takes: gravel is 2 to 5 mm wide
 STEP_SHARE = 0.46  # variance of one step of a mean, by the area of a vertex
 OFF_HEAD_MM = 8.0  # from the head there is no skin: strands that hang before it have skin's colours in shade
 SURELY = 0.5  # probability from which on a vertex of a rim counts as hair
@@ -85,8 +84,8 @@ FAR_MM = 1000.0  # a length along the crop's rays, any
 
 @traced
 def find_silent_hair(
-    depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig, known: float
-) -> tuple[Places | None, Sequence[DepthMap]]:
+    depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], votes: PartVotes | None, rig: Rig
+) -> tuple[Places | None, Sequence[DepthMap], float]:
     """Tells whether the subject has long hair of which the photographs hardly show the depth.
 
     Args:
@@ -94,15 +93,21 @@ def find_silent_hair(
         parts: the part maps by camera, in pixels of the photographs.
         votes: which part each point of the depth maps shows (``parts_over_head``); without it there is no such hair.
         rig: the cameras as calibrated, world frame.
-        known: share of the hair's pixels with a known depth (``known_share``).
 
     Returns:
         Places (world, mm) of the hair on which some views agree, which only taken together tell how deep inside the
         hull it lies, and the depth maps without it; or None and the depth maps, whose hair counts less if it scatters.
+        Third, how far (0 to 1) the depth of hair is noise.
     """
+    known = known_share(depth_maps, parts, rig)
+    most, least = SCATTERED_SHARE
+    scatter = float(np.clip((most - known) / (most - least), 0.0, 1.0))
     if votes is None or known >= SILENT_SHARE:
-        scatter = scatter_of(known)
-        return None, [loosened(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps
+        return (
+            None,
+            [loosened(each, parts, rig, scatter) for each in depth_maps] if scatter > 0.0 else depth_maps,
+            scatter,
+        )
 
     def split(depth_map: DepthMap) -> tuple[Float[np.ndarray, "n 3"], DepthMap]:
         points, known = points_world(depth_map), depth_map.known
@@ -119,7 +124,7 @@ def find_silent_hair(
     places = np.concatenate([points for points, _ in found])
     if len(places) < SHELL_AROUND:
         return None, depth_maps
-    return places[:: -(-len(places) // MAX_PLACES)], [each for _, each in found]
+    return places[:: -(-len(places) // MAX_PLACES)], [each for _, each in found], scatter
 
 
 def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
@@ -157,11 +162,6 @@ def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], ri
     counts = map_in_threads(lambda k: count(depth_maps[k]), len(depth_maps))
     known, hair, body = np.sum([np.zeros(3), *counts], axis=0)
     return 1.0 if hair <= MIN_HAIR * body else float(known / hair)
-
-
-def scatter_of(known: float) -> float:
-    """Returns how far (0 to 1) the depth of hair is noise, from the share of its pixels with a known depth."""
-    return float(np.clip((SCATTERED_SHARE[0] - known) / (SCATTERED_SHARE[0] - SCATTERED_SHARE[1]), 0.0, 1.0))
 
 
 def loosened(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig, scatter: float) -> DepthMap:

@@ -150,7 +150,9 @@ def solve(
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
     guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight))
     if hair is not None:
-        guess = _with_shell(guess, votes, grid, hair, views)
+        shell, outside = distance_to_shell(hair, views, grid)  # of hair, where photographs show its outside
+        mixed = outside * np.maximum(shell, votes.bound) + (1.0 - outside) * guess
+        guess = np.where(grid.outer | (votes.weight >= WEAK), guess, mixed)
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
     for halving in range(halvings):
@@ -206,15 +208,6 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface)
         prior[guessed] = np.where(weak[guessed] & np.isneginf(guess), prior[guessed], np.maximum(hull, guess))
     prior[grid.outer] = REACH * grid.step_mm
     return prior.astype(np.float32)
-
-
-def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: Places, views: ViewStack) -> Field:
-    """Returns the first guess with the shell of hair that no depth is known of, where photographs show its
-    outside."""
-    shell, shown = distance_to_shell(hair, views, grid)
-    reach = REACH * grid.step_mm
-    mixed = shown * np.maximum(shell, votes.bound) + (1.0 - shown) * guess
-    return np.where(grid.outer | (votes.weight >= WEAK), guess, np.clip(mixed, -reach, reach)).astype(np.float32)
 
 
 def _near_points(grid: Grid, points: Points) -> Bool[np.ndarray, "nx ny nz"]:

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float, Float32, Int16, Int64
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.fusion.view_stack_kernels import write_outline
 from pipeline.fusion.vote_kernels import (
     FRAME,
     NORMAL,
@@ -18,6 +17,7 @@ from pipeline.fusion.vote_kernels import (
     SIGMA_STEP_MM,
     UNKNOWN,
     Pixels,
+    write_outline,
 )
 from pipeline.geometry.projection import packed_lens
 from pipeline.geometry.projection_kernels import LENS

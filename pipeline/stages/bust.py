@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
-from pipeline.fusion.hair import find_silent_hair, known_share, parts_over_head, scatter_of
+from pipeline.fusion.hair import find_silent_hair, parts_over_head
 from pipeline.fusion.signed_distance import NoSurface
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
@@ -74,8 +74,7 @@ def fuse_depth(
     if settings.outputs.surface == "head":
         return Staged(None)
     parts = None if depth.votes is None else parts_over_head(depth.votes, head_world)
-    known = known_share(depth.maps, labels.maps, context.rig)
-    hair, maps = find_silent_hair(depth.maps, labels.maps, parts, context.rig, known)
+    hair, maps, scatter = find_silent_hair(depth.maps, labels.maps, parts, context.rig)
     try:
         surface = fuse(
             maps,
@@ -86,7 +85,7 @@ def fuse_depth(
             spacing_mm=settings.bust.spacing_mm,
             report=context.progress,
             hair=hair,
-            scatter=scatter_of(known),
+            scatter=scatter,
         )
     except NoSurface as reason:
         return Staged(None, [compose("no-bust", reason=reason.message)])

@@ -7,15 +7,7 @@ import pytest
 import trimesh
 
 from pipeline.fusion.fusion import fuse
-from pipeline.fusion.hair import (
-    OFF_HEAD_MM,
-    STUBBLE_MM,
-    grown_to_outlines,
-    loosened,
-    parts_over_head,
-    scatter_of,
-    smooth_hair,
-)
+from pipeline.fusion.hair import OFF_HEAD_MM, STUBBLE_MM, grown_to_outlines, loosened, parts_over_head, smooth_hair
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
@@ -131,8 +123,3 @@ def test_scattered_depth_makes_handles_and_loosened_depth_of_hair_none(outlines:
         ).mesh_world
         handles.append(1 - (len(mesh.vertices) - len(mesh.faces) // 2) // 2)
     assert 3 * handles[1] < handles[0]
-
-
-@pytest.mark.parametrize(("known", "scatter"), [(0.53, 1.0), (0.75, 0.5), (0.82, 0.0)])
-def test_hair_whose_depth_is_known_is_solid(known: float, scatter: float) -> None:
-    assert scatter_of(known) == pytest.approx(scatter)
