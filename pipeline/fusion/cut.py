@@ -63,18 +63,18 @@ def find_cut(box: Grid, views: ViewStack, seen: Float[np.ndarray, "m 3"], head_w
         seen: points of the surface that is seen, world frame, mm.
         head_world: the fitted head; without it only photographs' ends count.
     """
-    from scipy.ndimage import gaussian_filter  # 0.05 s, and only a bust needs it
+    from scipy.ndimage import gaussian_filter  # 0.05 s
 
     places = box.places()
     edges_mm = np.sort(views.outside(places)[0], axis=0)
     frames = np.clip(edges_mm[min(1, len(edges_mm) - 1)], -FAR_MM, FAR_MM)  # of all cameras but one
     beyond = gaussian_filter(frames.reshape(box.shape), ROUND_MM / box.step_mm).ravel() - SPARED_MM
-    low = np.zeros(0, bool)
-    if head_world is not None:
-        vertices = head_world.vertices[::EVERY]
-        tree, low = PointTree.of(vertices), near_rim(head_world, vertices)
-        far, near = nearest(tree, seen)
-    if not low.any() or low[near].all() or not low[near].any():
+    if head_world is None:
+        return Cut(box, beyond, np.zeros(len(beyond), bool))
+    vertices = head_world.vertices[::EVERY]
+    tree, low = PointTree.of(vertices), near_rim(head_world, vertices)
+    far, near = nearest(tree, seen)
+    if low[near].all() or not low[near].any():
         return Cut(box, beyond, np.zeros(len(beyond), bool))
     below, under = low[near], low[nearest(tree, places)[1]]
     down = vertices[low].mean(axis=0) - vertices.mean(axis=0)

@@ -66,15 +66,14 @@ STRAND_SHARE = 0.5  # standard deviation of a moved vertex, by its way: strands 
 # and a beard, 0.82 and 0.84 of solid hair.
 SILENT_SHARE = 0.4
 LOOSER = 6.0  # by what the deviation of strands' depth is multiplied: the membrane bridges their pockets
-SCATTERED_SHARE = (0.8, 0.7)  # the same, below which what is known scatters, and scatters wholly
+SCATTERED_SHARE = (0.7, 0.8)  # the same, up to which what is known scatters wholly, and from which on not at all
 MIN_HAIR = 0.2  # of what is not clothes; with less, hair is not worth it
 LIKELY = 0.5  # probability from which on a place counts as a part
 # Share of the pixels about one whose depth must be known, for skin and for clothes to count. Specks amid hair are
 # chance; the face, which shows between the strands, and the shirt below them are known more evenly.
 DENSE_SKIN, DENSE_CLOTHES, WINDOW_MM = 0.5, 0.4, 15.0
 PIXEL_EVERY = 4  # pixel of a crop, in either direction, is looked at
-SHELL_VIEWS = 3  # that agree on a depth, for it to tell how deep the hair lies
-MAX_PLACES = 25_000
+SHELL_VIEWS, MAX_PLACES = 3, 25_000  # views that agree on a depth, for it to tell how deep the hair lies
 DEEPEST_MM = 30.0  # inside the hull; farther in a place belongs to something else
 SHELL_AROUND = 36  # places, whose median is the depth of the hair about them
 FACING = (-0.1, 0.2)  # cosine to a camera from which on the shell's outside counts as shown, and wholly
@@ -100,8 +99,7 @@ def find_silent_hair(
         Third, how far (0 to 1) the depth of hair is noise.
     """
     known = known_share(depth_maps, parts, rig)
-    most, least = SCATTERED_SHARE
-    scatter = float(np.clip((most - known) / (most - least), 0.0, 1.0))
+    scatter = float(np.interp(known, SCATTERED_SHARE, (1.0, 0.0)))
     if votes is None or known >= SILENT_SHARE:
         return (
             None,
@@ -123,8 +121,8 @@ def find_silent_hair(
     found = map_in_threads(lambda k: split(depth_maps[k]), len(depth_maps))
     places = np.concatenate([points for points, _ in found])
     if len(places) < SHELL_AROUND:
-        return None, depth_maps
-    return places[:: -(-len(places) // MAX_PLACES)], [each for _, each in found], scatter
+        return None, depth_maps, scatter
+    return places[:: -(-len(places) // MAX_PLACES)], [each for _, each in found], 0.0
 
 
 def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
