@@ -225,9 +225,9 @@ def distance_to_hull(places: Float[np.ndarray, "n 3"], views: ViewStack) -> Floa
     return np.where(edges_mm > 0.0, -np.inf, outlines_mm).max(axis=0)
 
 
-def parts_over_head(votes: PartVotes, head_world: Mesh) -> PartVotes:
-    """Returns the votes with the cells' heights over a head considered: hair that lies on its skin counts as skin, and
-    skin that lies off it as hair."""
+def parts_over_head(votes: PartVotes, head_world: Mesh, stubble: bool = True) -> PartVotes:
+    """Returns the votes with the cells' heights over a head considered: skin that lies off it counts as hair, and with
+    ``stubble`` hair that lies on its skin as skin."""
     skin, hair = Part.SKIN.channel, Part.HAIR.channel
     both, out = votes.probability[:, skin] + votes.probability[:, hair], votes.probability.copy()
     far, near = nearest(PointTree.of(head_world.vertices), votes.places)
@@ -235,7 +235,7 @@ def parts_over_head(votes: PartVotes, head_world: Mesh) -> PartVotes:
     alike = nearest(PointTree.of(votes.places), votes.places, count=min(CELLS, len(height)))[1]
     weight = out[alike, hair] + 1e-9
     mean_mm = (weight * height[alike]).sum(axis=1) / weight.sum(axis=1)
-    over = np.clip((mean_mm - STUBBLE_MM[0]) / (STUBBLE_MM[1] - STUBBLE_MM[0]), 0.0, 1.0)
+    over = np.interp(mean_mm, STUBBLE_MM, (0.0, 1.0)) if stubble else 1.0
     out[:, hair] = np.where(far > OFF_HEAD_MM, both, over * out[:, hair])
     out[:, skin] = both - out[:, hair]
     return replace(votes, probability=out)

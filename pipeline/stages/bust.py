@@ -73,7 +73,7 @@ def fuse_depth(
     settings = context.settings
     if settings.outputs.surface == "head":
         return Staged(None)
-    parts = None if depth.votes is None else parts_over_head(depth.votes, head_world)
+    parts = None if depth.votes is None else parts_over_head(depth.votes, head_world, stubble=False)
     hair, maps, scatter = find_silent_hair(depth.maps, labels.maps, parts, context.rig)
     try:
         surface = fuse(
