@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.compute.trace import traced
-from pipeline.fusion.contradiction_kernels import BLOCK, mark_contradicted
 from pipeline.fusion.view_stack import ViewStack
-from pipeline.fusion.vote_kernels import OUTLINE, PIXEL_STEP
+from pipeline.fusion.vote_kernels import BLOCK, OUTLINE, PIXEL_STEP, mark_contradicted
 
 MIN_VIEWS = 2  # that see something solid
 WIDENED_PX = 10.0  # by windows: glasses and collars of good captures, 8 px beyond their outlines
@@ -45,7 +44,7 @@ def silence_contradicted(views: ViewStack) -> tuple[ViewStack, Float[np.ndarray,
     for start, mask in zip(views.starts, wrong, strict=True):
         if mask is not None:
             shown[start : start + mask.size, OUTLINE][mask.ravel()] = SILENT_PX / PIXEL_STEP
-    return replace(views, shown=shown, steady=shares == 0.0), shares
+    return replace(views, shown=shown), shares
 
 
 def _beyond_windows(solid: Bool[np.ndarray, "r c"], outline_px: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -7,7 +7,7 @@ for each vertex. A signed distance is computed on a grid (``signed_distance``); 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -15,12 +15,24 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.compute.trace import traced
 from pipeline.fusion.contradiction import silence_contradicted
 from pipeline.fusion.crossings import without_coincidences
-from pipeline.fusion.hair_outline import STRAND_SHARE, grown_to_outlines
+from pipeline.fusion.hair import (
+    STRAND_SHARE,
+    Places,
+    grown_to_outlines,
+    parts_over_head,
+    shell_deviation_mm,
+    smooth_hair,
+)
 from pipeline.fusion.net_kernels import component_of, compose_well
-from pipeline.fusion.quality import deviation_mm, seen_deviation_mm, without_islands
-from pipeline.fusion.refinement import Measured, refine_vertices
+from pipeline.fusion.refinement import (
+    MAX_MM,
+    Measured,
+    deviation_mm,
+    refine_vertices,
+    seen_deviation_mm,
+    without_islands,
+)
 from pipeline.fusion.signed_distance import Level, NoSurface, solve
-from pipeline.fusion.silent_hair import SilentHair, shell_deviation_mm
 from pipeline.fusion.skin import HeadSkin, combine_with_head
 from pipeline.fusion.untangling import CLEAN, MeshFaults, mesh_faults, smooth_spots, topology_of
 from pipeline.fusion.view_stack import stack_views
@@ -38,6 +50,7 @@ from rig.progress import Progress
 from rig.rig import Rig
 
 TURNED_TO = 0.01  # steps from the surface at which a node that is turned over lies
+CAP_STEPS = 0.5  # from the bust's end within which a vertex belongs to its cap
 MIN_VIEWS = 3
 HEAD_STRIDE = 7  # every seventh vertex of the fitted head says which piece is the subject
 CONTRADICTED_TIMES, CONTRADICTED_SOFT = 3.0, 0.03  # of the views' median, and at most: soft masks that other programs
@@ -72,6 +85,8 @@ class DepthSurface:
     safe_world: Float[np.ndarray, "v 3"]  # places (mm) with which the mesh cannot cross itself
     measured: Measured
     warnings: tuple[ReportWarning, ...]
+    capped: Bool[np.ndarray, " v"]  # vertices of the cut that ends the bust
+    scatter: float  # how far (0 to 1) the depth of hair is noise
     shell_deviation_mm: float | None = None  # of hair that is a guess inside its outlines; None without such hair
 
 
@@ -84,7 +99,8 @@ def fuse(
     bias: WindowBias,
     spacing_mm: float,
     report: Progress,
-    hair: SilentHair | None = None,
+    hair: Places | None = None,
+    scatter: float = 0.0,
 ) -> DepthSurface:
     """Fuses the depth maps to one closed surface.
 
@@ -97,6 +113,7 @@ def fuse(
         spacing_mm: distance of the vertices.
         report: called with the stage's progress.
         hair: of which the depth maps say nothing; None if there is none.
+        scatter: how far (0 to 1) the depth of hair is noise.
 
     Raises:
         NoSurface: fewer than three views have any depth, or they contradict each other.
@@ -106,17 +123,19 @@ def fuse(
         raise NoSurface(compose("depth-in-too-few-views", count=len(maps), needed=MIN_VIEWS))
     views, contradicted = silence_contradicted(stack_views(maps, silhouettes, rig))
     report("bust", 0.1)
-    level = solve(maps, views, head_world, spacing_mm, hair)
+    level, cut = solve(maps, views, head_world, spacing_mm, hair)
     report("bust", 0.6)
     net, safe = closed_net(level, head_world)
     report("bust", 0.8)
     mesh, measured = refine_vertices(net, views, spacing_mm)
-    measured = without_islands(mesh, measured)
+    capped = cut.distance_mm(mesh.vertices) > -CAP_STEPS * spacing_mm
+    measured = without_islands(mesh, replace(measured, views=np.where(capped, 0, measured.views).astype(np.uint8)))
     names = [depth_map.camera.name for depth_map in maps]
     warnings = tuple(mask_warnings(names, contradicted))
     straight = without_bias(mesh, measured.views > 0, bias)
-    shell_mm = None if hair is None else shell_deviation_mm(hair, views)
-    return DepthSurface(straight, safe, measured, warnings, shell_mm)
+    return DepthSurface(
+        straight, safe, measured, warnings, capped, scatter, hair if hair is None else shell_deviation_mm(hair, views)
+    )
 
 
 @traced
@@ -139,14 +158,17 @@ def finished(
     """
     mesh, measured = surface.mesh_world, surface.measured
     seen = measured.views > 0
-    shares = None if votes is None else part_shares(votes, mesh.vertices)
-    shown = np.full(len(mesh.vertices), Part.SKIN, np.uint8) if votes is None else part_codes(votes, mesh.vertices)
+    shares, shown = np.tile([1.0, 0.0, 0.0], (len(seen), 1)), np.full(len(seen), Part.SKIN, np.uint8)
+    if votes is not None:
+        shown = part_codes(votes, mesh.vertices)
+        shares = part_shares(votes if head is None else parts_over_head(votes, head.mesh_world), mesh.vertices)
+    skin, moved_mm = shares[:, Part.SKIN.channel], np.zeros(len(seen))
+    strands = surface.scatter * shares[:, Part.HAIR.channel]
     if head is not None:
-        skin = 1.0 if shares is None else shares[:, Part.SKIN.channel]
         mesh = combine_with_head(mesh, seen * skin, head, seen_deviation_mm(measured))
-    moved_mm = np.zeros(len(seen))
-    if shares is not None and surface.shell_deviation_mm is None:
-        mesh, moved_mm = grown_to_outlines(mesh, shares[:, Part.HAIR.channel], silhouettes, rig)
+    mesh = smooth_hair(mesh, strands, seen, surface.capped)
+    if surface.shell_deviation_mm is None:
+        mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))
     clean = without_coincidences(Mesh(smooth_spots(mesh.vertices, topology, surface.safe_world), mesh.faces))
     mended_mm = np.linalg.norm(clean.vertices - mesh.vertices, axis=1)
@@ -156,6 +178,7 @@ def finished(
     if surface.shell_deviation_mm is not None:
         guessed = ~seen & facing_a_camera(mesh, rig)
         deviation[guessed] = np.minimum(deviation[guessed], surface.shell_deviation_mm)
+    deviation[surface.capped] = MAX_MM
     faults = mesh_faults(mesh.vertices.astype(np.float32).astype(float), topology)
     return BustSurface(mesh, deviation, part, measured.views, surface.warnings, faults)
 

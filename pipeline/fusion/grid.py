@@ -29,6 +29,10 @@ class Grid:
     def __len__(self) -> int:
         return len(self.index)
 
+    def places(self, rows: np.ndarray | slice = slice(None)) -> Float[np.ndarray, "m 3"]:
+        """Returns where nodes lie (world frame, mm)."""
+        return self.corner + self.step_mm * self.index[rows]
+
 
 def whole_box(corner: Float[np.ndarray, " 3"], edges_mm: Float[np.ndarray, " 3"], step_mm: float) -> Grid:
     """Returns the grid with every node of a box, from its corner, edges and step (mm, world frame)."""
@@ -60,6 +64,17 @@ def marked_box(grid: Grid, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "
     box = np.zeros(grid.shape, bool)
     box[tuple(grid.index[chosen].T)] = True
     return box
+
+
+def at_points(box: Grid, values: Float[np.ndarray, " n"], points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
+    """Returns the values of a whole box's nodes, interpolated linearly at points."""
+    at = np.clip((points - box.corner) / box.step_mm, 0.0, np.array(box.shape) - 1.001)
+    low = at.astype(int)
+    share, total, volume = at - low, np.zeros(len(points)), values.reshape(box.shape)
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, share, 1.0 - share).prod(axis=1)
+        total += weight * volume[tuple((low + corner).T)]
+    return total
 
 
 def _linked(

@@ -133,17 +133,16 @@ def smooth_offsets(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def blurred_over_mesh(values: np.ndarray, starts: np.ndarray, indices: np.ndarray, steps: int) -> np.ndarray:
-    """Returns values (n, 2) at vertices after ``steps`` in each of which a vertex takes the mean of its own and its
+    """Returns values (n, k) at vertices after ``steps`` in each of which a vertex takes the mean of its own and its
     neighbours' mean. The neighbours of vertex v are ``indices[starts[v]:starts[v + 1]]``."""
     one, other = values.copy(), np.empty_like(values)
     for _ in range(steps):
         for v in range(len(values)):
-            first, second = 0.0, 0.0
-            for k in range(starts[v], starts[v + 1]):
-                first += one[indices[k], 0]
-                second += one[indices[k], 1]
             count = max(starts[v + 1] - starts[v], 1)
-            other[v, 0] = 0.5 * (one[v, 0] + first / count)
-            other[v, 1] = 0.5 * (one[v, 1] + second / count)
+            for c in range(values.shape[1]):
+                total = 0.0
+                for k in range(starts[v], starts[v + 1]):
+                    total += one[indices[k], c]
+                other[v, c] = 0.5 * (one[v, c] + total / count)
         one, other = other, one
     return one

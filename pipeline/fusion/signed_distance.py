@@ -4,7 +4,7 @@ fitted head.
 It goes from a coarse box around the subject down to the requested spacing. Every view votes at every node
 (``vote_kernels``): with the distance to the surface that it sees there, and free space in front of it; it says nothing
 of what lies behind. Silhouettes bound the body from outside. Between votes a membrane interpolates
-(``relaxation_kernels``); what no camera sees is drawn to the fitted head with its hair and to the visual hull. The
+(``grid_kernels``); what no camera sees is drawn to the fitted head with its hair and to the visual hull. The
 coarsest level decides what is inside; each finer level is solved around the surface of the one before.
 
 Volumetric fusion with free space: Curless and Levoy, *A volumetric method for building complex models from range
@@ -13,19 +13,19 @@ are inequalities, and the membrane fills holes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32
 
 from pipeline.compute.threads import in_threads
 from pipeline.compute.trace import traced
 from pipeline.fusion import grid_kernels
-from pipeline.fusion.exclusion_kernels import BLOCK, mark_excluded
-from pipeline.fusion.grid import Grid, everywhere, marked_box, refined, whole_box
+from pipeline.fusion.cut import Cut, find_cut
+from pipeline.fusion.grid import Grid, at_points, everywhere, marked_box, refined, whole_box
+from pipeline.fusion.grid_kernels import Membrane, relax
+from pipeline.fusion.hair import Places, distance_to_shell
 from pipeline.fusion.prior import SeenSurface, distance_to_subject
-from pipeline.fusion.relaxation_kernels import Membrane, relax
-from pipeline.fusion.silent_hair import SilentHair, distance_to_shell
 from pipeline.fusion.view_stack import ALONE_FACTOR, VIEWS_SURE, ViewStack
 from pipeline.fusion.vote_kernels import vote
 from pipeline.stereo.depth_map import DepthMap, points_world
@@ -52,7 +52,6 @@ EVERY = 7  # known pixel is used to tell where a surface may be
 THINNED = 10  # of these tell how far the surface lies from head and hull
 WIDENINGS = 4  # of a grid by one coarse step
 STRAYS = 0.1  # per cent of these that may lie outside of the box
-HORN_MM, AWAY_MM = 30.0, 20.0  # radius of what a guess must hold, and how far from all that is seen it must
 UNSEEN_DEPTH_MM = 200.0  # of a body beyond what is seen of it, at most
 
 
@@ -73,12 +72,10 @@ class Votes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Holds the solution on one grid: at each node the signed distance (mm, negative inside) and the weight of the
-    votes there."""
+    """Holds the solution on one grid: at each node the signed distance (mm, negative inside)."""
 
     grid: Grid
     field: Field
-    weight: Field
 
 
 def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: float) -> Level:
@@ -103,46 +100,28 @@ def solve_level(grid: Grid, votes: Votes, start: Field, sweeps: int, factor: flo
             relax(field, membrane, rows, grid.neighbours, factor, first, last)
 
         in_threads(len(rows), sweep_nodes)
-    return Level(grid, field, votes.weight)
+    return Level(grid, field)
 
 
 def votes_at(grid: Grid, views: ViewStack) -> Votes:
     """Combines the views at every node of the grid."""
-    return _votes(grid.index, grid.corner, grid.step_mm, views)
-
-
-def votes_in_box(box: Grid, views: ViewStack) -> Votes:
-    """Combines the views at every node of a whole box. Blocks of nodes that two silhouettes exclude by more than the
-    reach of a vote are decided at once: that is most of a box."""
-    reach = REACH * box.step_mm
-    near = np.flatnonzero(~excluded_by_outlines(box, views, reach))
-    votes = _votes(box.index[near], box.corner, box.step_mm, views)
-    value, weight, bound = (np.full(len(box), at, np.float32) for at in (reach, 0.0, reach))
-    value[near], weight[near], bound[near] = votes.value, votes.weight, votes.bound
-    return Votes(value, weight, bound)
-
-
-def excluded_by_outlines(box: Grid, views: ViewStack, reach_mm: float) -> Bool[np.ndarray, " n"]:
-    """Tells which nodes of a whole box lie in a block that is more than ``reach_mm`` outside two silhouettes."""
-    excluded, packed = np.zeros(len(box), bool), views.packed()
-
-    def mark(first: int, last: int) -> None:
-        mark_excluded(box.shape, box.corner, box.step_mm, packed, views.steady, reach_mm, excluded, first, last)
-
-    in_threads(-(-box.shape[0] // BLOCK), mark)
-    return excluded
-
-
-def _votes(index: Int32[np.ndarray, "n 3"], corner: Float[np.ndarray, " 3"], step: float, views: ViewStack) -> Votes:
-    value, weight, bound = (np.zeros(len(index), np.float32) for _ in range(3))
+    step = grid.step_mm
+    value, weight, bound = (np.zeros(len(grid), np.float32) for _ in range(3))
     limits = np.array([REACH * step, BEHIND * step, max(1.0, AGREEMENT * step), UNIT_STEPS * step, FLOOR_MM])
     packed = views.packed()
 
     def fill(first: int, last: int) -> None:
-        vote(index, corner, step, packed, limits, value, weight, bound, first, last)
+        vote(grid.index, grid.corner, step, packed, limits, value, weight, bound, first, last)
 
-    in_threads(len(index), fill)
+    in_threads(len(grid), fill)
     return Votes(value, weight, bound)
+
+
+def ended(votes: Votes, grid: Grid, cut: Cut) -> Votes:
+    """Returns the votes with the end of the bust among the bounds."""
+    reach = REACH * grid.step_mm
+    beyond = np.clip(cut.distance_mm(grid.places()), -reach, reach).astype(np.float32)
+    return replace(votes, bound=np.maximum(votes.bound, beyond))
 
 
 @traced
@@ -151,8 +130,8 @@ def solve(
     views: ViewStack,
     head_world: Mesh | None,
     spacing_mm: float,
-    hair: SilentHair | None = None,
-) -> Level:
+    hair: Places | None = None,
+) -> tuple[Level, Cut]:
     """Computes the signed distance near the surface, on a sparse grid with a step of ``spacing_mm``, from coarse to
     fine. ``hair`` is what the depth maps do not show."""
     halvings = 1
@@ -162,34 +141,40 @@ def solve(
     agreed = np.concatenate([depth_map.views[depth_map.known][::EVERY] for depth_map in depth_maps])
     shown = seen
     if hair is not None:
-        shown = np.concatenate([seen, hair.places])
-        agreed = np.concatenate([agreed, np.full(len(hair.places), VIEWS_SURE)])
+        shown = np.concatenate([seen, hair])
+        agreed = np.concatenate([agreed, np.full(len(hair), VIEWS_SURE)])
     grid = whole_box(*_box(depth_maps, shown, spacing_mm * 2**halvings), spacing_mm * 2**halvings)
-    votes = votes_in_box(grid, views)
-    known = shown[::THINNED]
+    votes, known = votes_at(grid, views), shown[::THINNED]
+    hull_mm, cut = at_points(grid, votes.bound, known), find_cut(grid, views, known, head_world)
+    votes = ended(votes, grid, cut)
     weight = np.where(agreed[::THINNED] < VIEWS_SURE, ALONE_FACTOR**-2, 1.0)
-    guess = _prior(grid, votes, head_world, SeenSurface(known, at_points(grid, votes.bound, known), weight))
+    guess = _prior(grid, votes, head_world, SeenSurface(known, hull_mm, weight))
     if hair is not None:
-        guess = _with_shell(guess, votes, grid, hair, views)
+        shell, outside = distance_to_shell(hair, views, grid)  # of hair, where photographs show its outside
+        mixed = outside * np.maximum(shell, votes.bound) + (1.0 - outside) * guess
+        guess = np.where(grid.outer | (votes.weight >= WEAK), guess, mixed)
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
     for halving in range(halvings):
         wanted = grid_kernels.grown(marked_box(level.grid, grid_kernels.crossed(level.field, level.grid.neighbours)))
-        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views)
+        level = _finer(level.grid, box, wanted | _near_points(level.grid, seen), views, cut)
         if halving < halvings - 1:
             box = everywhere(level.grid, level.field, box)
-    return level
+            cut = cut.without_rags(level.grid, box)
+    return level, cut
 
 
 def _finer(
-    coarse: Grid, box: Float32[np.ndarray, "nx ny nz"], wanted: Bool[np.ndarray, "nx ny nz"], views: ViewStack
+    coarse: Grid, box: Float32[np.ndarray, "nx ny nz"], wanted: Bool[np.ndarray, "nx ny nz"], views: ViewStack, cut: Cut
 ) -> Level:
-    """Computes the signed distance at half the step about the ``wanted`` nodes. The grid is widened while the surface
-    would leave it; raises NoSurface if it still does after ``WIDENINGS``."""
+    """Computes the signed distance at half the step about the ``wanted`` nodes. ``cut`` tells where the bust
+    ends. The grid is widened while the surface would leave it; raises NoSurface if it
+    still does after ``WIDENINGS``."""
     for _ in range(WIDENINGS + 1):
         grid = refined(coarse, wanted)
         start = grid_kernels.interpolated(box, grid.index)
-        level = solve_level(grid, votes_at(grid, views), start, FINE_SWEEPS, FINE_FACTOR)
+        votes = ended(votes_at(grid, views), grid, cut)
+        level = solve_level(grid, votes, start, FINE_SWEEPS, FINE_FACTOR)
         if not grid_kernels.crossed_at_rim(level.field, grid.neighbours, grid.outer):
             return level
         wanted = grid_kernels.grown(wanted)
@@ -218,44 +203,11 @@ def _prior(grid: Grid, votes: Votes, head_world: Mesh | None, seen: SeenSurface)
         weak = (votes.weight > 0) & (votes.weight < WEAK) & (votes.bound < 0)
         guessed = weak | ((votes.weight <= 0) & (prior < 0))
         hull = np.where(weak, votes.bound, prior)[guessed]
-        places = grid.corner + grid.step_mm * grid.index[guessed]
+        places = grid.places(guessed)
         guess = distance_to_subject(places, hull, head_world, seen)
         prior[guessed] = np.where(weak[guessed] & np.isneginf(guess), prior[guessed], np.maximum(hull, guess))
     prior[grid.outer] = REACH * grid.step_mm
-    return without_horns(prior, votes, grid).astype(np.float32)
-
-
-def _with_shell(guess: Field, votes: Votes, grid: Grid, hair: SilentHair, views: ViewStack) -> Field:
-    """Returns the first guess with the shell of hair that no depth is known of, where photographs show its
-    outside."""
-    shell, shown = distance_to_shell(hair, views, grid)
-    reach = REACH * grid.step_mm
-    mixed = shown * np.maximum(shell, votes.bound) + (1.0 - shown) * guess
-    return np.where(grid.outer | (votes.weight >= WEAK), guess, np.clip(mixed, -reach, reach)).astype(np.float32)
-
-
-def at_points(box: Grid, values: Field, points: Points) -> Float[np.ndarray, " m"]:
-    """Returns the values of a whole box's nodes, interpolated linearly at points."""
-    at = np.clip((points - box.corner) / box.step_mm, 0.0, np.array(box.shape) - 1.001)
-    low = at.astype(int)
-    share, total, volume = at - low, np.zeros(len(points)), values.reshape(box.shape)
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, share, 1.0 - share).prod(axis=1)
-        total += weight * volume[tuple((low + corner).T)]
-    return total
-
-
-def without_horns(guess: Float[np.ndarray, " n"], votes: Votes, grid: Grid) -> Float[np.ndarray, " n"]:
-    """Removes thin fins and horns, into which no ball of radius ``HORN_MM`` fits, from the signed distance ``guess``
-    (mm, negative inside) on a whole box. They arise where no silhouette limits how far the subject may extend along the
-    lines of sight. Within ``AWAY_MM`` of points that a view sees, the guess is kept."""
-    from scipy.ndimage import distance_transform_edt  # 0.05 s, and only a bust needs it
-
-    radius = HORN_MM / grid.step_mm
-    core = np.asarray(distance_transform_edt((guess < 0).reshape(grid.shape))) > radius
-    filled = np.asarray(distance_transform_edt(~core)) <= radius
-    away = np.asarray(distance_transform_edt((votes.weight <= 0).reshape(grid.shape))) > AWAY_MM / grid.step_mm
-    return np.where((away & ~filled).ravel(), np.maximum(guess, 0.5 * grid.step_mm), guess)
+    return prior.astype(np.float32)
 
 
 def _near_points(grid: Grid, points: Points) -> Bool[np.ndarray, "nx ny nz"]:

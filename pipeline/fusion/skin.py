@@ -23,8 +23,7 @@ from jaxtyping import Bool, Float, Int32, Int64
 
 from pipeline.compute.trace import traced
 from pipeline.fusion.prior import near_rim
-from pipeline.fusion.quality import guessed_deviation_mm
-from pipeline.fusion.refinement import neighbours
+from pipeline.fusion.refinement import guessed_deviation_mm, neighbours
 from pipeline.fusion.refinement_kernels import blurred_over_mesh, smooth_offsets
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.surface_index import SurfaceIndex

@@ -4,12 +4,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int16, Int64
+from jaxtyping import Float, Float32, Int16, Int64
 
 from pipeline.compute.threads import map_in_threads
-from pipeline.fusion.view_stack_kernels import write_outline
-from pipeline.fusion.vote_kernels import NORMAL, NORMAL_STEP, SIGMA, SIGMA_STEP_MM, UNKNOWN, Pixels
+from pipeline.fusion.vote_kernels import (
+    FRAME,
+    NORMAL,
+    NORMAL_STEP,
+    OUTLINE,
+    PIXEL_STEP,
+    SIGMA,
+    SIGMA_STEP_MM,
+    UNKNOWN,
+    Pixels,
+    write_outline,
+)
 from pipeline.geometry.projection import packed_lens
+from pipeline.geometry.projection_kernels import LENS
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.stereo.depth_map import DepthMap
 from rig.camera import Camera
@@ -27,8 +38,7 @@ class ViewStack:
     ``cameras`` has a row for each view: rotation (9), translation (3), fx fy cx cy, and the centre in the world frame
     (3). ``shown`` has a row for each pixel, in the steps of ``vote_kernels``: normal (3, world frame, towards the
     camera), standard deviation of the depth, and signed distances (negative inside) to the silhouette's contour and to
-    the edge of the photograph. With the depth these are 16 bytes a pixel. ``steady`` tells of which views the distance
-    to the contour changes by no more than the way from pixel to pixel.
+    the edge of the photograph. With the depth these are 16 bytes a pixel.
     """
 
     cameras: Float[np.ndarray, "k 19"]
@@ -36,11 +46,28 @@ class ViewStack:
     starts: Int64[np.ndarray, " k"]
     depth_mm: Float32[np.ndarray, " p"]  # 0 where nothing is known
     shown: Int16[np.ndarray, "p 6"]
-    steady: Bool[np.ndarray, " k"]
 
     def packed(self) -> Pixels:
         """Returns the same arrays as a named tuple that compiled loops accept."""
         return Pixels(self.cameras, self.sizes, self.starts, self.depth_mm, self.shown)
+
+    def outside(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 k n"]:
+        """Returns how far (mm, negative inside) points (world, mm) lie outside each photograph, and outside its
+        silhouette; inf and inf behind the camera."""
+
+        def outside_of(view: int) -> Float[np.ndarray, "2 n"]:
+            camera, size = self.cameras[view], self.sizes[view][::-1]
+            x, y, z = camera[:9].reshape(3, 3) @ places.T + camera[9:12, None]
+            fx, fy, cx, cy = camera[LENS : LENS + 4]
+            depth = np.maximum(z, 1.0)
+            pixel = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=1)
+            within = np.clip(pixel, 0, size - 1.0)
+            column, row = np.rint(within).astype(int).T
+            edge, outline = PIXEL_STEP * self.shown[self.starts[view] + row * size[0] + column][:, [FRAME, OUTLINE]].T
+            beyond = edge + np.linalg.norm(pixel - within, axis=1)
+            return np.where(z > 1.0, np.stack([beyond, outline]) * depth / fx, np.inf)
+
+        return np.stack(map_in_threads(outside_of, len(self.cameras)), axis=1)
 
 
 def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhouette], rig: Rig) -> ViewStack:
@@ -67,7 +94,7 @@ def stack_views(depth_maps: Sequence[DepthMap], silhouettes: Mapping[str, Silhou
 
     map_in_threads(fill, len(depth_maps))
     cameras = np.stack([_packed(depth_map.camera) for depth_map in depth_maps])
-    return ViewStack(cameras, sizes, starts[:-1], depth_mm, shown, np.ones(len(depth_maps), bool))
+    return ViewStack(cameras, sizes, starts[:-1], depth_mm, shown)
 
 
 def _packed(camera: Camera) -> Float[np.ndarray, " 19"]:

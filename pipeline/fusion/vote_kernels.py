@@ -1,11 +1,12 @@
 """Compiled loops that combine the views' depths at a point: how far in front of the surface it lies, and whether
-silhouettes exclude the subject there."""
+silhouettes exclude the subject there; and what a view's outline says at its pixels, and other views against it."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, pinhole, placed
+from pipeline.geometry.projection_kernels import LENS, NEAREST_MM, distorted, pinhole, placed
+from pipeline.imaging.sampling_kernels import held, sample
 from rig.jit import njit
 
 NORMAL, SIGMA, OUTLINE, FRAME = 0, 3, 4, 5  # columns of ``Pixels.shown``; the normal has three
@@ -19,6 +20,10 @@ THICKEST_MM = 60.0  # of a body behind its surface, where no silhouette bounds i
 UNDECIDED = -1.0  # weight of a place inside of the outlines that only their guess beyond the photographs leaves out
 WIDENING = 1.0  # beyond a photograph a body may widen by as much as it lies beyond it: shoulders do
 FLATTEST = 0.1  # cosine beyond which a tangent plane says nothing of a place beside it
+BLOCK = 4  # pixels along the side of what is decided at once
+STRIDE = 3  # every third pixel of every third row stands for the others
+CLEAR_PX = 2.5  # a point nearer to the outline is ordinary: blur, hair, calibration
+SURE_MM = 1.0  # points with a larger deviation do not count
 
 
 class Pixels(NamedTuple):
@@ -66,7 +71,6 @@ def vote(
         hull, hull_next = -1e9, -1e9  # largest and second largest distance outside a silhouette
         guess = -1e9  # the largest one with silhouettes that go on, widening, beyond their photographs
         hidden = 1e9  # smallest depth behind a surface that is seen
-        framed, framed_next = 1e9, 1e9  # smallest and second smallest distance outside a photograph
         for v in range(len(cameras)):
             depth, column, row = seen_at(cameras[v], place)
             if depth <= NEAREST_MM:
@@ -75,7 +79,6 @@ def vote(
             at += starts[v]
             scale = depth / cameras[v, LENS]
             edge, off = (PIXEL_STEP * shown[at, FRAME] + beyond) * scale, PIXEL_STEP * shown[at, OUTLINE] * scale
-            framed, framed_next = min(framed, edge), min(framed_next, max(framed, edge))
             guess = max(guess, off - WIDENING * beyond * scale)
             if edge > 0.0:
                 continue
@@ -96,7 +99,6 @@ def vote(
             votes[count] = min(max(before, PLANE_SHARE * (depths[at] - depth)), reach)
             weights[count] = share
             count += 1
-        hull = max(hull, framed_next)
         bound[n] = min(max(hull, -reach), reach)
         value[n], weight[n] = agreed(votes, weights, count, agreement)
         if hull_next > reach:  # whatever views before those two say
@@ -167,3 +169,56 @@ def agreed(votes: np.ndarray, weights: np.ndarray, count: int, agreement: float)
         return 0.0, 0.0
     share = agreeing / total
     return mean / agreeing, agreeing * share * share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mark_contradicted(target: int, views: Pixels, blocks: np.ndarray, width: int) -> None:
+    """Marks blocks of the view ``target`` in which other views have a precise surface point outside of its outline:
+    sets bit v % 64 of ``blocks`` (rows, columns; words of 64 bits, changed in place) for each such view v.
+
+    ``width`` is the target's width in pixels. A block is ``BLOCK`` pixels wide.
+    """
+    cameras, sizes, starts, depths, shown = views
+    place = np.empty(3)
+    for v in range(len(cameras)):
+        if v == target:
+            continue
+        p, bit = cameras[v], np.uint64(1) << np.uint64(v % 64)
+        for row in range(0, sizes[v, 0], STRIDE):
+            for column in range(0, sizes[v, 1], STRIDE):
+                at = starts[v] + row * sizes[v, 1] + column
+                if shown[at, SIGMA] == UNKNOWN or shown[at, SIGMA] * SIGMA_STEP_MM >= SURE_MM:
+                    continue
+                depth = depths[at]
+                x, y = (column - p[LENS + 2]) / p[LENS] * depth, (row - p[LENS + 3]) / p[LENS + 1] * depth
+                for axis in range(3):  # the rotation's inverse, from the camera's centre
+                    place[axis] = p[axis] * x + p[3 + axis] * y + p[6 + axis] * depth + p[CENTRE + axis]
+                ahead, at_column, at_row = seen_at(cameras[target], place)
+                if ahead <= NEAREST_MM:
+                    continue
+                near, beyond = nearest_pixel(at_column, at_row, sizes[target])
+                there = starts[target] + near
+                if beyond == 0.0 and shown[there, FRAME] < 0 and shown[there, OUTLINE] * PIXEL_STEP > CLEAR_PX:
+                    blocks[near // width // BLOCK, near % width // BLOCK] |= bit
+
+
+@njit(cache=True, nogil=True)
+def write_outline(crop: np.ndarray, lens: np.ndarray, width: int, distance: np.ndarray, shown: np.ndarray) -> None:
+    """Fills two columns of ``shown`` in steps of ``PIXEL_STEP``: the signed distances (px of the crop) to the
+    silhouette's contour and to the photograph's border, both negative inside, at the pixels of an undistorted crop.
+
+    Outside the photograph the distance to the contour is that of the nearest pixel on its border, so that a shoulder
+    which the border cuts goes on. ``crop`` is fx, fy, cx, cy of the crop; ``lens`` that of the photograph
+    (``packed_lens``); ``width`` the crop's; ``distance`` (rows, columns) the silhouette's signed distance.
+    """
+    rows, columns = distance.shape
+    steps = crop[0] / lens[0] / PIXEL_STEP  # a crop of fewer pixels has shorter distances
+    for at in range(len(shown)):
+        u, v = distorted((at % width - crop[2]) / crop[0], (at // width - crop[3]) / crop[1], lens)
+        shown[at, FRAME] = _stepped(steps * max(max(-u, u - (columns - 1)), max(-v, v - (rows - 1))))
+        shown[at, OUTLINE] = _stepped(steps * sample(distance, held(u, columns), held(v, rows)))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _stepped(value: float) -> int:
+    return round(min(max(value, -32767.0), 32767.0))

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.detail.hair_shell import MIN_COVERED, HairShell, hair_shell
 from pipeline.fusion.fusion import BustSurface, DepthSurface, finished, fuse
+from pipeline.fusion.hair import find_silent_hair, parts_over_head
 from pipeline.fusion.signed_distance import NoSurface
-from pipeline.fusion.silent_hair import find_silent_hair
 from pipeline.fusion.skin import HeadSkin
 from pipeline.geometry.nearest import PointTree, nearest
 from pipeline.geometry.raster import depth_maps
@@ -75,7 +75,8 @@ def fuse_depth(
     settings = context.settings
     if settings.outputs.surface == "head":
         return Staged(None)
-    hair, maps = find_silent_hair(depth.maps, labels.maps, depth.votes, context.rig, head_world)
+    parts = None if depth.votes is None else parts_over_head(depth.votes, head_world, stubble=False)
+    hair, maps, scatter = find_silent_hair(depth.maps, labels.maps, parts, context.rig)
     try:
         surface = fuse(
             maps,
@@ -86,6 +87,7 @@ def fuse_depth(
             spacing_mm=settings.bust.spacing_mm,
             report=context.progress,
             hair=hair,
+            scatter=scatter,
         )
     except NoSurface as reason:
         return Staged(None, [compose("no-bust", reason=reason.message)])

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from pipeline.fusion.quality import MAX_MM, deviation_mm, without_islands
-from pipeline.fusion.refinement import Measured
+from pipeline.fusion.refinement import MAX_MM, Measured, deviation_mm, without_islands
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
 

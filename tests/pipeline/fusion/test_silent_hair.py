@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from pipeline.fusion.fusion import finished, fuse
-from pipeline.fusion.silent_hair import SilentHair, distance_to_hull, find_silent_hair, local_share, only_where
+from pipeline.fusion.hair import Places, distance_to_hull, find_silent_hair, local_share, only_where
 from pipeline.fusion.view_stack import stack_views
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
@@ -82,10 +82,10 @@ def head() -> Mesh:
     return Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32))
 
 
-def split(made: Scene, above: Part) -> tuple[SilentHair | None, Sequence[DepthMap], PartVotes | None]:
+def split(made: Scene, above: Part) -> tuple[Places | None, Sequence[DepthMap], PartVotes | None]:
     parts = labels(made, above)
     votes = vote_parts(made.maps, parts, made.rig)
-    return *find_silent_hair(made.maps, parts, votes, made.rig, head()), votes
+    return *find_silent_hair(made.maps, parts, votes, made.rig)[:2], votes
 
 
 def test_specks_become_a_smooth_shell_that_counts_as_unseen(strands: Scene) -> None:

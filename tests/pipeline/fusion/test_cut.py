@@ -1,0 +1,41 @@
+"""The bust ends smoothly where photographs end, and nothing of it lies behind what cameras see."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.fusion.cut import FAR_MM, find_cut
+from pipeline.fusion.grid import whole_box
+from pipeline.fusion.view_stack import ViewStack, stack_views
+from rig.mesh import Mesh
+from tests.support.ellipsoid_depths import Ellipsoid, scene
+from tests.support.scenes import fan
+
+
+@pytest.fixture(scope="module")
+def views() -> ViewStack:
+    made = scene([Ellipsoid((0, 0, 0), (60, 60, 60))], fan(200, 150))
+    return stack_views(made.maps, made.silhouettes, made.rig)
+
+
+def test_nothing_lies_behind_what_cameras_see_and_the_end_is_a_plane(views: ViewStack) -> None:
+    """A head of 50 mm without what is lower than -30, before cameras from +z; points of it and of a chest are seen."""
+    sphere = trimesh.creation.icosphere(5, 50.0)
+    kept = (sphere.vertices[sphere.faces][..., 1] > -30.0).all(axis=1)
+    head = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces[kept], np.int32))
+    front = head.vertices[(head.vertices[:, 1] > -30.0) & (head.vertices[:, 2] > 0.0)]
+    seen = np.concatenate([front, front + [0.0, -60.0, 0.0]])
+    cut = find_cut(whole_box(np.full(3, -150.0), np.full(3, 300.0), 6.0), views, seen, head)
+    across = np.stack([np.linspace(-30, 30, 9), np.full(9, -80.0), np.full(9, -90.0)], axis=1)
+    assert np.ptp(cut.distance_mm(across)) < 0.1
+    assert cut.distance_mm(across).min() > 20.0
+    assert (cut.distance_mm(head.vertices[head.vertices[:, 1] > 0.0]) < 1.0).all()
+    assert (cut.distance_mm(seen) < 1.0).all()
+
+
+def test_bust_ends_where_all_photographs_but_one_end(views: ViewStack) -> None:
+    box = whole_box(np.full(3, -400.0), np.full(3, 800.0), 12.0)
+    places = np.array([[0.0, 210.0, 0.0], [0.0, 180.0, 0.0]])
+    second = np.sort(views.outside(places)[0], axis=0)[1]
+    assert (np.abs(second) < FAR_MM / 2).all()
+    assert find_cut(box, views, np.zeros((9, 3)), None).distance_mm(places) == pytest.approx(second, abs=12.0)

@@ -1,0 +1,125 @@
+"""Hair is what lies off the head; it is smoothed, and moved out to its outlines where windows matched its core."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.fusion.fusion import fuse
+from pipeline.fusion.hair import OFF_HEAD_MM, STUBBLE_MM, grown_to_outlines, loosened, parts_over_head, smooth_hair
+from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
+from pipeline.part_labels.codes import Part
+from pipeline.part_labels.labelling import PartMap
+from pipeline.part_labels.votes import PartVotes
+from pipeline.stereo.window_bias import WindowBias
+from rig.mesh import Mesh
+from rig.progress import discard_progress
+from tests.support.ellipsoid_depths import Ellipsoid, Scene, scene
+from tests.support.scenes import fan
+
+OUTLINE_MM = 60.0
+
+
+@pytest.fixture(scope="module")
+def outlines() -> Scene:
+    return scene([Ellipsoid((0, 0, 0), (OUTLINE_MM, OUTLINE_MM, OUTLINE_MM))], fan(400, 300))
+
+
+def ball(radius_mm: float) -> Mesh:
+    made = trimesh.creation.icosphere(subdivisions=5, radius=radius_mm)
+    return Mesh(np.asarray(made.vertices), np.asarray(made.faces))
+
+
+def radii(mesh: Mesh) -> np.ndarray:
+    return np.linalg.norm(mesh.vertices, axis=1)
+
+
+def test_core_of_strands_grows_to_the_outline(outlines: Scene) -> None:
+    """Of 4 mm that are missing, 0.7 and 0.7 of the rest are added; a pixel is 1.4 mm."""
+    core = ball(56.0)
+    grown, moved_mm = grown_to_outlines(core, np.ones(len(core.vertices)), outlines.silhouettes, outlines.rig)
+    assert np.median(radii(grown)) == pytest.approx(59.6, abs=0.1)
+    assert radii(grown) == pytest.approx(59.6, abs=0.6)
+    assert moved_mm == pytest.approx(3.6, abs=0.6)
+
+
+def test_skin_beside_hair_stays(outlines: Scene) -> None:
+    core = ball(56.0)
+    up = core.vertices[:, 1] / 56.0
+    grown, moved_mm = grown_to_outlines(core, (up > 0.0).astype(float), outlines.silhouettes, outlines.rig)
+    assert moved_mm[up < -0.3].max() < 0.01
+    assert np.median(radii(grown)[up > 0.3]) > 59.0
+
+
+def test_single_hairs_do_not_carry_the_surface_along(outlines: Scene) -> None:
+    """A tenth of the outline stands 12 mm farther out than the rest."""
+    core = ball(56.0)
+    turn = np.arctan2(core.vertices[:, 1], core.vertices[:, 0])
+    short = np.abs(np.sin(6 * turn)) < 0.156  # a tenth
+    dented = Mesh(core.vertices * np.where(short, 44.0 / 56.0, 1.0)[:, None], core.faces)
+    grown, _ = grown_to_outlines(dented, np.ones(len(core.vertices)), outlines.silhouettes, outlines.rig)
+    assert np.median(radii(grown)[~short]) < OUTLINE_MM + 0.5
+
+
+def test_view_that_is_left_out_says_nothing(outlines: Scene) -> None:
+    core, name = ball(56.0), outlines.rig.names[1]
+    everywhere = silhouette_from_mask(np.ones_like(outlines.silhouettes[name].mask))
+    wrong = {**outlines.silhouettes, name: replace(everywhere, quality=ViewQuality(usable=False))}
+    without = {other: each for other, each in outlines.silhouettes.items() if other != name}
+    hair = np.ones(len(core.vertices))
+    grown, _ = grown_to_outlines(core, hair, wrong, outlines.rig)
+    expected, _ = grown_to_outlines(core, hair, without, outlines.rig)
+    np.testing.assert_array_equal(grown.vertices, expected.vertices)
+
+
+def test_head_without_hair_is_not_drawn(outlines: Scene) -> None:
+    core = ball(56.0)
+    grown, moved_mm = grown_to_outlines(core, np.zeros(len(core.vertices)), outlines.silhouettes, outlines.rig)
+    assert grown is core
+    assert not moved_mm.any()
+
+
+@pytest.mark.parametrize(
+    ("height_mm", "shown", "part"),
+    [
+        (0.5 * STUBBLE_MM[0], Part.HAIR, Part.SKIN),
+        (STUBBLE_MM[1] + 1.0, Part.HAIR, Part.HAIR),
+        (OFF_HEAD_MM + 1.0, Part.SKIN, Part.HAIR),
+        (0.5 * STUBBLE_MM[0], Part.CLOTHES, Part.CLOTHES),
+    ],
+)
+def test_height_over_the_head_decides_between_skin_and_hair(height_mm: float, shown: Part, part: Part) -> None:
+    places = ball(OUTLINE_MM + height_mm).vertices[::20]
+    cells = np.tile((np.arange(3) == shown.channel).astype(float), (len(places), 1))
+    votes = PartVotes(places.min(axis=0), np.array([40, 40, 40]), np.arange(len(places)), places, cells)
+    shares = parts_over_head(votes, ball(OUTLINE_MM)).probability
+    assert (shares[:, part.channel] > 0.99).all()
+
+
+def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
+    rng, mesh = np.random.default_rng(0), ball(OUTLINE_MM)
+    noisy = Mesh(mesh.vertices * (1.0 + rng.normal(0.0, 1.0 / OUTLINE_MM, (len(mesh.vertices), 1))), mesh.faces)
+    side = mesh.vertices[:, 0]
+    held = mesh.vertices[:, 2] > 40.0
+    smooth = smooth_hair(noisy, (side <= 0.0).astype(float), np.ones(len(side), bool), held)
+    assert np.array_equal(smooth.vertices[held], noisy.vertices[held])
+    off = radii(smooth)[(side < -20.0) & ~held] - OUTLINE_MM
+    assert off.std() < 0.25  # of 1 mm: the 45 vertices about one leave a seventh, and near ones count more
+    assert np.median(off) == pytest.approx(0.0, abs=0.5)
+    assert smooth.vertices[side > 20.0] == pytest.approx(noisy.vertices[side > 20.0], abs=0.05)
+
+
+def test_scattered_depth_makes_handles_and_loosened_depth_of_hair_none(outlines: Scene) -> None:
+    rng, handles = np.random.default_rng(0), []
+    noise = [np.where(each.known, rng.normal(0.0, 4.0, each.known.shape), 0.0) for each in outlines.maps]
+    maps = [replace(each, depth_mm=each.depth_mm + off) for each, off in zip(outlines.maps, noise, strict=True)]
+    shown = np.where(np.arange(3) == Part.HAIR.channel, 255, 0).astype(np.uint8)
+    labels = {c.name: PartMap(c.name, np.tile(shown, (300, 400, 1))) for c in outlines.rig}
+    for scatter in (0.0, 1.0):
+        loose = [loosened(each, labels, outlines.rig, scatter) for each in maps]
+        mesh = fuse(
+            loose, outlines.silhouettes, outlines.rig, None, bias=WindowBias(), spacing_mm=1.5, report=discard_progress
+        ).mesh_world
+        handles.append(1 - (len(mesh.vertices) - len(mesh.faces) // 2) // 2)
+    assert 3 * handles[1] < handles[0]
