@@ -97,7 +97,7 @@ class _Reading:
     untold: int = 0  # faults beyond those
     number: int = 0  # of the line that was read
 
-    def fault(self, code: str, number: int, **parameters: object) -> None:
+    def fault(self, code: str, number: int, **parameters: str | int) -> None:
         if len(self.faults) < FAULTS_TOLD:
             self.faults.append(compose(code, line=number, **parameters))
         else:

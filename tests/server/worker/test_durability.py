@@ -7,6 +7,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import tarfile
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
@@ -253,6 +254,24 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
             assert client.get(f"/v1/jobs/{job}").json()["state"] == "succeeded"
             again = submit(service, capture, 1)
             assert await_state(client, again, ("succeeded",))["files"] == client.get(f"/v1/jobs/{job}").json()["files"]
+
+
+def test_data_of_an_earlier_version_are_opened_and_its_jobs_end(tmp_path: Path) -> None:
+    """The data folder of a service of commit 3ee27d5, killed while one job was done, one ran and one waited; its rows
+    are pickled."""
+    with tarfile.open(Path(__file__).with_name("data_of_version_3ee27d5.tar.xz")) as archive:
+        archive.extractall(tmp_path / "data", filter="data")
+    with served_client(tmp_path / "data") as (service, client):
+        listed = client.get("/v1/jobs", params={"sort": "created"}).json()["jobs"]
+        ended = [await_state(client, job["id"], ("succeeded", "failed"), 60) for job in listed]
+        assert [job["state"] for job in ended] == ["succeeded"] * 3
+        assert ended[0] == listed[0]
+        for job in ended:
+            assert job["files"] == ended[0]["files"]
+            for name, file in job["files"].items():
+                body = client.get(f"/v1/jobs/{job['id']}/result/{name}").content
+                assert hashlib.sha256(body).hexdigest() == file["sha256"]
+        assert submit(service, ended[0]["capture_id"], 0) not in {job["id"] for job in listed}
 
 
 @pytest.mark.slow
