@@ -6,9 +6,9 @@ foreign web page makes a browser send are then refused by their Host and Origin 
 
 import asyncio
 import hashlib
-from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import Annotated
+from weakref import WeakValueDictionary
 
 from fastapi import Depends, Request
 from fastapi.concurrency import run_in_threadpool
@@ -22,7 +22,7 @@ from server.services.service import Service
 from server.wire.problems import Problem
 
 SLOW_S, SLOW_MOST = 0.1, 8  # what takes longer, as a shot of the rig does, makes room for so many beside it
-SMALL_BYTES = 64 << 10  # a longer body takes its client's time, not the service's
+SMALL_DIGITS = 5  # of a body's length in bytes; a longer one takes its client's time, not the service's
 
 bearer = HTTPBearer(auto_error=False, description="API key, eh_...; not needed on loopback while no key exists")
 
@@ -98,8 +98,7 @@ class FairShares:
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
         self._known: dict[bytes, str] = {}  # by the digest of the header that was accepted
-        self._lines: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
-        self._here, self._slow = Counter[str](), Counter[str]()
+        self._lines: WeakValueDictionary[str, _Line] = WeakValueDictionary()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one ASGI connection. What is no request to the API is passed on."""
@@ -108,10 +107,10 @@ class FairShares:
             return
         headers = dict(scope["headers"])
         shown = hashlib.sha256(headers.get(b"authorization", b"")).digest()
-        length = headers.get(b"content-length", b"0" if b"transfer-encoding" not in headers else b"")
-        long_body = not length.isdigit() or int(length) > SMALL_BYTES
         name = self._known.get(shown) or f"at {(scope.get('client') or ('',))[0]}"
-        line, held, slow = self._lines[name], False, False
+        line = self._lines.setdefault(name, _Line())
+        long_body = b"transfer-encoding" in headers or len(headers.get(b"content-length", b"")) > SMALL_DIGITS
+        held = slow = False
 
         def leave() -> None:
             nonlocal held
@@ -121,9 +120,9 @@ class FairShares:
 
         def make_room() -> None:
             nonlocal slow
-            if held and self._slow[name] < SLOW_MOST:
-                self._slow[name] += 1
+            if held and line.slow < SLOW_MOST:
                 slow = True
+                line.slow += 1
                 leave()
 
         async def receive_body() -> Message:
@@ -135,19 +134,17 @@ class FairShares:
             leave()
             await send(message)
 
-        self._here[name] += 1
+        await line.acquire()
+        held, timer = True, asyncio.get_running_loop().call_later(SLOW_S, make_room)
         try:
-            await line.acquire()
-            held, timer = True, asyncio.get_running_loop().call_later(SLOW_S, make_room)
-            try:
-                await self._app(scope, receive_body, begin_answer)
-            finally:
-                timer.cancel()
+            await self._app(scope, receive_body, begin_answer)
         finally:
+            timer.cancel()
             leave()
-            self._slow[name] -= slow
-            self._here[name] -= 1
-            if not self._here[name]:
-                del self._here[name], self._slow[name], self._lines[name]
+            line.slow -= slow
             if "caller" in scope:
                 self._known[shown] = scope["caller"]
+
+
+class _Line(asyncio.Lock):
+    slow = 0  # requests that made room

@@ -19,12 +19,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from functools import partial, wraps
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Concatenate
 
 import sqlalchemy as sa
 import structlog
@@ -67,8 +67,6 @@ from server.worker.result_files import add_warning, described
 LOST_S = 10.0  # between the end of a workflow and its row, which takes milliseconds
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
 
-P = ParamSpec("P")
-T = TypeVar("T")
 log = structlog.get_logger()
 
 
@@ -149,7 +147,7 @@ class Worker:
             return insist(worker._stop, lambda: worker.publish(job_id, attempt))
 
         @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=self.settings.attempts)
-        @self._noted
+        @self._noted()
         def reconstruct_job(request: JobRequest) -> dict[str, FileEntry]:
             job_id = DBOS.workflow_id
             assert job_id is not None
@@ -181,7 +179,7 @@ class Worker:
             return worker._webhooks.post(message)
 
         @DBOS.workflow(name=DELIVERY)
-        @self._noted
+        @self._noted()
         def deliver(message: WebhookMessage) -> int:
             return post(message)
 
@@ -190,25 +188,21 @@ class Worker:
             return worker.calibrate(identity)
 
         @DBOS.workflow(name=calibrations.WORKFLOW, max_recovery_attempts=self.settings.attempts)
-        @self._noted
+        @self._noted()
         def calibrate_rig(identity: str) -> CalibrationOutcome:
             return calibrate(identity)
 
         del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
 
-    def _noted(self, workflow: Callable[P, T]) -> Callable[P, T]:
-        """Notes the ids of the workflows that run here."""
-
-        @wraps(workflow)
-        def run(*arguments: P.args, **named: P.kwargs) -> T:
-            identity = DBOS.workflow_id or ""
-            self._here.add(identity)
-            try:
-                return workflow(*arguments, **named)
-            finally:
-                self._here.discard(identity)
-
-        return run
+    @contextmanager
+    def _noted(self) -> Iterator[None]:
+        """Notes the id of a workflow while it runs here."""
+        identity = DBOS.workflow_id or ""
+        self._here.add(identity)
+        try:
+            yield
+        finally:
+            self._here.discard(identity)
 
     def ingest(self, job_id: str, request: JobRequest) -> None:
         """Checks that a job's capture exists and that the disk has space, and makes the job's folder. Raises JobFailed
