@@ -19,7 +19,6 @@ from rig.messages.message import Message, compose
 MOST_VERTICES = 200_000  # 8 times a film's head; registering it takes 4 minutes and 2 GB. Larger files are scans
 MOST_CORNERS = 8 * MOST_VERTICES
 MOST_SIDES = 4096  # of a polygon: ten times what closes a neck; a fan of all corners takes minutes to follow
-MOST_LINES = 4 * MOST_CORNERS
 MOST_BYTES = 256 << 20
 FAULTS_TOLD = 12
 KEPT_STATEMENTS = ("o", "g", "s", "usemtl")
@@ -74,7 +73,7 @@ def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
     begun = ""
     for number, raw in enumerate(file, start=1):
         line = raw.rstrip()
-        if line.endswith("\\") and number <= MOST_LINES:
+        if line.endswith("\\"):
             begun += line[:-1] + " "
             continue
         yield number, begun + line
@@ -95,7 +94,6 @@ class _Reading:
     statements: list[tuple[int, str]] = field(default_factory=list)
     faults: list[Message] = field(default_factory=list)
     untold: int = 0  # faults beyond those
-    number: int = 0  # of the line that was read
 
     def fault(self, code: str, number: int, **parameters: str | int) -> None:
         if len(self.faults) < FAULTS_TOLD:
@@ -104,7 +102,6 @@ class _Reading:
             self.untold += 1
 
     def take(self, number: int, line: str) -> None:
-        self.number = number
         word, _, rest = line.strip().partition(" ")
         if word == "v":
             self.vertices.append(self._numbers(number, line, rest.split(), 3))
@@ -152,8 +149,7 @@ class _Reading:
         return row
 
     def too_large(self) -> bool:
-        counts = (len(self.vertices), MOST_VERTICES), (len(self.corners), MOST_CORNERS), (len(self.uv), MOST_CORNERS)
-        return any(count > most for count, most in (*counts, (self.number, MOST_LINES)))
+        return len(self.vertices) > MOST_VERTICES or len(self.corners) > MOST_CORNERS or len(self.uv) > MOST_CORNERS
 
     def finished(self, name: str) -> PolygonMesh:
         """Returns the arrays. Raises InputError."""

@@ -9,6 +9,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from server.services.keys import SCOPES
+from tests.support.attacks import add_keys
 from tests.support.services import ROOT, running_service
 
 SECONDS_MOST = 120  # drawing a shot of the simulated studio takes seconds, on a machine that is busy many
@@ -17,11 +19,10 @@ SECONDS_MOST = 120  # drawing a shot of the simulated studio takes seconds, on a
 @pytest.mark.slow
 @pytest.mark.gl
 @pytest.mark.timeout(900)
-def test_schemathesis_finds_nothing(tmp_path: Path) -> None:
-    data, environment = tmp_path / "data", os.environ | {"EIGENHEAD_DATA": str(tmp_path / "data")}
-    command = [sys.executable, "-m", "server.cli", "keys", "add", "schemathesis"]
-    key = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
-    with running_service(data) as service:
+@pytest.mark.parametrize("scope", ["admin", *(pytest.param(s, marks=pytest.mark.nightly) for s in SCOPES[:-1])])
+def test_schemathesis_finds_nothing(tmp_path: Path, scope: str) -> None:
+    with running_service(tmp_path / "data") as service:
+        key = add_keys(service, scope)[0]
         while not httpx.get(service.url + "/readyz", timeout=60).json()["ready"]:
             time.sleep(0.2)
         command = [
