@@ -137,7 +137,7 @@ def _refuse_blind_cameras(detections: Detections, dropped: Sequence[Dropped]) ->
 
 
 def _adjust(graph: Graph, detections: Detections, lenses: dict[str, Lens], report: Progress) -> _Fit:
-    """The bundle, again and again until nothing contradicts it any more."""
+    """Repeats the bundle adjustment until no observation contradicts it."""
     names, noise = graph.names, np.array([lenses[name].noise_px for name in graph.names])
     weak = weak_prior([detections.sizes[name] for name in names])
     dropped = list(_explain(graph.strays, graph, graph.state(lenses), detections, float(np.median(noise))))

@@ -8,11 +8,10 @@ from pipeline.stages.alignment import Alignment, align_head
 from pipeline.stages.bust import colour_bust, fuse_depth, push_out_hair, shape_bust
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.depth import measure_depth
-from pipeline.stages.evidence import judge_head
+from pipeline.stages.evidence import check_pose, judge_head
 from pipeline.stages.faces import find_faces
 from pipeline.stages.head_fit import HeadFit, fit_head, fit_outlines
 from pipeline.stages.part_labels import PartLabels, find_worn_cap, label_parts
-from pipeline.stages.pose_check import check_pose
 from pipeline.stages.recorder import Recorder
 from pipeline.stages.refined_head import refine_head
 from pipeline.stages.texturing import texture_head
@@ -67,12 +66,12 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
             )
     with run.stage("bust") as stage:
         bust = stage.keep(colour_bust(stage.context, views, surface.product, texturing.capture))
-        hair = stage.keep(push_out_hair(stage.context, refined, bust))
+        hair = stage.keep(push_out_hair(stage.context, views, refined, bust, texturing.capture))
     if any(warning.code == "pose-doubtful" for warning in run.warnings):  # of a refusal that was overruled, too
         pose = replace(pose, doubtful=True)
     refuse(run.warnings, context.settings.fail_on)
     context.progress("done", 1.0)
-    return Reconstruction(
+    result = Reconstruction(
         model_name=context.model.name,
         model_sha256=context.model.sha256,
         settings=context.settings,
@@ -92,3 +91,4 @@ def reconstruct(context: ReconstructionContext) -> Reconstruction:
         warnings=run.warnings,
         seconds=run.seconds(),
     )
+    return result.widen_by_scale(context.rig.scale_sigma) if context.rig.scale_sigma else result

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from pipeline.typed_tables import read_fields
 from pipeline.warnings import WARNING_CODES
 from rig.colour_space import COLOUR_NAMES, srgb_from_text
 from rig.errors import InputError
 from rig.messages.message import Message, compose
+from rig.typed_tables import read_fields
 
 PHOTO_LEVELS = (None, "photo", "fine", "pores")  # of detail: those that look inside the outline
 FINE_LEVELS = (None, "fine", "pores")  # and those that draw the head to the dense surface

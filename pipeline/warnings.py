@@ -32,6 +32,7 @@ WARNING_CODES = (
     "masks-exchanged",
     "masks-of-alpha",
     "masks-off-edges",
+    "crown-low",
     "moments-differ",
     "no-albedo",
     "no-bust",

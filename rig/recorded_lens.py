@@ -25,10 +25,12 @@ ROUNDS, EXACT = 100, 1e-12  # iterations and tolerance of the inverse of either 
 
 @dataclass(frozen=True, slots=True)
 class RecordedLens:
-    """Holds a lens model and its coefficients, in the order of ``COEFFICIENTS[model]``."""
+    """Holds a lens model, its coefficients in the order of ``COEFFICIENTS[model]``, and the skew of its pixels: entry
+    (0, 1) of the camera matrix, in focal lengths fx. The pinhole has none."""
 
     model: LensModel
     coefficients: tuple[float, ...]
+    skew: float = 0.0
 
     def distorted(self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 2"]:
         """Returns where the pinhole's ``pixels`` lie in the recorded picture. ``matrix`` is the camera matrix of
@@ -42,7 +44,8 @@ class RecordedLens:
             projected = cv2.fisheye.projectPoints(rays[None], none, none, matrix, lens)[0]
         else:
             projected = cv2.projectPoints(rays, none, none, matrix, lens)[0]
-        return projected.reshape(-1, 2)
+        projected = projected.reshape(-1, 2)
+        return projected + np.outer(_rows(projected, matrix), [self.skew * matrix[0, 0], 0.0])
 
     def undistorted(
         self, pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]
@@ -51,7 +54,8 @@ class RecordedLens:
         of both."""
         import cv2
 
-        lens, places = np.array(self.coefficients), pixels.reshape(1, -1, 2)
+        straight = pixels - np.outer(_rows(pixels, matrix), [self.skew * matrix[0, 0], 0.0])
+        lens, places = np.array(self.coefficients), straight.reshape(1, -1, 2)
         until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, ROUNDS, EXACT)
         if self.model == "kannala-brandt":
             undistorted = cv2.fisheye.undistortPoints(places, matrix, lens, R=None, P=matrix, criteria=until)
@@ -73,6 +77,11 @@ class RecordedLens:
         return cv2.remap(picture, across, down, way, borderMode=cv2.BORDER_CONSTANT)
 
 
+def _rows(pixels: Float[np.ndarray, "n 2"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " n"]:
+    """Returns ``Y / Z`` of pixels, by which a skew shifts them across."""
+    return (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
+
+
 @lru_cache(maxsize=4)  # a photograph, its plates and its mask come one after the other
 def _maps(lens: RecordedLens, size: tuple[int, int], values: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     import cv2
@@ -80,4 +89,6 @@ def _maps(lens: RecordedLens, size: tuple[int, int], values: tuple[float, ...]) 
     matrix, coefficients = np.array(values).reshape(3, 3), np.array(lens.coefficients)
     make = cv2.fisheye.initUndistortRectifyMap if lens.model == "kannala-brandt" else cv2.initUndistortRectifyMap
     across, down = make(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
+    if lens.skew:
+        across = across + (lens.skew * matrix[0, 0] / matrix[1, 1] * (down - matrix[1, 2])).astype(np.float32)
     return across, down

@@ -25,9 +25,11 @@ class UnknownCamera(EigenheadError, KeyError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:
-    """Holds the cameras, in the order of their file."""
+    """Holds the cameras, in the order of their file. ``scale_sigma`` is the relative standard deviation of all lengths,
+    where they were estimated from photographs: what it moves, it moves in all cameras together."""
 
     cameras: tuple[Camera, ...]
+    scale_sigma: float = 0.0
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -53,11 +55,12 @@ class Rig:
     def subset(self, names: Iterable[str]) -> "Rig":
         """Returns the rig of the named cameras only, in the rig's order."""
         retained = set(names)
-        return Rig(tuple(camera for camera in self.cameras if camera.name in retained))
+        return replace(self, cameras=tuple(camera for camera in self.cameras if camera.name in retained))
 
     def scaled(self, factor: float) -> "Rig":
         """Returns the rig for images scaled by ``factor``."""
-        return Rig(tuple(replace(camera, intrinsics=camera.intrinsics.scaled(factor)) for camera in self.cameras))
+        cameras = (replace(camera, intrinsics=camera.intrinsics.scaled(factor)) for camera in self.cameras)
+        return replace(self, cameras=tuple(cameras))
 
     def centre_world(self) -> Float[np.ndarray, " 3"]:
         """Returns the point (mm) nearest to all optical axes by least squares, near which the subject should be."""

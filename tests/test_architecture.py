@@ -114,6 +114,7 @@ LONG_FOR_A_REASON = {
 }
 
 MANY_FOR_A_REASON = {
+    "server.cli.export.export": "each is an option of a command",
     "server.cli.heads.reconstruct": "each is an option of a command",
     "server.cli.batch.batch": "each is an option of a command",
     "server.http.routes.jobs.list_jobs": "each is a parameter of the query",

@@ -31,9 +31,8 @@ from tests.support.services import ROOT, running_service, small_capture
 from tests.tools.reference import OF_OTHERS
 
 DOCS = ROOT / "docs"
-KEPT = DOCS / "results"  # words around kept figures, no pages
 NOTES = ROOT / "tests" / "laboratory" / "notes"
-PAGES = sorted({*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *NOTES.glob("*.md")} - {*KEPT.glob("*.md")})
+PAGES = sorted({*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *NOTES.glob("*.md")})
 LINK = re.compile(r"(?<!!)\[[^\]]+\]\(([^)\s]+)\)")
 CAN_BE_MADE_AGAIN = {"cache", "incoming", "uploads", "trash", "set-aside"}
 

@@ -1,6 +1,5 @@
 """deploy/setup.sh and what it stands on: the download of uv, the quick way out, the list of allowed skips."""
 
-import functools
 import hashlib
 import importlib.util
 import io
@@ -8,15 +7,16 @@ import os
 import shutil
 import subprocess
 import sys
-import threading
 import time
 import zipfile
 from collections.abc import Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from tests.support.loopback import served
 
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAM = b"#!/bin/sh\necho uv 9.9.9\n"
@@ -32,11 +32,6 @@ def fetch_uv() -> ModuleType:
     return module
 
 
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:
-        pass
-
-
 @pytest.fixture
 def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A package index on this machine with one wheel; relative links, as mirrors have them."""
@@ -50,13 +45,10 @@ def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (site / "files" / "uv-1.0-x.whl").write_bytes(wheel.getvalue())
     page = '<a href="../../files/uv-0.9-x.whl">old</a><a href="../../files/uv-1.0-x.whl#sha256=whatever">new</a>'
     (site / "simple" / "uv" / "index.html").write_text(page)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(site)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    monkeypatch.setenv("UV_DEFAULT_INDEX", f"http://127.0.0.1:{server.server_port}/simple")
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    yield site
-    server.shutdown()
-    server.server_close()
+    with served(SimpleHTTPRequestHandler, site) as url:
+        monkeypatch.setenv("UV_DEFAULT_INDEX", f"{url}/simple")
+        yield site
 
 
 def pin(fetch_uv: ModuleType, monkeypatch: pytest.MonkeyPatch, filename: str, digest: str) -> None:

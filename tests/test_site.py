@@ -30,11 +30,7 @@ def targets(pattern: re.Pattern[str], page: Path) -> set[str]:
 
 def test_every_document_is_a_page(site: Path) -> None:
     docs = ROOT / "docs"
-    pages = {
-        path.relative_to(docs).with_suffix(".html")
-        for path in docs.rglob("*.md")
-        if docs / "results" not in path.parents
-    }
+    pages = {path.relative_to(docs).with_suffix(".html") for path in docs.rglob("*.md")}
     assert pages < {page.relative_to(site) for page in site.rglob("*.html")}
     assert "Two commands" in (site / "index.html").read_text(encoding="utf-8")
 

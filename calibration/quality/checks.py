@@ -100,8 +100,8 @@ def check_scale(board: Board, aspect: float, aspect_sigma: float) -> Check:
 
 
 def check_frame(rig: Rig, board: Board) -> Check:
-    """Checks that a head fits into what the pictures show where the cameras look, as it does not where ``square_mm`` is
-    in another unit."""
+    """Checks that the frame where the cameras look is as large as a head needs; if ``square_mm`` is in another unit, it
+    is far too small."""
     frame = frame_mm(rig)
     advice = compose("advice-square-unit", square_mm=board.square_mm)
     return Check("frame", frame >= FRAME_LEAST_MM, compose("frame-shown", frame_mm=frame), advice)

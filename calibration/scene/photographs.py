@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from rig.capture import TEXTURE_SETS
 from rig.errors import InputError
 from rig.formats.cameras.cameras_json import CAMERAS_LEAST, name_fault
 from rig.formats.captures.capture_folder import capture_root, size_fault
 from rig.formats.captures.capture_masks import mask_subjects
-from rig.formats.captures.shot_files import BESIDE_PICTURES, find_files
-from rig.formats.pictures.images import decode_image_file, is_picture
+from rig.formats.captures.shot_files import ASIDE, find_files, listed_pictures, picture_folder
+from rig.formats.pictures.images import decode_image_file
+from rig.formats.pictures.picture_names import entry, safe_name
 from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -47,36 +47,34 @@ def find_photographs(folder: Path) -> Photographs:
     if not folder.is_dir():
         raise InputError(folder.name, [compose("no-folder-of-photographs")])
     root = capture_root(folder)
-    root = root / "images" if (root / "images").is_dir() else root
-    flat = _pictures(root)
-    beside = [
-        path for path in sorted(root.iterdir()) if path.is_dir() and path.name not in (*BESIDE_PICTURES, TEXTURE_SETS)
-    ]
-    folders = {path.name: _pictures(path) for path in beside}
+    root = picture_folder(root)
+    flat = listed_pictures(root)
+    beside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name.lower() not in ASIDE]
+    folders = {safe_name(path.name): listed_pictures(path) for path in beside}
     folders = {name: files for name, files in folders.items() if files}
     if flat and folders:
         mixed = compose("photographs-beside-folders")
         raise InputError(folder.name, [mixed])
-    files = folders or {path.stem: [path] for path in flat}
+    files = folders or {safe_name(path.stem): [path] for path in flat}
     faults = [compose("camera-rename", fault=fault) for name in files if (fault := name_fault(name))]
     if len(files) < CAMERAS_LEAST:
         faults.append(compose("photographs-too-few", count=len(files), needed=CAMERAS_LEAST))
     for name, paths in [*folders.items()] or [(compose("the-folder"), flat)]:
-        stems = [path.stem for path in paths]
+        stems = [safe_name(path.stem) for path in paths]
         twice = sorted({stem for stem in stems if stems.count(stem) > 1})
         faults += [compose("photograph-repeated", folder=name, name=stem, count=stems.count(stem)) for stem in twice]
     if faults:
         raise InputError(folder.name, say_once(faults, files))
     if folders:
         return Photographs({name: {path.stem: path for path in paths} for name, paths in folders.items()})
-    return Photographs({path.stem: {ONE_SHOT: path} for path in flat})
+    return Photographs({name: {ONE_SHOT: path} for name, (path,) in files.items()})
 
 
 def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bool[np.ndarray, "_ _"]]:
     """Reads the masks (True = subject) in masks/ beside the photographs of a single shot, by camera. Raises InputError
     for a mask that is damaged or of another size than its photograph."""
     root = capture_root(folder)
-    if photographs.shots != (ONE_SHOT,) or not (root / "masks").is_dir():
+    if photographs.shots != (ONE_SHOT,) or not entry(root, "masks").is_dir():
         return {}
     planes, faults = {}, list[Message]()
     for name, path in find_files(root, rig, [name for name in photographs.names if name not in rig]).masks.items():
@@ -93,7 +91,3 @@ def find_masks(folder: Path, photographs: Photographs, rig: Rig) -> dict[str, Bo
     if faults:
         raise InputError(folder.name, faults)
     return dict(masks)
-
-
-def _pictures(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if is_picture(path))

@@ -34,15 +34,18 @@ def scaled_by_length(capture: Capture, rig: Rig, full: Rig, known: KnownLength) 
     """
     scale = _scale(capture, rig, full, known)
     if abs(np.log(scale.factor)) <= max(AGREES_LEAST, AGREES_SHARES * scale.share):
-        return rig, []
-    return times(rig, scale.factor), [compose("cameras-scaled", factor=scale.factor, scale=scale.provenance)]
+        return replace(rig, scale_sigma=min(rig.scale_sigma, scale.share)), []
+    return replace(times(rig, scale.factor), scale_sigma=scale.share), [
+        compose("cameras-scaled", factor=scale.factor, scale=scale.provenance)
+    ]
 
 
 def times(rig: Rig, factor: float) -> Rig:
     """Returns the rig with all its lengths multiplied by ``factor`` and its covariances scaled accordingly."""
     grows = np.diag([1.0, 1.0, 1.0, factor, factor, factor])
-    return Rig(
-        tuple(
+    return replace(
+        rig,
+        cameras=tuple(
             replace(
                 camera,
                 camera_from_world=replace(
@@ -51,7 +54,7 @@ def times(rig: Rig, factor: float) -> Rig:
                 covariance=None if camera.covariance is None else grows @ camera.covariance @ grows,
             )
             for camera in rig
-        )
+        ),
     )
 
 

@@ -1,12 +1,13 @@
 """Finds how many millimetres the unit of a scene is: from a known length in it, or else from the usual size of heads.
 
 Enters: a structure in any unit. Leaves: the factor, with its relative standard deviation and where it comes from. The
-known lengths are those of ``scale.json``. Without one, the points around the point that the cameras see are assumed to
-be a head, as far from their middle as the model's mean head is from its own. Hair, a neck and the table distort that,
-so that it is right to a fifth only, and it is marked as an assumption wherever it is shown.
+known lengths are those of ``scale.json``. Without one, the face in the photographs is assumed to be as large as a mean
+adult's. Where no two views show one, the points around the point that the cameras see are assumed to be a head, as far
+from their middle as the model's mean head is from its own; hair, a neck and the table distort that. Both are marked as
+an assumption wherever they are shown.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -15,17 +16,21 @@ from jaxtyping import Float, UInt8
 
 from calibration.scene.photographs import Photographs
 from calibration.scene.structure import Structure
+from pipeline.faces.networks import load_networks
+from pipeline.faces.subject import SearchEffort, find_subject
 from pipeline.multiview.triangulation import NoPoint, TriangulatedPoint, triangulate
 from rig.errors import InputError
 from rig.formats.cameras.scale_json import CameraDistance, KnownLength, PointDistance, TagSize, dictionaries
 from rig.formats.pictures.images import decode_image_file
+from rig.formats.pictures.work_size import WORK_PIXELS, work_rig, work_share
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 PICKED_PX = 1.0  # of a point picked by hand, an axis
 TAG_PX = 0.3  # of a tag's corner, refined below a pixel
 HEAD_SHARE = 0.2  # standard deviation of what the size of a head tells
-ASSUMED = "head-size"
+FACE_SHARE = 0.06  # of a face's: adults' differ by .05 (ANSUR II: breadth and height), the network's points by .03
+ASSUMED = ("face-size", "head-size")
 HALF_PIXEL = 0.5
 """AprilTag's edge lines count from a pixel's corner. They leave sides unbiased; OpenCV's own corners, refined below a
 pixel, lie 0.15 px inside each way: 1 % of a tag of 35 px."""
@@ -40,7 +45,7 @@ class Scale:
     Attributes:
         factor: millimetres in its unit of length.
         share: relative standard deviation of ``factor``.
-        source: points, tag, cameras or head-size.
+        source: points, tag, cameras, face-size or head-size.
         provenance: where the scale comes from, as a sentence.
     """
 
@@ -52,21 +57,21 @@ class Scale:
     @property
     def assumed(self) -> bool:
         """Tells whether the scale is assumed, because the photographs hold nothing of known length."""
-        return self.source == ASSUMED
+        return self.source in ASSUMED
 
 
 def find_scale(
     structure: Structure, known: KnownLength | None, photographs: Photographs, head: Float[np.ndarray, "v 3"]
 ) -> Scale:
-    """Computes the scale of a structure from a ``known`` length or, if that is None, from the size of a mean head
-    (``head``: its vertices, mm). Raises InputError if the photographs do not show the known length."""
+    """Computes the scale of a structure from a ``known`` length or, if that is None, from the size of a mean face, or
+    of a mean head (``head``: its vertices, mm). Raises InputError if the photographs do not show the known length."""
     if isinstance(known, PointDistance):
         return scale_from_points(structure.rig, known)
     if isinstance(known, CameraDistance):
         return scale_from_cameras(structure.rig, known)
     if isinstance(known, TagSize):
         return scale_from_tags(structure.rig, known, find_tags(photographs, known))
-    return scale_from_head(structure, head)
+    return scale_from_face(structure.rig, photographs) or scale_from_head(structure, head)
 
 
 def scale_from_cameras(rig: Rig, known: CameraDistance) -> Scale:
@@ -117,33 +122,28 @@ Tags = Mapping[tuple[str, int], Mapping[str, Float[np.ndarray, "4 2"]]]
 def find_tags(photographs: Photographs, known: TagSize) -> Tags:
     """Finds the tags of a dictionary in all photographs. Returns their corners (px) by (shot, number of the tag), then
     by camera."""
-    detector = _tag_detector(known)
-    tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
-    for camera, shots in photographs.files.items():
-        for shot, path in shots.items():
-            pixels, _, _ = decode_image_file(path, path.name, "grey")
-            assert pixels is not None  # matching has read it
-            for number, corners in _tags_in(pixels, detector).items():
-                tags.setdefault((shot, number), {})[camera] = corners
-    return tags
+    files = ((camera, shot, path) for camera, shots in photographs.files.items() for shot, path in shots.items())
+    decoded = ((camera, shot, decode_image_file(path, path.name, "grey")[0]) for camera, shot, path in files)
+    return _tags_of(((camera, shot, grey) for camera, shot, grey in decoded if grey is not None), known)
 
 
 def find_tags_of_shot(images: Mapping[str, UInt8[np.ndarray, "_ _ 3"]], known: TagSize) -> Tags:
     """Finds the tags of a dictionary in the pictures of one shot. Returns their corners (px) by tag, then by camera.
     The key of a tag is ("", its number), since the shot has no name."""
-    detector = _tag_detector(known)
-    tags: dict[tuple[str, int], dict[str, np.ndarray]] = {}
-    for camera, image in images.items():
-        for number, corners in _tags_in(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), detector).items():
-            tags.setdefault(("", number), {})[camera] = corners
-    return tags
+    grey = ((camera, "", np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))) for camera, image in images.items())
+    return _tags_of(grey, known)
 
 
-def _tag_detector(known: TagSize) -> cv2.aruco.ArucoDetector:
+def _tags_of(pictures: Iterable[tuple[str, str, UInt8[np.ndarray, "h w"]]], known: TagSize) -> Tags:
+    """Finds tags in grey pictures of (camera, shot)."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     dictionary = cv2.aruco.getPredefinedDictionary(dictionaries()[known.dictionary])
-    return cv2.aruco.ArucoDetector(dictionary, parameters)
+    detector, tags = cv2.aruco.ArucoDetector(dictionary, parameters), dict[tuple[str, int], dict[str, np.ndarray]]()
+    for camera, shot, grey in pictures:
+        for number, corners in _tags_in(grey, detector).items():
+            tags.setdefault((shot, number), {})[camera] = corners
+    return tags
 
 
 def _tags_in(grey: UInt8[np.ndarray, "h w"], detector: cv2.aruco.ArucoDetector) -> dict[int, Float[np.ndarray, "4 2"]]:
@@ -186,13 +186,30 @@ def scale_from_tags(rig: Rig, known: TagSize, tags: Tags) -> Scale:
     return Scale(factor, float(np.median([share for _, share, _ in markers])), "tag", provenance)
 
 
+def scale_from_face(rig: Rig, photographs: Photographs) -> Scale | None:
+    """Assumes the scale at which the face in the first shot has a mean adult's size. Returns None if no two of the
+    photographs agree on a face."""
+    images, small = {}, work_rig(rig, WORK_PIXELS)
+    for camera in rig:
+        path = next(iter(photographs.files[camera.name].values()))
+        share = work_share(camera.intrinsics, WORK_PIXELS)
+        pixels, _, _ = decode_image_file(path, path.name, "colour", share=share)
+        assert pixels is not None  # matching has read it
+        images[camera.name] = pixels
+    effort = SearchEffort(with_eyes=False)
+    face = find_subject(images, small, load_networks(), eye_distance_mm=None, effort=effort).matched
+    if face is None or len(face.detections) < 2:
+        return None
+    return Scale(1.0 / face.world_from_face.scale, FACE_SHARE, ASSUMED[0], compose("scale-by-face"))
+
+
 def scale_from_head(structure: Structure, head: Float[np.ndarray, "v 3"]) -> Scale:
     """Assumes the scale at which the points around the subject are as far from their middle (median) as the vertices of
     a mean head ``head`` (mm) are from theirs."""
     points = _looked_at(structure)
     ratio = _median_radius(head) / _median_radius(points)
     provenance = compose("scale-by-head")
-    return Scale(ratio, HEAD_SHARE, ASSUMED, provenance)
+    return Scale(ratio, HEAD_SHARE, ASSUMED[1], provenance)
 
 
 def _looked_at(structure: Structure) -> Float[np.ndarray, "p 3"]:

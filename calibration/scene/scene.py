@@ -18,7 +18,7 @@ from calibration.scene.covariance import uncertainty
 from calibration.scene.matching import Matches, match_photographs
 from calibration.scene.photographs import find_masks, find_photographs
 from calibration.scene.result import SceneCalibration
-from calibration.scene.scale import HEAD_SHARE, Scale, find_scale
+from calibration.scene.scale import Scale, find_scale
 from calibration.scene.structure import Structure, solve_structure, why_not
 from calibration.silhouette_refinement.single import VIEWS_LEAST, refine_one
 from pipeline.head_model.model import load_model
@@ -129,7 +129,7 @@ def placed(
     reasons = (compose("located", where=name, fault=why) for name, why in left_out.items())
     warnings = [compose("left-out", what=reason) for reason in reasons]
     if scale.assumed:
-        warnings.append(compose("scale-good-to", scale=scale.provenance, share=HEAD_SHARE))
+        warnings.append(compose("scale-good-to", scale=scale.provenance, share=scale.share))
     warnings += [
         compose("pose-known-to", camera=name, px=px)
         for name, px in zip(here.rig.names, spread.pose_sigma_px, strict=True)
@@ -140,7 +140,7 @@ def placed(
     if len(here.rig) > CAMERAS_MOST:
         warnings.append(compose("joined-too-many", cameras=len(here.rig), most=CAMERAS_MOST))
     return SceneCalibration(
-        Rig(tuple(cameras)),
+        Rig(tuple(cameras), scale.share),
         here,
         spread,
         scale,

@@ -283,7 +283,8 @@ class _Refining:
 def _with_covariances(rig: Rig, covariance: Float[np.ndarray, "p p"], *, focal: bool) -> Rig:
     size = per_camera(focal=focal)
     blocks = [covariance[size * k : size * k + 6, size * k : size * k + 6] for k in range(len(rig))]
-    return Rig(tuple(replace(c, covariance=0.5 * (b + b.T)) for c, b in zip(rig, blocks, strict=True)))
+    cameras = (replace(c, covariance=0.5 * (b + b.T)) for c, b in zip(rig, blocks, strict=True))
+    return replace(rig, cameras=tuple(cameras))
 
 
 def _tangencies(capture: Mapping[str, Silhouette], rig: Rig, pairs: Pairs | None, *, outer: bool) -> list[Tangency]:

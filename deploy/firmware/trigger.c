@@ -1,4 +1,4 @@
-/* Firmware of the trigger box for an ATmega328P at 16 MHz (Arduino Uno, Nano): docs/trigger-protocol.md.
+/* Firmware of the trigger box for an ATmega328P at 16 MHz (Arduino Uno, Nano): docs/rig.md.
  *
  * Camera outputs 0..5 are PD2..PD7 (Arduino D2..D7), 6..11 are PB0..PB5 (D8..D13); light outputs 0..3 are
  * PC0..PC3 (A0..A3). All are active high. UART0 runs at 115200 baud, 8N1.

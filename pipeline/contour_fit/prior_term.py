@@ -5,10 +5,10 @@ Most faces are neutral, and the others combine few expressions. The prior of an 
 
     p(w) ~ (1 + w / t)^-2 N(w; 0, 1),    0 <= w <= 1
 
-(Lomax 1954, of shape 1, whose median is t). A small weight is kept only if it explains much; a large one is hardly held
-back, unlike with a Gaussian or an exponential prior. In the equations the logarithm is replaced by its tangent, which
-lies above it, so that a step that lowers the one lowers the other (Candes, Wakin and Boyd 2008, *Enhancing sparsity by
-reweighted l1 minimization*). ``head_problem`` keeps the weights within their bounds.
+Its first factor is Lomax's distribution (1954) of shape 1, whose median is t. A small weight is kept only if it
+explains much; a large one is hardly held back, unlike with a Gaussian or an exponential prior. In the equations the
+logarithm is replaced by its tangent, which lies above it, so that a step that lowers the one lowers the other (Candes,
+Wakin and Boyd 2008, *Enhancing sparsity by reweighted l1 minimization*). ``head_problem`` bounds the weights.
 
 The other priors are Gaussian: of the coefficients, of log scale and of each camera's correction.
 """

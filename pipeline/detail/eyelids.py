@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.compute.trace import traced
 from pipeline.detail.smooth_field import smooth_field
-from pipeline.estimation.sparse_factor import factorised
+from pipeline.estimation.positive_definite import factorised
+from pipeline.faces.eyes import MAX_CLOSED_OPENING, MIN_HALF_OPENING
 from pipeline.head_model.model import HeadModel
 from rig.mesh import vertex_normals
 from rig.rig import Rig
@@ -31,7 +32,6 @@ VIEWS, MIN_FACING = 5, 0.6  # the most frontal cameras
 WHITE_CHROMA, WHITE_LIGHT, DARK_LIGHT = 0.5, 0.6, 0.35  # by the skin's
 WHITE_SHARE, DARK_SHARE = 0.05, 0.1  # of what is looked at; lashes of a closed eye are a line
 MIN_VERTICES = 12
-MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.095, 0.1  # of lids that are half closed (0.108), and of lids that meet (0.093)
 
 
 @dataclass(frozen=True, slots=True)

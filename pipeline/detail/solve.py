@@ -17,7 +17,7 @@ from scipy.sparse.linalg import SuperLU
 from pipeline.compute.trace import traced
 from pipeline.detail.nodes import NodeMesh
 from pipeline.detail.smooth_field import SmoothField
-from pipeline.estimation.sparse_factor import factorised
+from pipeline.estimation.positive_definite import factorised
 from pipeline.head_model.subdivision import row_count
 
 

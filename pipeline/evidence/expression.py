@@ -44,6 +44,11 @@ class BlendshapeRig:
     weights: Mapping[str, float]  # by morph: those of the head as photographed
     missing: tuple[str, ...]
 
+    @property
+    def moving(self) -> dict[str, Float[np.ndarray, "v 3"]]:
+        """Returns the morph targets that move something."""
+        return {name: morph for name, morph in self.morphs.items() if name not in self.missing}
+
 
 def fitted_weights(model: HeadModel, fit: Fit) -> dict[str, float]:
     """Returns the fitted weight of every expression of the model, by name; empty if the model has none."""

@@ -60,6 +60,11 @@ class Landmark:
     position_mm: Float[np.ndarray, " 3"]
     std_mm: Float[np.ndarray, " 3"] | None
 
+    def widen_by_scale(self, sigma: float, centre: Float[np.ndarray, " 3"]) -> "Landmark":
+        """Returns the landmark of a head whose size about ``centre`` (mm) is known to the share ``sigma``."""
+        off = sigma * (self.position_mm - centre)
+        return Landmark(self.position_mm, None if self.std_mm is None else np.hypot(self.std_mm, off))
+
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
@@ -67,6 +72,11 @@ class Measurement:
 
     value_mm: float
     std_mm: float | None
+
+    def widen_by_scale(self, sigma: float) -> "Measurement":
+        """Returns the length of a head whose size is known to the share ``sigma``."""
+        std = None if self.std_mm is None else float(np.hypot(self.std_mm, sigma * self.value_mm))
+        return Measurement(self.value_mm, std)
 
 
 def landmarks(model: HeadModel, fit: Fit, vertices: Float[np.ndarray, "v 3"] | None = None) -> dict[str, Landmark]:

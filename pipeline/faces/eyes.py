@@ -5,6 +5,7 @@ resolution than that for landmarks: its lids follow the visible edge, where the 
 an average eye.
 """
 
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -15,12 +16,15 @@ from pipeline.faces.detection import FaceDetection
 from pipeline.faces.matching import MatchedFaces
 from pipeline.faces.networks import EYE_SIZE, FaceNetworks
 from pipeline.faces.points import LEFT_EYE_CORNERS, RIGHT_EYE_CORNERS, direction_from_face
+from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 CROP_OF_WIDTH = 2.3  # side of an eye's crop by the distance of its corners, as the network was trained
 LIDS = {"right": slice(0, 16), "left": slice(16, 32)}  # rows of ``FaceDetection.lids_px``
 INNER, LOWER, UPPER = 8, slice(1, 8), slice(9, 16)  # of one eye's lids: its inner corner, and edges but for corners
 OPENING_VIEWS = 4  # the most frontal ones
+
+MIN_HALF_OPENING, MAX_CLOSED_OPENING = 0.095, 0.1  # of lids that are half closed (0.108), and of lids that meet (0.093)
 
 
 def find_eyes(pyramid: Pyramid, face: FaceDetection, networks: FaceNetworks) -> FaceDetection:
@@ -51,6 +55,19 @@ def eye_openings(face: MatchedFaces, rig: Rig) -> dict[str, float]:
         if views:
             openings[side] = float(np.median(views[:OPENING_VIEWS]))
     return openings
+
+
+def closed_by_openings(openings: Mapping[str, float]) -> frozenset[str]:
+    """Returns the eyes whose lids meet."""
+    return frozenset(side for side, opening in openings.items() if opening < MIN_HALF_OPENING)
+
+
+def eye_warnings(closed: Collection[str]) -> list[Message]:
+    """Returns a warning if an eye is closed. The result is right, but most studios then want another shot."""
+    if not closed:
+        return []
+    both = len(closed) == 2
+    return [compose("eyes-closed", eyes=compose("both-eyes-are") if both else compose("one-eye-is", side=min(closed)))]
 
 
 def _opening(lids_px: Float[np.ndarray, "16 2"], direction: Float[np.ndarray, " 3"]) -> float:

@@ -84,6 +84,11 @@ class Iris:
         """Returns the centre of the eyeball, about which the eye turns."""
         return self.centre - BEHIND_MM * self.gaze
 
+    def widen_by_scale(self, sigma: float, origin: Float[np.ndarray, " 3"]) -> "Iris":
+        """Returns the iris of a head whose size about ``origin`` (mm) is known to the share ``sigma``."""
+        moved = sigma * np.concatenate([self.centre - origin, np.zeros(3), [self.radius_mm]])
+        return replace(self, covariance=self.covariance + np.outer(moved, moved))
+
     @property
     def eyeball_jacobian(self) -> Float[np.ndarray, "3 7"]:
         """Returns the derivative of ``eyeball`` by what ``covariance`` is of."""

@@ -1,9 +1,10 @@
 """Says which surface point of a head model each of the face detector's 468 points is, and how large the detector's
 error is.
 
-Both were measured on renders of heads of the model's own population (``python -m tests.support.landmark_map``), for the
-two models whose triangles are known: MakeHuman's and ICT-FaceKit. To any other model the points are transferred from
-the first one's mean head, by the landmarks that both have, and the error of that is added.
+Both were measured on renders of heads of the model's own population (``python -m
+tests.laboratory.model_packs.landmark_map``), for the two models whose triangles are known: MakeHuman's and ICT-FaceKit.
+To any other model the points are transferred from the first one's mean head, by the landmarks that both have, and the
+error of that is added.
 
 A point that the detector puts at x (triangulated, without its biases) is ``map.points(vertices) + e``. The error e has
 the mean ``offset_mm``, a part that is independent for each point (``deviation_mm``), and a part in which all points

@@ -2,7 +2,7 @@
 shape, and their bias and noise. ``right`` and ``left`` are the subject's.
 
 The network was run on faces and on their mirror images; each point was paired with the one that comes nearest (``python
--m tests.support.landmark_map``).
+-m tests.laboratory.model_packs.landmark_map``).
 """
 
 from dataclasses import dataclass

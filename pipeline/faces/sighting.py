@@ -4,16 +4,15 @@ Enters: small pictures (``reduce_picture``) and their cameras. Leaves: ``FaceSig
 after a few views without a face, and then tests only those cameras that must show it.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces
-from pipeline.faces.networks import FaceNetworks
-from pipeline.faces.subject import SearchEffort, SubjectFaces, find_subject
+from pipeline.faces.eyes import closed_by_openings, eye_openings, eye_warnings
+from pipeline.faces.matching import MatchedFaces
+from pipeline.faces.subject import SearchEffort, SubjectFaces
 from rig.acquisition.face_sighting import FaceSighting
 from rig.camera import Camera
 from rig.image import ImageRgb
@@ -22,7 +21,7 @@ from rig.rig import Rig
 GLANCE_PX = 640  # longer side: a face of a third of it fills the networks' 192 px
 SMALLEST_PX = 96  # shorter side: no face in a smaller picture is more than a guess
 MUST_SEE = 0.7  # cosine: a camera within 45 degrees of where a face looks shows it, hair beside it or not
-GLANCE = SearchEffort(max_fruitless=5, min_facing=MUST_SEE, rounds=3, with_eyes=False)
+GLANCE = SearchEffort(max_fruitless=5, min_facing=MUST_SEE, rounds=3)
 MIN_OFF_MIDDLE_DEG = 5.0  # of the cameras; less is the networks' own error
 MIN_FAN = 0.3  # mean of the unit directions to the cameras: a fan of 180 degrees has 0.64, a full circle 0
 MIN_WITNESSES = 2  # other cameras that show the face, before one is blamed that does not
@@ -39,29 +38,20 @@ def reduce_picture(image: ImageRgb, camera: Camera, longest_px: int) -> tuple[UI
     return np.asarray(small, np.uint8), replace(camera, intrinsics=lens)
 
 
-def sight_face(
-    images: Mapping[str, ImageRgb],
-    rig: Rig,
-    networks: FaceNetworks,
-    *,
-    front: str,
-    eye_distance_mm: tuple[float, float] | None = EYE_DISTANCE_MM,
-) -> FaceSighting:
-    """Finds the subject's face in small pictures, which cameras lack it, and how far it is turned from the front
-    camera. Takes 0.1 to 0.4 s at 640 px.
+def sight_face(subject: SubjectFaces, rig: Rig, *, front: str) -> FaceSighting:
+    """Tells which cameras lack the subject's face, whether its eyes are closed, and how far it is turned from the front
+    camera.
 
     Args:
-        images: by camera, small.
+        subject: as ``find_subject`` finds it in small pictures with the effort ``GLANCE``, in 0.1 to 0.4 s at 640 px.
         rig: the cameras of these pictures.
-        networks: as ``load_networks`` loads them.
         front: the camera that the subject is to look at.
-        eye_distance_mm: limits of a face's size; None where the rig's scale is not known.
     """
-    subject = find_subject(images, rig, networks, eye_distance_mm=eye_distance_mm, effort=GLANCE)
     face = subject.matched
     if face is None:
         return FaceSighting(len(subject.found), False, any(subject.found.values()), front)
-    sighting = FaceSighting(len(subject.found), True, True, front, _missing(subject, face))
+    closed = eye_warnings(closed_by_openings(eye_openings(face, rig)))
+    sighting = FaceSighting(len(subject.found), True, True, front, _missing(subject, face), remarks=tuple(closed))
     if not has_front(rig):
         return sighting
     from_front = gaze_from(face, rig[front].axis_world if front in rig.names else -_fan(rig))

@@ -32,11 +32,11 @@ from pipeline.faces.matching import EYE_DISTANCE_MM, MatchedFaces, complete_matc
 from pipeline.faces.networks import FaceNetworks
 from pipeline.faces.points import direction_from_face, point_table
 from pipeline.faces.triangulated_face import TriangulatedFace, point_noise_px, unbiased_px, view_noise_px
-from pipeline.multiview.spread_views import spread_views
 from rig.camera import Camera
 from rig.capture import ImageRgb
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.rig import Rig
+from rig.spread_views import spread_views
 
 ROUNDS = 3  # of the pose, and the bias that follows from it
 DISTANCE_SHARE = 0.1  # standard deviation of the distance, by itself: measured, and by how heads differ

@@ -17,7 +17,7 @@ import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 
 from pipeline.compute.array_cache import cached_arrays
-from pipeline.estimation.sparse_factor import factorised
+from pipeline.estimation.positive_definite import factorised
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.fusion.net_kernels import component_of
 from pipeline.geometry.registration.procrustes import procrustes

@@ -11,6 +11,7 @@ per stored operator entry (13 MB). ``basis`` of a whole level is cached: 12 M V 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -203,3 +204,28 @@ def with_expressions(model: HeadModel) -> HeadModel:
         posed=range(len(model.modes), len(model.modes) + count),
         _bases={},
     )
+
+
+def model_info(model: HeadModel) -> dict[str, Any]:
+    """Returns the description of a model as JSON types. ``vertices`` and ``faces`` are those of the full level; figures
+    that were never measured are None."""
+    full = model.levels["full"]
+    return {
+        "name": model.name,
+        "licence": model.licence,
+        "sha256": model.sha256,
+        "subjects": dict(model.subjects),
+        "modes": len(model.modes),
+        "expressions": list(model.expressions.names),
+        "vertices": full.count,
+        "faces": len(full.faces),
+        "landmarks": len(model.landmarks),
+        "generalisation_mm": model.figures.get("generalisation_mm"),
+        "specificity_mm": model.figures.get("specificity_mm"),
+        "source": model.source,
+        "notice": model.notice,
+        "figures": dict(model.figures),
+        "levels": {
+            name: {"vertices": level.count, "faces": len(level.faces)} for name, level in sorted(model.levels.items())
+        },
+    }

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial import Delaunay, KDTree
 
 from pipeline.head_model.model import HeadModel
 
@@ -16,6 +17,7 @@ EYE_MARGIN_MM, EYE_HALF_HEIGHT_MM, EYE_DEPTH_MM = 6.0, 13.0, 20.0  # about the l
 NOSE_MARGIN_MM = 4.0
 MOUTH_MARGIN_MM, MOUTH_HALF_HEIGHT_MM = 6.0, 16.0
 EAR_BEHIND_MM, EAR_BEFORE_MM, EAR_HALF_HEIGHT_MM, EAR_INSIDE_MM = 36.0, 4.0, 33.0, 12.0
+PINNA_OFF_MM, PINNA_REACH_MM = 4.0, 6.0  # off the innermost vertex so near, seen from the side
 NECK_BELOW_TRAGION_MM = 30.0
 FOREHEAD_ABOVE_GLABELLA_MM = (8.0, 45.0)  # above the brows, which move, and below most hairlines
 BRIDGE_HALF_WIDTH_MM, BRIDGE_BELOW_NASION_MM, BRIDGE_DEPTH_MM = 8.0, 12.0, 14.0
@@ -50,6 +52,22 @@ def head_regions(model: HeadModel) -> dict[str, Bool[np.ndarray, " v"]]:
         "neck": neck,
         "cranium": ~(face | ears | neck),
     }
+
+
+@lru_cache(maxsize=2)
+def pinnae(model: HeadModel) -> Bool[np.ndarray, " v"]:
+    """Returns which vertices of the full level belong to what stands off the head at the ears, seen from the side: the
+    region ``ears`` has the scalp about it, too."""
+    vertices, ears = model.vertices(np.zeros(0)), head_regions(model)["ears"]
+    found = np.zeros(len(vertices), bool)
+    for side in (-1.0, 1.0):
+        rows = np.flatnonzero(ears & (side * vertices[:, 0] > 0.0))
+        out, flat = side * vertices[rows, 0], vertices[rows, 1:]
+        inner = np.array([out[near].min() for near in KDTree(flat).query_ball_point(flat, PINNA_REACH_MM)])
+        standing = flat[out - inner > PINNA_OFF_MM]
+        if len(standing) > 2:
+            found[rows] = Delaunay(standing).find_simplex(flat) >= 0
+    return found
 
 
 def stable_region(model: HeadModel) -> Bool[np.ndarray, " v"]:

@@ -6,12 +6,17 @@ Decimation: half-edge collapses ordered by Garland and Heckbert's quadric error 
 subset of the vertices where they are, so that a decimated level is a choice of rows of the same operator.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 
 from rig.errors import EigenheadError
 from rig.mesh import boundary_edges, edges_of, face_normals
+
+OPENINGS = 4  # borders of a head whose eyes and mouth are open: these and the neck
+MAX_CLOSING = 400  # triangles that close eyes and mouth: 192 of the default model, 152 of ICT-FaceKit
 
 
 class NotAManifold(EigenheadError):
@@ -94,6 +99,23 @@ def close_loop(vertices: Float[np.ndarray, "V 3"], loop: list[int]) -> Int[np.nd
             out.append([other[j], other[j + 1], one[i]])
             j += 1
     return np.array([t for t in out if len(set(t)) == 3], np.int32).reshape(-1, 3)
+
+
+def opened_faces(levels: Mapping[str, Int[np.ndarray, "F 3"]]) -> Int[np.ndarray, "G 3"]:
+    """Returns the triangles of the level ``full`` without those that close eyes and mouth; all of them if there are
+    none. Models have those last in the level ``cage``, of which every triangle becomes equally many of ``full``."""
+    cage, full = levels["cage"], levels["full"]
+    first, closing = len(cage), MAX_CLOSING if len(boundary_loops(cage)) == 1 else 0
+    for count in range(len(cage) - 1, len(cage) - closing, -1):
+        try:
+            borders = len(boundary_loops(cage[:count]))
+        except NotAManifold:
+            borders = 0
+        if borders == OPENINGS:
+            first = count
+        elif first < len(cage):
+            break
+    return full[: first * (len(full) // len(cage))]
 
 
 def subdivision(faces: Int[np.ndarray, "F 3"], count: int) -> tuple[sparse.csr_array, Int[np.ndarray, "F4 3"]]:

@@ -16,6 +16,7 @@ from pipeline.geometry.projection import project_points
 from pipeline.part_labels.codes import Part, codes_from_channels
 from pipeline.part_labels.labelling import PartMap
 from pipeline.stereo.depth_map import DepthMap, points_world
+from rig.camera import Camera
 from rig.rig import Rig
 
 SKIN = Part.SKIN  # as the laboratory calls it
@@ -54,7 +55,7 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
 
     def cloud(k: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         points = points_world(voting[k])
-        return points, parts_shown(points, parts[voting[k].camera.name], rig)
+        return points, shown_parts(points, parts[voting[k].camera.name], rig[voting[k].camera.name])
 
     points, shown = (np.concatenate(part) for part in zip(*map_in_threads(cloud, len(voting)), strict=True))
     corner = points.min(axis=0)
@@ -72,10 +73,11 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
     return PartVotes(corner, size, keys, mean(points), mean(shown))
 
 
-def parts_shown(points: Float[np.ndarray, "n 3"], part: PartMap, rig: Rig) -> Float[np.ndarray, "n 3"]:
-    """Returns the probabilities that a photograph shows at points (world, mm); 0 outside of it."""
+def shown_parts(points: Float[np.ndarray, "n 3"], part: PartMap, camera: Camera) -> Float[np.ndarray, "n 3"]:
+    """Returns the probabilities of skin, hair and clothes at the pixel of each point (world, mm); 0 beside the
+    picture."""
     height, width = part.of_255.shape[:2]
-    column, row = np.rint(np.nan_to_num(project_points(rig[part.camera], points), nan=-1.0)).astype(int).T
+    column, row = np.rint(np.nan_to_num(project_points(camera, points), nan=-1.0)).astype(int).T
     framed = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return part.of_255[np.where(framed, row, 0), np.where(framed, column, 0)] * (framed / 255.0)[:, None]
 

@@ -12,25 +12,26 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 
 from pipeline.head_model.subdivision import boundary_loops, close_loop
-from pipeline.results.metadata import QUALITY, asset_extras, ply_comments
-from pipeline.results.reconstruction import Reconstruction
-from pipeline.results.skin_files import write_skin_maps
+from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extras, ply_comments
 from pipeline.texturing.chart_colours import CODES, ENCODED
 from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.pores.skin_maps import SkinMaps
 from pipeline.texturing.sets.specular import Specular
 from pipeline.texturing.sets.texture_sets import SetTextures
 from pipeline.texturing.visibility import LINEAR
 from rig.atomic_write import write_atomically
-from rig.formats.meshes.glb import Skin, glb_bytes
-from rig.formats.meshes.obj import mtl_bytes, obj_bytes, textured_obj_bytes
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.obj import mtl_bytes, scene_obj_bytes
 from rig.formats.meshes.ply import write_ply
 from rig.formats.meshes.printing import stl_bytes, threemf_bytes
-from rig.formats.meshes.usdz import usdz_bytes
+from rig.formats.meshes.scene import Part, Scene, Skin
+from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.formats.pictures.exr import write_exr
+from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 
 JPEG_OPTIONS = (
@@ -45,17 +46,10 @@ FAN_MM = 15.0  # a border that reaches so far to all sides is the neck's: it is 
 PNG_SPEED = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # level 6 takes four times as long for a tenth of the size
 
 
-def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
-    """Writes head.ply and the other head files that ``settings.outputs`` names. Raises NoUsd if the library for USD is
-    missing, and OSError.
-
-    Args:
-        folder: of the result.
-        result: what is written.
-        head: the head's mesh in the head frame, mm.
-    """
-    outputs, formats, atlas = result.settings.outputs, result.settings.outputs.formats, result.texturing.atlas
-    named = atlas is not None and outputs.ply_texture
+def write_head_ply(folder: Path, result: Reconstruction) -> None:
+    """Writes head.ply, and head.png if the settings ask for its texture. Raises OSError."""
+    atlas = result.texturing.atlas
+    named = atlas is not None and result.settings.outputs.ply_texture
     corner_uv = atlas.layout.uv[atlas.layout.faces] if atlas is not None and named else None
     write_ply(
         folder / "head.ply",
@@ -67,25 +61,39 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
         corner_uv=corner_uv,
         comments=[*ply_comments(result), QUALITY, *(["TextureFile head.png"] if named else [])],
     )
-    if atlas is not None and (named or "obj" in formats):
-        write_atomically(folder / "head.png", encoded(atlas, "png"))
+    if atlas is not None and named:
+        write_atomically(folder / "head.png", encoded(atlas.image, "png"))
+
+
+def write_formats(folder: Path, result: Reconstruction, head: Mesh) -> None:
+    """Writes the textures and the other head files that ``settings.outputs`` names. Raises NoUsd if the library for USD
+    is missing, and OSError.
+
+    Args:
+        folder: of the result.
+        result: what is written.
+        head: the head's mesh in the head frame, mm.
+    """
+    formats, atlas = result.settings.outputs.formats, result.texturing.atlas
     if result.texturing.albedo is not None:
-        write_atomically(folder / "texture" / "albedo.png", encoded(result.texturing.albedo.atlas, "png"))
+        write_atomically(folder / "texture" / "albedo.png", encoded(result.texturing.albedo.atlas.image, "png"))
     if atlas is not None and result.texturing.skin is not None:
         write_skin_maps(folder / "texture", atlas, result.texturing.skin)
     if result.texturing.sets is not None:
         write_set_textures(folder / "texture", result.texturing.sets)
+    skin = head_skin(result, head)
     normals = result.texturing.normals @ result.head.fit.world_from_head.rotation
     if "glb" in formats:
         write_atomically(folder / "head.glb", _glb(result, head, normals))
     if "obj" in formats:
-        _write_obj(folder, result)
+        if atlas is not None:
+            write_atomically(folder / "head.mtl", mtl_bytes("head.png"))
+            write_atomically(folder / "head.png", encoded(atlas.image, "png"))
+        part = Part("head", Mesh(result.mesh_world.vertices, head.faces, head.colours), result.texturing.normals, skin)
+        write_atomically(folder / "head.obj", scene_obj_bytes(Scene([part]), "head.mtl" if skin else None))
     if "usdz" in formats and atlas is not None:
-        data = usdz_bytes(
-            head, normals=normals, uv=atlas.layout.uv, faces_uv=atlas.layout.faces, image=encoded(atlas, "jpeg"),
-            suffix=".jpg",
-        )  # fmt: skip
-        write_atomically(folder / "head.usdz", data)
+        photograph = replace(skin, image=encoded(atlas.image, "jpeg"), mime="image/jpeg") if skin else None
+        write_atomically(folder / "head.usdz", scene_usdz_bytes(Scene([Part("head", head, normals, photograph)])))
     if {"stl", "3mf"} & set(formats):
         closed = printable(head)
         for name, data_of in (("stl", stl_bytes), ("3mf", threemf_bytes)):
@@ -93,50 +101,59 @@ def write_head(folder: Path, result: Reconstruction, head: Mesh) -> None:
                 write_atomically(folder / f"head.{name}", data_of(closed))
 
 
-def _glb(result: Reconstruction, head: Mesh, normals: np.ndarray) -> bytes:
-    atlas, extras, outputs = result.texturing.atlas, asset_extras(result), result.settings.outputs
+def head_skin(result: Reconstruction, head: Mesh) -> Skin | None:
+    """Returns the texture that the head's files show, with its maps; None without one."""
+    texturing, kind = result.texturing, result.settings.outputs.image
+    atlas, sets = texturing.atlas, texturing.sets
     if atlas is None:
-        return glb_bytes(head, normals=normals, colours=result.texturing.vertices.colours, extras=extras)
-    kind = outputs.image
-    source, sets = atlas.layout.source, result.texturing.sets
+        return None
     strength = None if sets is None or sets.specular is None else strength_png(sets.specular)
-    if outputs.albedo == "glb" and result.texturing.albedo is not None:
-        atlas = result.texturing.albedo.atlas
+    layout, image = atlas.layout, atlas.image
+    if result.settings.outputs.albedo == "glb" and texturing.albedo is not None:
+        image = texturing.albedo.atlas.image
     elif sets is not None and sets.diffuse is not None and strength is not None:
-        atlas = sets.diffuse  # highlights come from the strength
-    if result.texturing.reduced is not None:
-        mapped = normal_mapped(head.vertices, normals, atlas.layout, result.texturing.reduced)
+        image = sets.diffuse.image  # highlights come from the strength
+    mime = ENCODINGS[kind][1]
+    skin = Skin(layout.uv, encoded(image, kind), mime, layout.source, layout.faces, specular=strength)
+    if texturing.skin is None:
+        return skin
+    normals = texturing.normals @ result.head.fit.world_from_head.rotation
+    places = head.vertices[layout.source]
+    tangents = vertex_tangents(places, normals[layout.source], layout.uv, layout.faces)
+    return replace(skin, normal_map=png(texturing.skin.normals), tangents=tangents)
+
+
+def head_mesh(result: Reconstruction) -> Mesh:
+    """Returns the result's mesh in the head frame, in true millimetres: the rotation and translation of the pose are
+    undone, its scale is kept."""
+    mesh = result.mesh_world
+    return Mesh(head_from_world(result).apply(mesh.vertices), mesh.faces, result.texturing.vertices.colours)
+
+
+def head_from_world(result: Reconstruction) -> RigidTransform:
+    """Returns the transform from the world to the head frame, which keeps the pose's scale."""
+    place = result.head.fit.world_from_head
+    return RigidTransform(place.rotation, place.translation).inverse()
+
+
+def _glb(result: Reconstruction, head: Mesh, normals: Float[np.ndarray, "v 3"]) -> bytes:
+    """Encodes head.glb, with the shapes about the photographed head if the settings ask for them."""
+    skin, extras, blendshape_rig = head_skin(result, head), asset_extras(result), result.evidence.blendshape_rig
+    if result.texturing.reduced is not None and skin is not None and result.texturing.atlas is not None:
+        mapped = normal_mapped(head.vertices, normals, result.texturing.atlas.layout, result.texturing.reduced)
         extras["rows_of_ply"] = mapped.rows.tolist()
-        skin = Skin(mapped.uv, encoded(atlas, kind), ENCODINGS[kind][1], png(mapped.image), mapped.tangents, strength)
-        return glb_bytes(mapped.mesh, normals=mapped.normals, skin=skin, extras=extras)
-    extras["repeated_vertices"] = source[len(head.vertices) :].tolist()
-    opened = Mesh(head.vertices[source], atlas.layout.faces)
-    skin = Skin(atlas.layout.uv, encoded(atlas, kind), ENCODINGS[kind][1], specular=strength)
-    if result.texturing.skin is not None:
-        tangents = vertex_tangents(opened.vertices, normals[source], atlas.layout.uv, atlas.layout.faces)
-        skin = replace(skin, normal_map=png(result.texturing.skin.normals), tangents=tangents)
-    return glb_bytes(opened, normals=normals[source], skin=skin, extras=extras)
+        skin = replace(skin, uv=mapped.uv, source=mapped.rows, faces=mapped.mesh.faces)
+        skin = replace(skin, normal_map=png(mapped.image), tangents=mapped.tangents)
+    elif skin is not None and skin.source is not None:
+        extras["repeated_vertices"] = skin.source[len(head.vertices) :].tolist()
+    morphs = blendshape_rig.moving if blendshape_rig is not None and result.settings.outputs.morphs else {}
+    return scene_glb_bytes(Scene([Part("head", head, normals, skin, morphs)]), extras)
 
 
-def _write_obj(folder: Path, result: Reconstruction) -> None:
-    mesh, atlas = result.mesh_world, result.texturing.atlas
-    if atlas is None:
-        coloured = Mesh(mesh.vertices, mesh.faces, result.texturing.vertices.colours)
-        write_atomically(folder / "head.obj", obj_bytes(coloured))
-        return
-    layout = atlas.layout
-    data = textured_obj_bytes(
-        mesh, normals=result.texturing.normals, uv=layout.uv, faces_uv=layout.faces, library="head.mtl"
-    )  # fmt: skip
-    write_atomically(folder / "head.mtl", mtl_bytes("head.png"))
-    write_atomically(folder / "head.obj", data)
-
-
-def encoded(atlas: Atlas, kind: str) -> bytes:
-    """Returns the texture as the bytes of an image file; ``kind`` is a key of ``ENCODINGS``."""
+def encoded(image: UInt8[np.ndarray, "s s 3"], kind: str) -> bytes:
+    """Returns a texture (sRGB) as the bytes of an image file; ``kind`` is a key of ``ENCODINGS``."""
     suffix, _, options = ENCODINGS[kind]
-    stored: UInt8[np.ndarray, "s s 3"] = np.ascontiguousarray(atlas.image[:, :, ::-1])  # it is kept blue first
-    _, data = cv2.imencode(suffix, stored, list(options))
+    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[:, :, ::-1]), list(options))  # OpenCV's blue comes first
     return data.tobytes()
 
 
@@ -174,6 +191,12 @@ def write_set_textures(folder: Path, sets: SetTextures) -> None:
         write_exr(folder / "specular.exr", light)
 
 
+def write_skin_maps(folder: Path, atlas: Atlas, maps: SkinMaps) -> None:
+    """Writes the maps of a head's skin below ``folder``, each under a temporary name first. Raises OSError."""
+    for name, image in (("colour", atlas.image), ("normals", maps.normals), ("displacement", maps.displacement)):
+        _write_png(folder / f"{name}.png", image)
+
+
 def strength_png(specular: Specular) -> bytes:
     """Returns glTF's specular strength as a PNG whose alpha it is; the colours of the pixels are white."""
     alpha = specular.strength()
@@ -184,6 +207,6 @@ def _encode_light(light: Float[np.ndarray, "s s 3"]) -> UInt8[np.ndarray, "s s 3
     return ENCODED[(CODES * np.clip(light, 0.0, 1.0) + 0.5).astype(np.int32)]
 
 
-def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"]) -> None:
-    stored = np.ascontiguousarray(image[:, :, ::-1])
+def _write_png(path: Path, image: UInt8[np.ndarray, "s s 3"] | UInt16[np.ndarray, "s s"]) -> None:
+    stored = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     write_atomically(path, cv2.imencode(".png", stored, PNG_SPEED)[1].tobytes())

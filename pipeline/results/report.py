@@ -104,6 +104,8 @@ def report_document(result: Reconstruction) -> Report:
     }
     if result.hair is not None:
         document["hair"] = _hair(result.hair)
+    if result.scale_sigma:
+        document["scale_sigma"] = result.scale_sigma
     return document
 
 

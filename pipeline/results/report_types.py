@@ -254,6 +254,7 @@ class Report(TypedDict):
     texture: TextureReport
     bust: BustReport | None
     hair: NotRequired[HairReport]  # where head_hair.ply was asked for
+    scale_sigma: NotRequired[float]  # where the cameras' scale has one (cameras.json); all deviations include it
     evaluations: int
     stopped_because: str
     seconds: dict[str, float]

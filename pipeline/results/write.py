@@ -6,7 +6,7 @@
     contact_sheet.png   input, silhouette difference before and after the fit (section 5.4), the head from new views
     turntable.png       the head from the right to the left profile
     head.obj head.mtl head.png, head.usdz, head.stl, head.3mf     on request (settings.outputs.formats)
-    neutral.glb         on request: the head without its expression; posed.glb, with morphs to make others
+    neutral.glb         on request: the head without its expression
     texture/            on request: albedo.png; with pores colour.png, normals.png and displacement.png
     texture/sets/       a texture of each texture set; of polarised light texture/diffuse and texture/specular
     landmarks.mrk.json  on request: the landmarks as a point list of 3D Slicer
@@ -21,24 +21,30 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.compute.threads import task_pool
-from pipeline.evidence.expression import BlendshapeRig
-from pipeline.results.head_files import write_head
-from pipeline.results.metadata import QUALITY, asset_extras, ply_comments
+from pipeline.results.head_files import (
+    ENCODINGS,
+    encoded,
+    head_from_world,
+    head_mesh,
+    head_skin,
+    write_formats,
+    write_head_ply,
+)
 from pipeline.results.overlays import contact_sheet, difference, overlay, turntable
-from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.reconstruction import QUALITY, Reconstruction, asset_extras, ply_comments
 from pipeline.results.report import report_document
 from pipeline.results.report_types import AddedReport
 from pipeline.results.slicer_landmarks import landmarks_document
 from pipeline.stages.bust import Bust, HairyHead
 from rig.atomic_write import write_atomically
 from rig.capture import Capture, reassign_images
-from rig.formats.meshes.glb import glb_bytes, write_glb
-from rig.formats.meshes.morph_glb import with_morphs
+from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.ply import write_ply
+from rig.formats.meshes.scene import Part, Scene, Skin
 from rig.formats.pictures.images import write_image
-from rig.geometry import RigidTransform, Similarity
 from rig.mesh import Mesh
 
 SHEET_ROWS = 4  # cameras on the contact sheet
@@ -68,13 +74,13 @@ def write_result(
         extra_writers: what writes further files of the result, such as the head in a template's vertex order.
     """
     capture = reassign_images(capture, pictures=result.views.assignment)
-    head, blendshape_rig = head_mesh(result), result.evidence.blendshape_rig
+    head = head_mesh(result)
     with task_pool(THREADS) as pool:
         extra_jobs = [pool.submit(write, folder, result) for write in extra_writers]
         jobs = [
             pool.submit(_write_meshes, folder, result, head),
             pool.submit(_write_overviews, folder, result, capture, head),
-            *([] if blendshape_rig is None else [pool.submit(_write_expression, folder, result, blendshape_rig)]),
+            pool.submit(write_neutral, folder, result),
             *([] if result.bust is None else [pool.submit(_write_bust, folder, result, result.bust)]),
             *([] if result.hair is None else [pool.submit(_write_hair, folder, result, result.hair)]),
             *(pool.submit(_write_overlay, folder, result, capture, name) for name in _shown(result, capture)),
@@ -93,10 +99,9 @@ def write_result(
 
 
 def _write_bust(folder: Path, result: Reconstruction, bust: Bust) -> None:
-    mesh, place = bust.mesh_world, result.head.fit.world_from_head
     write_ply(
         folder / "bust.ply",
-        mesh,
+        bust.mesh_world,
         normals=bust.normals,
         colours=bust.colours,
         quality=bust.surface.deviation_mm.astype(np.float32),
@@ -104,13 +109,13 @@ def _write_bust(folder: Path, result: Reconstruction, bust: Bust) -> None:
         part=bust.surface.part,
         comments=[*ply_comments(result), QUALITY, "part is 0 unseen, 1 skin, 2 hair, 3 clothes"],
     )
-    turned = Mesh(_head_from_world(place).apply(mesh.vertices), mesh.faces, bust.colours)
-    extras = asset_extras(result)
-    write_glb(folder / "bust.glb", turned, normals=bust.normals @ place.rotation, colours=bust.colours, extras=extras)
+    _write_glb(
+        folder / "bust.glb", result, Mesh(bust.mesh_world.vertices, bust.mesh_world.faces, bust.colours), bust.normals
+    )
 
 
 def _write_hair(folder: Path, result: Reconstruction, hair: HairyHead) -> None:
-    mesh, place = Mesh(hair.shell.vertices_world, result.mesh_world.faces), result.head.fit.world_from_head
+    mesh = Mesh(hair.shell.vertices_world, result.mesh_world.faces, hair.colours)
     write_ply(
         folder / "head_hair.ply",
         mesh,
@@ -120,43 +125,39 @@ def _write_hair(folder: Path, result: Reconstruction, hair: HairyHead) -> None:
         views=hair.views,
         comments=[*ply_comments(result), "quality: height above the skin, mm"],
     )
-    turned = Mesh(_head_from_world(place).apply(mesh.vertices), mesh.faces, hair.colours)
-    extras = asset_extras(result)
-    write_glb(
-        folder / "head_hair.glb", turned, normals=hair.normals @ place.rotation, colours=hair.colours, extras=extras
-    )
+    atlas, kind = hair.atlas, result.settings.outputs.image
+    skin = None
+    if atlas is not None:
+        image = encoded(atlas.image, kind)
+        skin = Skin(atlas.layout.uv, image, ENCODINGS[kind][1], atlas.layout.source, atlas.layout.faces)
+    _write_glb(folder / "head_hair.glb", result, mesh, hair.normals, skin)
 
 
-def _write_expression(folder: Path, result: Reconstruction, blendshape_rig: BlendshapeRig) -> None:
-    """Writes ``neutral.glb`` and ``posed.glb`` if the settings ask for them, with the vertex colours of the
-    photographed head."""
-    outputs, colours = result.settings.outputs, result.texturing.vertices.colours
-    world = blendshape_rig.neutral_world
-    neutral = Mesh(_head_from_world(result.head.fit.world_from_head).apply(world.vertices), world.faces, colours)
-    glb = glb_bytes(neutral, normals=neutral.normals(), colours=colours)
-    if outputs.neutral:
-        write_atomically(folder / "neutral.glb", glb)
-    if outputs.morphs:
-        morphed = with_morphs(glb, neutral.vertices, neutral.faces, blendshape_rig.morphs, blendshape_rig.weights)
-        write_atomically(folder / "posed.glb", morphed)
+def write_neutral(folder: Path, result: Reconstruction) -> None:
+    """Writes neutral.glb, with the texture of the photographed head, if the settings ask for it and the model has
+    expressions. Raises OSError."""
+    if result.evidence.blendshape_rig is None or not result.settings.outputs.neutral:
+        return
+    world = result.evidence.blendshape_rig.neutral_world
+    mesh = Mesh(world.vertices, world.faces, result.texturing.vertices.colours)
+    _write_glb(folder / "neutral.glb", result, mesh, mesh.normals(), head_skin(result, head_mesh(result)))
+
+
+def _write_glb(
+    path: Path, result: Reconstruction, mesh_world: Mesh, normals: Float[np.ndarray, "v 3"], skin: Skin | None = None
+) -> None:
+    """Writes a coloured mesh of the world frame as a GLB in the head frame."""
+    from_world = head_from_world(result)
+    mesh = Mesh(from_world.apply(mesh_world.vertices), mesh_world.faces, mesh_world.colours)
+    part = Part("head", mesh, normals @ from_world.rotation.T, skin)
+    write_atomically(path, scene_glb_bytes(Scene([part]), asset_extras(result)))
 
 
 def _write_meshes(folder: Path, result: Reconstruction, head: Mesh) -> None:
     if result.settings.outputs.surface == "bust" and result.bust is not None:
         return
-    write_head(folder, result, head)
-
-
-def head_mesh(result: Reconstruction) -> Mesh:
-    """Returns the result's mesh in the head frame, in true millimetres: the rotation and translation of the pose are
-    undone, its scale is kept."""
-    head_from_world = _head_from_world(result.head.fit.world_from_head)
-    mesh = result.mesh_world
-    return Mesh(head_from_world.apply(mesh.vertices), mesh.faces, result.texturing.vertices.colours)
-
-
-def _head_from_world(place: Similarity) -> RigidTransform:
-    return RigidTransform(place.rotation, place.translation).inverse()
+    write_head_ply(folder, result)
+    write_formats(folder, result, head)
 
 
 def _shown(result: Reconstruction, capture: Capture) -> list[str]:

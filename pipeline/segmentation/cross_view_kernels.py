@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.segmentation.cross_view``."""
+"""Compiled loops of ``pipeline.segmentation.segment``."""
 
 import numpy as np
 

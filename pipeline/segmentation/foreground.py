@@ -4,7 +4,7 @@ The log odds of foreground against the corrected background (``pipeline.segmenta
 shadows count as background, are smoothed by mean-field sweeps. Their links are cut where the *difference* to the plate
 has an edge (Sun et al., *Background Cut*, ECCV 2006), so that edges of the backdrop cut nothing. A pixel that looks
 like the plate proves something only where the subject looks different: ``Decision.clear``. Elsewhere, and where a
-shadow might be a coat, the other cameras are asked (``pipeline.segmentation.cross_view``), and ``reconsider`` decides
+shadow might be a coat, the other cameras are asked (``pipeline.segmentation.segment``), and ``reconsider`` decides
 again.
 
 Soft shadows on the backdrop and light that the subject reflects onto it do not belong to the subject; they are found at

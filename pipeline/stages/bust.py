@@ -18,9 +18,11 @@ from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
+from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.paint import find_layout, paint_head
 from pipeline.texturing.vertex_colours import texture
 from rig.capture import Capture
-from rig.mesh import Mesh, vertex_normals
+from rig.mesh import Mesh
 from rig.messages.message import compose
 
 # Of the face: the message is for an operator who takes the bust for a measurement.
@@ -125,28 +127,37 @@ def colour_bust(
         return Staged(None)
     settings, rig, mesh = context.settings, context.rig, shaped.surface.mesh_world
     normals, depths = mesh.normals(), depth_maps(rig, mesh)
-    colours = texture(mesh, normals, coloured, views.silhouettes, rig, depths, settings=settings.texture)
+    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture)
     return Staged(Bust(shaped, normals, colours.colours, colours.views, settings.bust.spacing_mm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HairyHead:
-    """Holds the head pushed out to its hair, with the bust's colours (sRGB) and views."""
+    """Holds the head pushed out to its hair, with its colours (sRGB), the number of images that coloured each vertex,
+    and its texture if the settings ask for one."""
 
     shell: HairShell
     normals: Float[np.ndarray, "v 3"]
     colours: UInt8[np.ndarray, "v 3"]
     views: UInt8[np.ndarray, " v"]
+    atlas: Atlas | None = None
 
 
-def push_out_hair(context: ReconstructionContext, refined: RefinedHead, bust: Bust | None) -> Staged[HairyHead | None]:
-    """Pushes the delivered head out to the bust's hair, if the settings ask for it. Returns None otherwise, and without
-    a bust. Warns ``hair-beyond-head`` where the head's vertices do not reach the hair."""
-    if bust is None or context.settings.outputs.surface != "hair":
+def push_out_hair(
+    context: ReconstructionContext, views: Views, refined: RefinedHead, bust: Bust | None, coloured: Capture
+) -> Staged[HairyHead | None]:
+    """Pushes the delivered head out to the bust's hair, if the settings ask for it, and colours it from the photographs
+    of ``coloured``. Returns None otherwise, and without a bust. Warns ``hair-beyond-head`` where the head's vertices do
+    not reach the hair."""
+    settings, rig = context.settings, context.rig
+    if bust is None or settings.outputs.surface != "hair":
         return Staged(None)
-    head, mesh = refined.mesh_world, bust.mesh_world
-    shell = hair_shell(head, mesh, bust.surface.part)
-    near = nearest(PointTree.of(mesh.vertices), shell.vertices_world)[1]
-    made = HairyHead(shell, vertex_normals(shell.vertices_world, head.faces), bust.colours[near], bust.views[near])
+    shell = hair_shell(refined.mesh_world, bust.mesh_world, bust.surface.part)
+    mesh = Mesh(shell.vertices_world, refined.mesh_world.faces)
+    normals, depths, layout = mesh.normals(), depth_maps(rig, mesh), find_layout(context.model, settings)[0]
+    around = None if layout is None else layout.around
+    colours = texture(mesh, coloured, views.silhouettes, rig, depths, settings=settings.texture, around=around)
+    atlas = paint_head(layout, mesh, colours, context.model.levels["full"].face_region, settings)
+    made = HairyHead(shell, normals, colours.colours, colours.views, atlas)
     beyond = shell.covered < MIN_COVERED
     return Staged(made, [compose("hair-beyond-head", share=shell.covered)] if beyond else [])

@@ -10,7 +10,6 @@ from pipeline.contour_fit.expression_evidence import makes_face
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.blink import blinks_of, with_lids
 from pipeline.detail.expression_reading import with_read_expression
-from pipeline.detail.eyelids import MAX_CLOSED_OPENING, MIN_HALF_OPENING
 from pipeline.detail.refine import DeformedSurface
 from pipeline.evidence.camera_metrics import CameraFigures, camera_figures, start_masks
 from pipeline.evidence.expression import (
@@ -25,7 +24,9 @@ from pipeline.evidence.expression import (
 from pipeline.evidence.gaze import pupils
 from pipeline.evidence.measurements import Landmark, Measurement, landmarks, measurements
 from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_warnings, unexplained_outlines, unseen_face
-from pipeline.evidence.pose import PoseEvidence
+from pipeline.evidence.pose import PoseEvidence, judge_pose
+from pipeline.faces.eyes import MAX_CLOSED_OPENING, closed_by_openings, eye_warnings
+from pipeline.faces.landmark_map import landmark_map
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
@@ -35,8 +36,6 @@ from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
-from pipeline.warnings import ReportWarning
-from rig.messages.message import compose
 
 MIN_LIDS = 0.4  # of the way down: of 26 eyes with smaller weights 12 were open, 9 half closed and 5 closed
 Masks = Mapping[str, Bool[np.ndarray, "h w"]]
@@ -136,14 +135,22 @@ def told_lids(lids: Mapping[str, float]) -> dict[str, float]:
 def confirmed_closed(closed: frozenset[str], openings: Mapping[str, float]) -> frozenset[str]:
     """Returns which eyes are closed: those that are on the fitted head (``closed``), corrected by the measured
     ``openings`` of the lids where these are clear."""
-    met = {side for side, opening in openings.items() if opening < MIN_HALF_OPENING}
     apart = {side for side, opening in openings.items() if opening > MAX_CLOSED_OPENING}
-    return (closed | met) - apart
+    return (closed | closed_by_openings(openings)) - apart
 
 
-def eye_warnings(closed: frozenset[str]) -> list[ReportWarning]:
-    """Returns a warning if an eye is closed. The result is right, but most studios then want another shot."""
-    if not closed:
-        return []
-    both = len(closed) == 2
-    return [compose("eyes-closed", eyes=compose("both-eyes-are") if both else compose("one-eye-is", side=min(closed)))]
+def check_pose(
+    context: ReconstructionContext, faces: Faces, alignment: Alignment, head: HeadFit, refined: RefinedHead
+) -> Staged[PoseEvidence]:
+    """Compares the head's landmarks with the faces in the photographs, and the cost of its pose with that of the best
+    other pose."""
+    evidence, warnings = judge_pose(
+        refined.mesh_world,
+        head.fit.world_from_head,
+        context.rig,
+        faces.subject,
+        None if faces.subject is None else landmark_map(context.model),
+        method=alignment.method,
+        rival=alignment.rival,
+    )
+    return Staged(evidence, warnings)

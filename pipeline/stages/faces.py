@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from pipeline.detail.eyelids import MIN_HALF_OPENING
-from pipeline.faces.eyes import eye_openings
+from pipeline.faces.eyes import closed_by_openings, eye_openings
 from pipeline.faces.irises import Iris, UnseenEye, find_irises
 from pipeline.faces.networks import load_networks
 from pipeline.faces.subject import SubjectFaces, find_subject
@@ -38,5 +37,5 @@ def find_faces(context: ReconstructionContext, capture: Capture) -> Staged[Faces
     if subject.matched is None:
         return Staged(Faces(subject))
     openings = eye_openings(subject.matched, context.rig)
-    closed = frozenset(side for side, opening in openings.items() if opening < MIN_HALF_OPENING)
-    return Staged(Faces(subject, openings, find_irises(subject.matched, capture.images, context.rig, closed)), warnings)
+    irises = find_irises(subject.matched, capture.images, context.rig, closed_by_openings(openings))
+    return Staged(Faces(subject, openings, irises), warnings)

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from pipeline.head_model.model import HeadModel
@@ -12,11 +12,13 @@ from pipeline.head_model.model_basis import model_basis
 from pipeline.part_labels.cap import Cap, find_cap
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap, classify_parts
+from pipeline.part_labels.votes import shown_parts
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
+from rig.camera import Camera
 from rig.colour_space import linear_from_srgb, srgb_from_text
 from rig.mesh import Mesh
 from rig.messages.message import compose
@@ -33,6 +35,22 @@ class PartLabels:
     def hiding_probability(self) -> "OnePart":
         """Returns, for each camera, the probability at every pixel that hair, or the cap, hides the skin."""
         return OnePart(self.maps, Part.HAIR, {} if self.cap is None else self.cap.masks)
+
+    def skin_share(
+        self,
+        camera: Camera,
+        points: Float[np.ndarray, "v 3"],
+        hairless: Bool[np.ndarray, " v"],
+        face: Bool[np.ndarray, " v"],
+    ) -> Float[np.ndarray, " v"]:
+        """Returns how probably (0 to 1) a view shows the head at its points (world, mm), and not clothes or a backdrop
+        before them, nor hair before ``hairless`` ones. In the ``face``, what is of no part is a mouth or a nostril. 1
+        without a part map."""
+        if camera.name not in self.maps:
+            return np.ones(len(points))
+        shown = shown_parts(points, self.maps[camera.name], camera)
+        of_head = shown[:, Part.SKIN.channel] + ~hairless * shown[:, Part.HAIR.channel]
+        return of_head + face * (1.0 - shown.sum(axis=1))
 
     def skin_probability(self) -> "OnePart":
         """Returns, for each camera, the probability of skin at every pixel."""

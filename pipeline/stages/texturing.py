@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.geometry.raster import depth_maps
+from pipeline.head_model.regions import head_regions, pinnae
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.head_fit import HeadFit
 from pipeline.stages.part_labels import PartLabels
@@ -15,13 +16,13 @@ from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.views import Views
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo
 from pipeline.texturing.chart_colours import ChartColours, chart_colours, with_true_colours
-from pipeline.texturing.head_texture import find_layout, paint_head
-from pipeline.texturing.layout.reduced_layout import ReducedLayout, reduced_layout
+from pipeline.texturing.layout.normal_map import ReducedLayout, reduced_layout
 from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.paint import find_layout, paint_head
 from pipeline.texturing.pores.close_views import CloseViews, read_close_views
 from pipeline.texturing.pores.skin_maps import SkinMaps, skin_maps, skin_share
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
-from pipeline.texturing.vertex_colours import Texture, texture
+from pipeline.texturing.vertex_colours import SkinShown, Texture, texture
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
 from rig.mesh import Mesh
@@ -54,9 +55,9 @@ def texture_head(
     chart, chart_warnings = chart_colours(views.capture, rig) if settings.texture.chart else (None, [])
     capture = views.capture if chart is None else with_true_colours(views.capture, chart)
     around = None if layout is None else layout.around
+    ears = pinnae(model)
     vertices = texture(
         mesh,
-        normals,
         capture,
         views.silhouettes,
         rig,
@@ -64,6 +65,9 @@ def texture_head(
         settings=settings.texture,
         around=around,
         dim_share=DIM_SHARE if settings.outputs.albedo != "none" else None,
+        skin=SkinShown(
+            lambda camera: labels.skin_share(camera, mesh.vertices, ears, face), ~head_regions(model)["cranium"] | ears
+        ),
     )
     close, pores_warnings = _read_pores(context, views, mesh, vertices, face, chart)
     atlas = paint_head(layout, mesh, vertices, face, settings, None if close is None else close.for_texels())

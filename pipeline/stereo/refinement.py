@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32
 
 from pipeline.compute.threads import map_in_threads
 from pipeline.stereo.crops import MAX_UNSEEN_PX
-from pipeline.stereo.field import Field
+from pipeline.stereo.depth_map import Field
 from pipeline.stereo.field_kernels import double, fit_planes
 from pipeline.stereo.matcher import Matching, Planes
 from pipeline.stereo.speck_kernels import fill_specks, mark_specks

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 
 from pipeline.compute.threads import map_in_threads
+from pipeline.stereo.depth_map import Field
 from pipeline.stereo.depth_range import REACH_MM, STEEPEST, DepthRange
-from pipeline.stereo.field import Field
 from pipeline.stereo.matcher import Matching
 from pipeline.stereo.sweep_kernels import aggregate
 from rig.camera import Camera

@@ -16,11 +16,9 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from pipeline.compute.threads import in_threads
 from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.texturing.chart_colours import ChartColours, levelled_by_chart
-from pipeline.texturing.inpaint import fill_unknown
-from pipeline.texturing.layout.layout_image import spread_texels
-from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
+from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, spread_texels
 from pipeline.texturing.light import Light, fit_light, transfer
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown
 from pipeline.texturing.vertex_colours import Texture
 from pipeline.warnings import ReportWarning
 from rig.colour_space import linear_from_srgb, srgb_from_linear
@@ -115,7 +113,7 @@ def multiplied(atlas: Atlas, factors: Float[np.ndarray, "v 3"]) -> UInt8[np.ndar
 
 
 def _factor_image(layout: Layout, factors: Float[np.ndarray, "v 3"]) -> Float32[np.ndarray, "s s 3"]:
-    """The vertices' factors over the layout; beside it, those of the nearest texel."""
+    """Spreads the vertices' factors over the layout; texels outside get the factor of the nearest one."""
     texels, ones = FACTORS_PX * layout.uv - 0.5, np.ones(len(layout.uv))
     _, shown = rasterise(texels, ones, layout.faces, FACTORS_PX, FACTORS_PX)
     image = interpolate(shown, texels, ones, layout.faces, factors[layout.source].astype(np.float32))

@@ -1,4 +1,4 @@
-"""Compiled loops of ``pipeline.texturing.inpaint``."""
+"""Compiled loops of ``pipeline.texturing.neighbourhood``."""
 
 import numpy as np
 

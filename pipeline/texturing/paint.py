@@ -8,15 +8,21 @@ these are blended across the triangle. What no camera sees gets the vertices' co
 
 import cv2
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Bool, Int, UInt8
 
 from pipeline.compute.threads import in_threads
+from pipeline.compute.trace import traced
 from pipeline.geometry.raster import camera_depths
 from pipeline.geometry.raster_kernels import interpolate, rasterise
+from pipeline.head_model.model import HeadModel
+from pipeline.settings import Settings
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.uv_unwrap import Atlas, Layout
+from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, ModelLayout, NoLayout, model_layout
 from pipeline.texturing.paint_kernels import paint_rows
+from pipeline.texturing.vertex_colours import Texture
+from pipeline.warnings import ReportWarning
 from rig.mesh import Mesh
+from rig.messages.message import compose
 from rig.rig import Rig
 
 SIZES = (1024, 2048, 4096, 8192)
@@ -84,3 +90,33 @@ def texture_size(
     pixel_mm = [float(camera_depths(camera, centre)[0]) / camera.intrinsics.fx for camera in views]
     least = unit_mm / min(pixel_mm, default=unit_mm)
     return next((size for size in SIZES if size >= least), SIZES[-1])
+
+
+def find_layout(model: HeadModel, settings: Settings) -> tuple[ModelLayout | None, list[ReportWarning]]:
+    """Returns the model's texture layout; None if no file of the result has a texture, or if the model cannot be laid
+    flat. Also returns warnings about the model."""
+    if not settings.outputs.textured or settings.texture.blend == "reference":
+        return None, []
+    try:
+        return model_layout(model), []
+    except NoLayout as reason:
+        return None, [compose("no-texture-layout", reason=reason.message)]
+
+
+@traced
+def paint_head(
+    layout: ModelLayout | None,
+    mesh: Mesh,
+    coloured: Texture,
+    face_region: Bool[np.ndarray, " v"],
+    settings: Settings,
+    full_size: Rig | None = None,
+) -> Atlas | None:
+    """Paints the texture of the head, as fine as the pictures, or as those of the cameras ``full_size``. Returns None
+    if there is no layout or no camera saw the head."""
+    if layout is None or coloured.decision is None:
+        return None
+    region = np.flatnonzero(face_region)
+    wanted = settings.outputs.texture_size
+    size = texture_size(layout.layout, mesh, full_size or coloured.decision.views, region, wanted=wanted)
+    return paint_texture(layout.layout, mesh, coloured.colours, coloured.decision, size)

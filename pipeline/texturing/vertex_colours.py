@@ -17,7 +17,7 @@ be painted in the colour of the skin around it. Such a patch takes its colours f
 it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,8 +32,7 @@ from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
-from pipeline.texturing.inpaint import fill_unknown
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown
 from pipeline.texturing.paint_kernels import Pictures
 from pipeline.texturing.seam_levelling import level_views
 from pipeline.texturing.vertex_colours_kernels import OUTLIER, blend_views
@@ -60,6 +59,7 @@ GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
 
 
+MIN_SKIN, MIN_MEAN_SKIN = 0.5, 0.7  # of a view, and of all: at a collar's soft edge single views are sure of skin
 GAIN_HALVED = 1.0  # of the light, in powers of two: a camera that differs so much counts half
 
 Rgb = tuple[float, float, float]
@@ -80,10 +80,35 @@ class Texture:
     warnings: tuple[ReportWarning, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SkinShown:
+    """Says where views show the skin of a head: ``share`` (0 to 1) gives for a camera how probably it does at each
+    vertex. Unseen vertices ``within`` a part of the mesh are filled from that part alone."""
+
+    share: Callable[[Camera], Float[np.ndarray, " v"]]
+    within: Bool[np.ndarray, " v"]
+
+    def shown(self, weights: Float32[np.ndarray, "k v"], views: Rig) -> Bool[np.ndarray, "k v"]:
+        """Tells which views may colour each vertex: not where they, or the mean of all, hardly show its skin."""
+        shares = np.stack([self.share(camera) for camera in views])
+        mean = (weights * shares).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-9)
+        return (shares > MIN_SKIN) & (mean > MIN_MEAN_SKIN)
+
+    def filled(
+        self,
+        colours: Float[np.ndarray, "v 3"],
+        seen: Bool[np.ndarray, " v"],
+        faces: Int[np.ndarray, "f 3"],
+        whole: Float[np.ndarray, "v 3"],
+    ) -> Float[np.ndarray, "v 3"]:
+        """Returns the colours ``whole`` with those of the part filled from the part alone."""
+        inside = faces[self.within[faces].all(axis=1)]
+        return np.where(self.within[:, None], fill_unknown(colours, seen & self.within, inside), whole)
+
+
 @traced
 def texture(
     mesh_world: Mesh,
-    normals: Float[np.ndarray, "v 3"],
     capture: Capture,
     silhouettes: Mapping[str, Silhouette],
     rig: Rig,
@@ -93,30 +118,33 @@ def texture(
     around: Neighbourhood | None = None,
     dim_share: float | None = None,
     outlier: float = OUTLIER,
+    skin: SkinShown | None = None,
 ) -> Texture:
     """Computes the colour of each vertex from the photographs of the usable views. ``depths`` are the mesh's depth maps
     in these views (mm).
 
     If ``around``, the edges of the mesh, is not None, the result also has a ``decision``: a view for each vertex. If
     ``dim_share`` is not None, it also has each vertex's colour in a dim view: views with that share of the vertex's
-    weight are no brighter. A view counts half where it differs from the median of the
-    views by ``outlier`` of its level.
+    weight are no brighter. A view counts half where it differs from the views' median by ``outlier`` of its level.
+    With ``skin``, no view colours a vertex where it shows something before the mesh.
     """
-    views = usable_views(capture, silhouettes, rig)
+    views, normals = usable_views(capture, silhouettes, rig), mesh_world.normals()
     if settings.blend == "reference":
         return _reference(mesh_world, normals, capture, silhouettes, views, depths)
     if not len(views):
         return _untextured(len(normals))
 
     def read_view(camera: Camera) -> tuple[Sight, UInt8[np.ndarray, "_ _ 3"]]:
-        name = camera.name
-        image = sharpened(capture.images[name], silhouettes[name].mask, settings.sharpening)
-        points, silhouette = mesh_world.vertices, silhouettes[name]
-        sight = see_points(camera, image, silhouette, depths[name], points, normals)
-        return sight, image
+        silhouette = silhouettes[camera.name]
+        image = sharpened(capture.images[camera.name], silhouette.mask, settings.sharpening)
+        return see_points(camera, image, silhouette, depths[camera.name], mesh_world.vertices, normals), image
 
     found = map_in_threads(lambda k: read_view(views.cameras[k]), len(views))
     weights, colours = _stacked([sight for sight, _ in found])
+    hidden = np.asarray((weights > 0).any(axis=0))
+    if skin is not None:
+        weights *= skin.shown(weights, views)
+    hidden &= ~(weights > 0).any(axis=0)
     gains, offsets = np.ones((len(views), 3)), np.zeros((len(views), 3))
     if settings.balance:
         gains, offsets = balance(weights, colours)
@@ -127,17 +155,16 @@ def texture(
         return _untextured(len(seen))
     decision = None
     if around is not None:
-        images = [image for _, image in found]
         masks = {name: silhouettes[name].mask for name in views.names}
-        pictures = pack_pictures(views, images, masks, gains, offsets, mesh_world=mesh_world)
+        pictures = pack_pictures(views, [image for _, image in found], masks, gains, offsets, mesh_world=mesh_world)
         decision = decide(views, weights, balanced, agreed, gains, pictures, around=around)
-        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths)
-    shown = np.rint(255 * srgb_from_linear(fill_unknown(agreed, seen > 0, mesh_world.faces))).astype(np.uint8)
-    by_camera = _by_name(views, gains)
+        decision = fill_unobserved_patches(decision, mesh_world, silhouettes, depths, hidden)
+    whole = fill_unknown(agreed, seen > 0, mesh_world.faces)
+    whole = whole if skin is None else skin.filled(agreed, seen > 0, mesh_world.faces, whole)
+    shown, by_camera = np.rint(255 * srgb_from_linear(whole)).astype(np.uint8), _by_name(views, gains)
     filled = int(np.count_nonzero(seen == 0))
-    warnings = _gain_warnings(by_camera)
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
-    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, warnings)
+    return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, _gain_warnings(by_camera))
 
 
 def underexposed_views(
@@ -283,10 +310,12 @@ def fill_unobserved_patches(
     mesh_world: Mesh,
     silhouettes: Mapping[str, Silhouette],
     depths: Mapping[str, Float32[np.ndarray, "_ _"]],
+    hidden: Bool[np.ndarray, " v"] | None = None,
 ) -> Decision:
     """Returns the decision with a view added at the corners of every wide patch that a camera sees although it sees
-    none of the corners, such as a strip that closes an eye."""
-    rows = np.flatnonzero(_blind(decision.weights, mesh_world.faces))
+    none of the corners, such as a strip that closes an eye; not where hair or clothes lie before ``hidden`` corners."""
+    blind = _blind(decision.weights, mesh_world.faces)
+    rows = np.flatnonzero(blind if hidden is None else blind & ~hidden[mesh_world.faces].any(axis=1))
     faces, normals, area = _parts(mesh_world, rows)
     rows = rows[_wide(faces, area)]
     if not len(rows):

@@ -68,6 +68,8 @@ GUARDS = (
     Guard(("view-left-out",), ("contrast along the outline, or area against the other cameras",),
           "a head pressed into a wrong outline", kind="warns"),
     Guard(("mask-contradicted",), ("dense depth of other views outside a silhouette",), "a cut bust", kind="warns"),
+    Guard(("crown-low",), ("planes that touch the crown", "the face says where the skull is"), "a head with a flat top",
+          kind="warns"),
     Guard(("moments-differ",), ("landmarks of a view against those of the others",), "a face between two moments",
           kind="warns"),
     Guard(("lens-doubtful",), ("rays of points on the subject",), "a head bent by a wrong lens", kind="warns"),
@@ -89,9 +91,18 @@ class FaceEvidence:
     """
 
     centre_world: Float[np.ndarray, " 3"]
-    up_world: Float[np.ndarray, " 3"]
+    rotation: Float[np.ndarray, "3 3"]  # world from face: leftwards, up, ahead
     views: tuple[str, ...]
     missed: tuple[str, ...]
+
+    @property
+    def up_world(self) -> Float[np.ndarray, " 3"]:
+        """Returns which way is up for the subject."""
+        return self.rotation[:, 1]
+
+    def skull_world(self, from_face_mm: tuple[float, float, float]) -> Float[np.ndarray, " 3"]:
+        """Returns the point that lies ``from_face_mm`` from the face."""
+        return self.centre_world + self.rotation @ np.array(from_face_mm)
 
     @property
     def holds_the_rig(self) -> bool:
@@ -107,7 +118,7 @@ def find_face_evidence(images: Mapping[str, ImageRgb], rig: Rig) -> FaceEvidence
         return None
     missed = tuple(name for name in subject.expected if name not in face.detections)
     placed = face.world_from_face
-    return FaceEvidence(placed.translation, placed.rotation[:, 1], tuple(face.detections), missed)
+    return FaceEvidence(placed.translation, placed.rotation, tuple(face.detections), missed)
 
 
 FindFace = Callable[[Mapping[str, ImageRgb], Rig], FaceEvidence | None]

@@ -1,4 +1,5 @@
-"""Checks the size of the head that the outlines show, before a fit, from silhouettes, cameras and the subject's face.
+"""Checks the head that the outlines show, before a fit, from silhouettes, cameras and the subject's face: its size, and
+whether every view shows its crown as high as the others do.
 
 Cameras from another program have an arbitrary unit if no length was given. A model fitted to a head three times too
 large lies inside the face, and every outline counts as clutter. Each outline has a diameter that needs no model: going
@@ -9,7 +10,10 @@ Up is the face's; without a face it is the pictures', or the rig's if its camera
 more outlines meet in one head. A mask may end anywhere and touch any border, so that no border says what is down. A
 face of a human's size contradicts every outline: then nothing is refused.
 
-Enters: silhouettes, the rig and the face. Leaves: the diameter, and the message about it.
+A crown is nearly round: planes that touch it from above, each through one camera, pass the skull's middle at nearly
+the same distance. A mask that ends below the crown has a plane that passes nearer.
+
+Enters: silhouettes, the rig and the face. Leaves: the diameter and the crowns, and the messages about them.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,6 +37,14 @@ REFUSED_MM = (122.0, 350.0)  # a bald child of three has 130, hair 60 mm thick 3
 STRAND_SHARE = 0.06  # of a mask's size (root of its area): a centimetre of a head, which loose strands do not fill
 MIN_VIEWS = 3  # whose crown is in the picture
 MIN_MEETING = 0.5  # of these views: where most do not meet in one head, they measure none
+
+BESIDE_MM = 110.0  # from the middle of the head: what is farther is a hand or a shoulder
+SKULL_MM = (
+    0.0,
+    60.0,
+    -90.0,
+)  # the middle of the skull from that of the face: leftwards, up, ahead; crowns of 8 captures
+MAX_LOW_MM = 18.0  # below the others; 12 in whole masks of 8 captures, long hair among them
 
 Discs = Mapping[str, tuple[Float[np.ndarray, " 2"], float]]  # by camera: middle and diameter (px)
 
@@ -72,6 +84,59 @@ def _diameters_mm(
     if len(meeting) < MIN_MEETING * len(discs):
         return []
     return [discs[name][1] * _mm_per_px(rig[name], point) for name in meeting]
+
+
+def find_low_crowns(
+    silhouettes: Mapping[str, Silhouette], rig: Rig, find_face: Callable[[], FaceEvidence | None]
+) -> dict[str, float]:
+    """Returns how far (mm) the crown in a view lies below that in the others, for views where it is more than
+    ``MAX_LOW_MM``. The face is asked only if the outlines alone raise suspicion."""
+    solid = {name: _without_strands(s.mask) for name, s in silhouettes.items() if s.quality.usable and name in rig}
+    pictures_up = -np.mean([camera.camera_from_world.rotation[1] for camera in rig], axis=0)
+    found = {name: crown_disc(mask, turns_to_upright(rig[name], pictures_up)) for name, mask in solid.items()}
+    middle = _middle({name: disc for name, disc in found.items() if disc is not None}, rig)
+    if middle is not None and not _low_crowns(solid, rig, middle, pictures_up / np.linalg.norm(pictures_up)):
+        return {}
+    face = find_face()
+    return {} if face is None else _low_crowns(solid, rig, face.skull_world(SKULL_MM), face.up_world)
+
+
+def _low_crowns(
+    solid: Mapping[str, Bool[np.ndarray, "_ _"]],
+    rig: Rig,
+    middle_world: Float[np.ndarray, " 3"],
+    up_world: Float[np.ndarray, " 3"],
+) -> dict[str, float]:
+    heights = {name: crown_height_mm(mask, rig[name], middle_world, up_world) for name, mask in solid.items()}
+    known = {name: height for name, height in heights.items() if height is not None}
+    if len(known) < MIN_VIEWS:
+        return {}
+    others = {name: float(np.median([known[other] for other in known if other != name])) for name in known}
+    return {name: others[name] - known[name] for name in known if others[name] - known[name] > MAX_LOW_MM}
+
+
+def crown_height_mm(
+    mask: Bool[np.ndarray, "h w"], camera: Camera, middle_world: Float[np.ndarray, " 3"], up_world: np.ndarray
+) -> float | None:
+    """Returns the distance (mm) from the middle of the skull to the plane through the camera that touches the mask from
+    above; None if the mask ends at the picture's border there, or shows nothing."""
+    middle, above = camera.project(np.stack([middle_world, middle_world + 50.0 * up_world]))
+    up = (above - middle) / np.linalg.norm(above - middle)
+    across = np.array([-up[1], up[0]])
+    rows, columns = np.nonzero(mask)
+    pixels = np.stack([columns, rows], axis=1) - middle
+    near = np.abs(pixels @ across) < BESIDE_MM / _mm_per_px(camera, middle_world)
+    if not near.any():
+        return None
+    pixels = pixels[near]
+    top = pixels[int(np.argmax(pixels @ up))] + middle
+    limit = np.array([mask.shape[1], mask.shape[0]]) - 2.0
+    if (top < 1.0).any() or (top > limit).any():
+        return None
+    ends = camera.rays_world(np.stack([top + 20.0 * across, top - 20.0 * across]))
+    normal = np.cross(ends[0], ends[1])
+    normal *= np.sign(normal @ up_world) / np.linalg.norm(normal)
+    return float(normal @ (camera.centre_world - middle_world))
 
 
 def _mm_per_px(camera: Camera, point_world: Float[np.ndarray, " 3"]) -> float:

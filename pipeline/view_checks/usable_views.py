@@ -5,22 +5,27 @@ which the unreliable ones are marked, and the warnings that say why. ``reconstru
 does nothing else.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
-from pipeline.imaging.silhouette import Silhouette
+import cv2
+import numpy as np
+
+from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.view_checks.camera_assignment import FITTING_MISFIT, own_misfit
 from pipeline.view_checks.camera_drift import find_drift
 from pipeline.view_checks.guards import STRICT, Guards
-from pipeline.view_checks.head_size import judge_head_size
-from pipeline.view_checks.image_assignment import assign_images
+from pipeline.view_checks.head_size import find_low_crowns, judge_head_size
+from pipeline.view_checks.image_assignment import assign_images, common_share, thumbnail
 from pipeline.view_checks.mask_edges import masks_off_edges
-from pipeline.view_checks.picture_faults import plates_brightness, with_picture_faults
 from pipeline.view_checks.rig_agreement import misplaced_camera
 from pipeline.warnings import ReportWarning
 from rig.capture import Capture
+from rig.colour_space import linear_from_srgb
 from rig.errors import EigenheadError
+from rig.image import ImageRgb
 from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
 from rig.rig import Rig
@@ -97,22 +102,26 @@ def usable_views(
     find_face = cache(lambda: guards.find_face(assigned.capture.images, rig))
     overruled: list[ReportWarning] = []
     doubted = [name for name, s in assigned.silhouettes.items() if s.quality.warnings or not s.quality.usable]
-    silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted)
+    silhouettes = with_picture_faults(assigned.silhouettes, assigned.capture, doubted, rig)
     usable = sum(silhouette.quality.usable for silhouette in silhouettes.values())
     by_face = MIN_VIEWS_OF_FACE <= usable < MIN_VIEWS <= len(silhouettes) and find_face() is not None
     if usable < MIN_VIEWS and not by_face:
         overruled.append(guards.refuse(TooFewViews(silhouettes, capture)))
         silhouettes = {name: _tried(silhouette) for name, silhouette in silhouettes.items()}
+    low = find_low_crowns(silhouettes, rig, find_face)
+    left_out = usable - len(low) >= MIN_VIEWS
+    silhouettes = {n: _left_out(s) if left_out and n in low else s for n, s in silhouettes.items()}
+    crowns = [compose("crown-low", camera=name, low_mm=mm) for name, mm in low.items()]
     silhouettes, moved = without_moved_cameras(silhouettes, rig)
     unexplained = silhouettes
-    silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys())
+    silhouettes = with_picture_faults(silhouettes, assigned.capture, moved.keys(), rig)
     moved_warnings = [warning for name, warning in moved.items() if silhouettes[name] is unexplained[name]]
     masks_given = bool(assigned.capture.masks)
     size = judge_head_size(silhouettes, rig, find_face, guards=guards, masks_given=masks_given)
     given_masks = [name for name in rig.names if name in assigned.capture.masks]
     beside = masks_off_edges(assigned.capture.images, silhouettes, given_masks)
     of_views = (*view_warnings(silhouettes), *moved_warnings)
-    warnings = (*assigned.warnings, *overruled, *of_views, *size, *beside, *capture.remarks)
+    warnings = (*assigned.warnings, *overruled, *crowns, *of_views, *size, *beside, *capture.remarks)
     return UsableViews(assigned.capture, silhouettes, assigned.pictures, warnings)
 
 
@@ -120,6 +129,10 @@ def _tried(silhouette: Silhouette) -> Silhouette:
     """Returns the silhouette as a usable one if it shows anything."""
     usable = silhouette.quality.usable or float(silhouette.mask.mean()) > MIN_AREA
     return replace(silhouette, quality=replace(silhouette.quality, usable=usable))
+
+
+def _left_out(silhouette: Silhouette) -> Silhouette:
+    return replace(silhouette, quality=replace(silhouette.quality, usable=False))
 
 
 def without_moved_cameras(
@@ -130,12 +143,11 @@ def without_moved_cameras(
     kept, warnings = dict(silhouettes), dict[str, ReportWarning]()
     for drift in find_drift(silhouettes, rig):
         if drift.moved:
-            quality = replace(silhouettes[drift.camera].quality, usable=False)
-            kept[drift.camera] = replace(silhouettes[drift.camera], quality=quality)
+            kept[drift.camera] = _left_out(silhouettes[drift.camera])
         warnings[drift.camera] = drift.warning()
     misplaced = misplaced_camera(kept, rig)
     if misplaced is not None:
-        kept[misplaced] = replace(kept[misplaced], quality=replace(kept[misplaced].quality, usable=False))
+        kept[misplaced] = _left_out(kept[misplaced])
         warnings[misplaced] = compose("camera-moved", finding=compose("camera-misplaced", camera=misplaced))
     return kept, warnings
 
@@ -172,3 +184,113 @@ def _doubt(remark: Message) -> ReportWarning:
     return compose(
         "mask-doubtful", camera=camera, remark=compose("same-of-more", fault=fault, count=count, names=names)
     )
+
+
+MIN_TURNED = 0.5  # share of a picture that its turned plate explains: 0.65 to 0.69, and 0.55 to 0.79 of right ones ...
+TURNED_GAIN = 1.5  # ... and how many times what the plate explains as it is: 1.7 to 4, and 0.95 at most of right ones
+MISFIT_GAIN = 1.2  # how many times the misfit of the right turn that as it is must be: 1.26 to 1.6 if upside down
+FINE_PX, COARSE_PX = 1.0, 2.0  # blurs between which a picture's fine detail lies: noise of single pixels is below
+DETAIL_QUANTILE = 0.9  # of the subject's pixels: eyes, hair and clothes, not flat skin
+MAX_BLURRED = 0.45  # of the median view's detail: 0.39 at a blur of 3 px, 0.28 in motion over 60; 0.57 and more in
+# sharp views of six captures, from face to back
+INSET_PX = 4.0  # inside the outline, of which a loose mask shows the backdrop
+OTHER_EXPOSURE = 1.8  # between plate and shot: up to one stop is levelled
+MIN_LIGHT, MAX_LIGHT = 0.002, 0.98  # neither black nor burnt out
+MIN_PIXELS, MIN_COMPARED = 500, 3  # of a subject, and views, that tell anything
+
+
+def with_picture_faults(
+    silhouettes: Mapping[str, Silhouette], capture: Capture, suspects: Collection[str], rig: Rig
+) -> dict[str, Silhouette]:
+    """Returns silhouettes in which the fault of a suspect's picture replaces the warnings that follow from it. Views
+    with a turned picture are not usable."""
+    found = dict(silhouettes)
+    blurred = blurred_views(capture.images, silhouettes) if suspects else {}
+    for name in suspects:
+        fault = turned_against_plate(capture, name) or turned_against_others(silhouettes, name, rig)
+        usable = silhouettes[name].quality.usable and fault is None
+        fault = fault or blurred.get(name)
+        if fault is not None:
+            quality = replace(silhouettes[name].quality, usable=usable, warnings=(fault,), doubts=())
+            found[name] = replace(silhouettes[name], quality=quality)
+    return found
+
+
+def turned_against_plate(capture: Capture, name: str) -> Message | None:
+    """Returns the fault of a picture that shows its clean plate only once it is turned by 180 degrees or flipped."""
+    plates = capture.backgrounds.get(name, ())
+    if name not in capture.images or not plates:
+        return None
+    picture, plate = thumbnail(capture.images[name]), thumbnail(plates[0])
+    turns = {
+        compose("turned-half"): picture[::-1, ::-1],
+        compose("flip-across"): picture[:, ::-1],
+        compose("flip-down"): picture[::-1],
+    }
+    shares = {turn: common_share(np.ascontiguousarray(turned), plate) for turn, turned in turns.items()}
+    turn, share = max(shares.items(), key=lambda one: one[1])
+    if share < max(MIN_TURNED, TURNED_GAIN * common_share(picture, plate)):
+        return None
+    return compose("picture-turned-to-plate", turn=turn)
+
+
+def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig: Rig) -> Message | None:
+    """Returns the fault of a picture, turned together with its plate, whose outline agrees with those of the other
+    cameras only once it is turned by 180 degrees or flipped."""
+    others = {camera: s for camera, s in silhouettes.items() if s.quality.usable and camera != name}
+    if len(others) < MIN_COMPARED or not silhouettes[name].mask.any():
+        return None
+
+    def misfit(mask: np.ndarray) -> float:
+        return own_misfit({**others, name: silhouette_from_mask(np.ascontiguousarray(mask))}, rig)[name]
+
+    mask = silhouettes[name].mask
+    turns = {
+        compose("turned-half"): mask[::-1, ::-1],
+        compose("flip-across"): mask[:, ::-1],
+        compose("flip-down"): mask[::-1],
+    }
+    misfits = {turn: misfit(turned) for turn, turned in turns.items()}
+    turn, least = min(misfits.items(), key=lambda one: one[1])
+    if not least < FITTING_MISFIT < misfit(mask) or misfit(mask) < MISFIT_GAIN * least:
+        return None
+    return compose("picture-turned-to-others", turn=turn)
+
+
+def blurred_views(images: Mapping[str, ImageRgb], silhouettes: Mapping[str, Silhouette]) -> dict[str, Message]:
+    """Returns the fault of each picture whose subject has much less fine detail than in the other views."""
+    known = {name: _detail(image, silhouettes[name]) for name, image in images.items() if name in silhouettes}
+    details = {name: detail for name, detail in known.items() if detail is not None}
+    if len(details) < MIN_COMPARED:
+        return {}
+    usual = float(np.median([*details.values()]))
+    return {
+        name: compose("detail-missing", share=detail / usual)
+        for name, detail in details.items()
+        if detail < MAX_BLURRED * usual
+    }
+
+
+def plates_brightness(capture: Capture) -> float | None:
+    """Returns how many times as bright as the pictures the clean plates are, in linear light; None where that is no
+    other exposure. The subject covers less than half of a picture, so that the median is of the backdrop."""
+    ratios = []
+    for name, plates in capture.backgrounds.items():
+        if name in capture.images and plates and plates[0].shape == capture.images[name].shape:
+            light = [
+                linear_from_srgb(of[::8, ::8].astype(np.float32) / 255.0) for of in (plates[0], capture.images[name])
+            ]
+            known = (light[0] < MAX_LIGHT).all(axis=2) & (light[1] > MIN_LIGHT).all(axis=2)
+            ratios += [float(np.median(light[0][known] / light[1][known]))] if known.any() else []
+    factor = float(np.median(ratios)) if ratios else 1.0
+    return factor if abs(np.log(factor)) > np.log(OTHER_EXPOSURE) else None
+
+
+def _detail(image: ImageRgb, silhouette: Silhouette) -> float | None:
+    """Returns how much (levels) the subject's pixels change within a few pixels; None where too few are seen."""
+    inside = silhouette.distance < -INSET_PX
+    if np.count_nonzero(inside) < MIN_PIXELS:
+        return None
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (FINE_PX, COARSE_PX))
+    return float(np.quantile(np.abs(fine - coarse)[inside], DETAIL_QUANTILE))

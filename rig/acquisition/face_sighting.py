@@ -23,6 +23,7 @@ class FaceSighting:
     ``searched``: number of pictures searched; ``missing``: cameras that the face is turned to but whose pictures do not
     show it; ``left_deg`` and ``up_deg``: how far the face looks to the subject's left and up, seen from the camera
     ``front``. Both are None where there is no face, or where the cameras stand all around and none is the front.
+    ``remarks``: what else the face shows, such as closed eyes.
     """
 
     searched: int
@@ -32,6 +33,7 @@ class FaceSighting:
     missing: tuple[str, ...] = ()
     left_deg: float | None = None
     up_deg: float | None = None
+    remarks: tuple[Message, ...] = ()
 
 
 def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tuple[Message, ...]:
@@ -48,7 +50,7 @@ def face_remarks(sighting: FaceSighting | None, faults: Iterable[Fault]) -> tupl
     if ways:
         way = ways[0] if len(ways) == 1 else compose("look-both", across=ways[0], upwards=ways[1])
         remarks.append(compose("face-turned", way=way, camera=sighting.front))
-    return tuple(remarks)
+    return (*remarks, *sighting.remarks)
 
 
 def _ways(sighting: FaceSighting) -> list[Message]:

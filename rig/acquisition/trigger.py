@@ -1,4 +1,4 @@
-"""Drives the trigger box over pyserial by its line protocol (docs/trigger-protocol.md).
+"""Drives the trigger box over pyserial by its line protocol (docs/rig.md).
 
 A request is ``@SS BODY*CCCC\\n`` and its reply ``#SS BODY*CCCC\\n``: SS is a sequence number (two hex digits), CCCC the
 CRC-16/CCITT-FALSE of ``SS BODY``. The start character resynchronises a receiver at any moment, so noise between lines

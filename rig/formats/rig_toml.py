@@ -5,11 +5,8 @@ suggested. A camera is identified by something that survives a reboot (serial nu
 address), never by an index, since indices change. deploy/rig.example.toml shows every key."""
 
 import dataclasses
-import math
 import re
 import tomllib
-import types
-import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +17,7 @@ from rig.formats.cameras.cameras_json import name_fault
 from rig.formats.captures.shot_files import PLATES_MOST
 from rig.messages.message import Message, compose
 from rig.text import suggest
+from rig.typed_tables import read_fields
 
 FORMAT = "eigenhead-rig/1"
 DriverName = Literal["opencv", "gphoto", "genicam", "replay", "simulated"]
@@ -40,12 +38,18 @@ _CAMERA_BOUNDS = {
     "white_balance_k": (1000, 20_000),
 }
 
-_SHOT_MOST = {
-    "timeout_s": 600,
-    "open_timeout_s": 600,
-    "warm_up_frames": 1000,
-    "plates": PLATES_MOST,
-    "plates_over_s": 600,
+_TRIGGER_BOUNDS = {"pulse_us": (1, 500_000), "baud": (300, 4_000_000), "window_s": (0.1, 60)}
+_SHOT_BOUNDS = {
+    "timeout_s": (0.001, 600),
+    "open_timeout_s": (0.001, 600),
+    "warm_up_frames": (1, 1000),
+    "plates": (1, PLATES_MOST),
+    "plates_over_s": (0, 600),
+    "skew_most_ms": (0.001, 60_000),
+    "clipped_most": (1e-6, 1),
+    "dark_below": (1e-6, 100),
+    "blur_most_px": (0.001, 1000),
+    "moved_most_px": (0.001, 1000),
 }
 
 
@@ -151,10 +155,8 @@ def read_rig_config(path: Path) -> RigConfig:
 def rig_config_from_document(document: Mapping[str, Any], folder: Path, subject: str = "rig.toml") -> RigConfig:
     """Returns a rig from parsed TOML. Raises InputError that names every fault."""
     faults: list[Message] = []
-    config = _read_table(RigConfig, document, "", faults)
-    if config is not None:
-        faults.extend(_rig_faults(config))
-    if faults or config is None:
+    config = read_fields(RigConfig, document, "", faults)
+    if faults := faults or _rig_faults(config):
         raise InputError(subject, faults)
     return dataclasses.replace(config, folder=folder)
 
@@ -193,10 +195,8 @@ def _rig_faults(config: RigConfig) -> list[Message]:
         faults.extend(compose("located", where="trigger", fault=fault) for fault in of_trigger)
     strange = [output for output in config.lights.outputs if output not in range(4)]
     faults.extend(compose("lights-output-unknown", output=output) for output in strange)
-    if not 0 <= config.lights.settle_s <= 60:
-        faults.append(_outside("lights.settle_s", config.lights.settle_s, 0, 60))
-    faults.extend(_shot_faults(config.shot))
-    return faults
+    faults += _outside(config.lights, {"settle_s": (0, 60)}, "lights.")
+    return faults + _outside(config.shot, _SHOT_BOUNDS, "shot.")
 
 
 def _doubles(config: RigConfig, what: str) -> list[Message]:
@@ -225,108 +225,24 @@ def _camera_faults(camera: CameraConfig, trigger: TriggerConfig | None) -> list[
         faults.append(compose("channel-unknown", channel=camera.channel))
     if camera.channel is not None and trigger is None:
         faults.append(compose("channel-without-trigger"))
-    for key, (least, most) in _CAMERA_BOUNDS.items():
-        value = getattr(camera, key)
-        if value is not None and not least <= value <= most:
-            faults.append(_outside(key, value, least, most))
-    return faults
+    return faults + _outside(camera, _CAMERA_BOUNDS)
 
 
 def _trigger_faults(trigger: TriggerConfig) -> list[Message]:
     faults: list[Message] = []
     if _INDEXED_PORT.fullmatch(trigger.port.strip()):
         faults.append(compose("port-by-index", port=f"{trigger.port!r}"))
-    if not 1 <= trigger.pulse_us <= 500_000:
-        faults.append(_outside("pulse_us", trigger.pulse_us, 1, 500_000))
-    if not 300 <= trigger.baud <= 4_000_000:
-        faults.append(_outside("baud", trigger.baud, 300, 4_000_000))
-    if not 0.1 <= trigger.window_s <= 60:
-        faults.append(_outside("window_s", trigger.window_s, 0.1, 60))
-    return faults
+    return faults + _outside(trigger, _TRIGGER_BOUNDS)
 
 
-def _outside(key: str, value: float, least: float, most: float) -> Message:
-    return compose("value-outside", key=key, value=f"{value}", least=f"{least}", most=f"{most}")
-
-
-def _shot_faults(shot: ShotConfig) -> list[Message]:
-    least = {"warm_up_frames": 1, "plates": 1, "plates_over_s": 0}
-    values = {field.name: getattr(shot, field.name) for field in dataclasses.fields(shot)}
-    faults: list[Message] = []
-    for name, value in values.items():
-        if name in least and value < least[name]:
-            faults.append(compose("value-small", key=f"shot.{name}", value=f"{value}", least=least[name]))
-        elif name not in least and value <= 0:
-            faults.append(compose("value-not-positive", key=f"shot.{name}", value=f"{value}"))
-    for name, most in _SHOT_MOST.items():
-        if values[name] > most:
-            faults.append(compose("value-large", key=f"shot.{name}", value=f"{values[name]}", most=most))
-    return faults
-
-
-def _read_table(kind: type, table: Any, where: str, faults: list[Message]) -> Any:
-    """Builds a dataclass from a table. Returns None, and appends the faults, if a value is missing or of a wrong
-    type."""
-    if not isinstance(table, Mapping):
-        faults.append(compose("located", where=where or "document", fault=compose("is-no-table")))
-        return None
-    fields = {field.name: field for field in dataclasses.fields(kind) if field.metadata.get("key", True)}
-    hints = typing.get_type_hints(kind)
-    prefix = f"{where}." if where else ""
-    before = len(faults)
-    unknown = [key for key in table if key not in fields]
-    faults.extend(_hinted(compose("toml-key-unknown", key=f"{prefix}{key}"), key, fields) for key in unknown)
-    values: dict[str, object] = {}
-    for name, field in fields.items():
-        if name in table:
-            values[name] = _read_value(hints[name], table[name], prefix + name, faults)
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            known = _allowed(hints[name])
-            missing = compose("key-missing", key=f"{prefix}{name}")
-            faults.append(compose("one-of", fault=missing, known=known) if known else missing)
-    return kind(**values) if len(faults) == before else None
-
-
-def _read_value(hint: Any, value: Any, where: str, faults: list[Message]) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        if value not in arguments or isinstance(value, bool):
-            fault = compose("value-not-allowed", key=where, value=f"{value!r}")
-            faults.append(_hinted(compose("one-of", fault=fault, known=_allowed(hint)), value, arguments))
-        return value
-    if origin in (types.UnionType, typing.Union):
-        return _read_value(arguments[0], value, where, faults)
-    if origin is tuple:
-        if not isinstance(value, list):
-            faults.append(compose("located", where=where, fault=compose("is-no-list")))
-            return ()
-        return tuple(_read_value(arguments[0], v, _item(where, v, i), faults) for i, v in enumerate(value))
-    if dataclasses.is_dataclass(hint):
-        return _read_table(typing.cast(type, hint), value, where, faults)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        faults.append(compose("value-is-no", key=where, value=f"{value!r}", kind=_KINDS.get(hint, str(hint))))
-    elif isinstance(value, float) and not math.isfinite(value):
-        faults.append(compose("value-not-finite", key=where, value=f"{value}"))
-    return value
-
-
-_KINDS = {
-    str: compose("kind-text"),
-    int: compose("kind-whole-number"),
-    float: compose("kind-number"),
-    bool: compose("kind-switch"),
-}
-
-
-def _item(where: str, value: Any, index: int) -> str:
-    name = value.get("name") if isinstance(value, Mapping) else None
-    return f"{where}.{name}" if isinstance(name, str) else f"{where}[{index}]"
-
-
-def _allowed(hint: Any) -> tuple[str, ...]:
-    return tuple(map(str, typing.get_args(hint))) if typing.get_origin(hint) is Literal else ()
+def _outside(table: object, bounds: Mapping[str, tuple[float, float]], where: str = "") -> list[Message]:
+    """Returns a fault for each value of a table that is outside its bounds."""
+    values = {key: getattr(table, key) for key in bounds}
+    return [
+        compose("value-outside", key=where + key, value=f"{value}", least=f"{bounds[key][0]}", most=f"{bounds[key][1]}")
+        for key, value in values.items()
+        if value is not None and not bounds[key][0] <= value <= bounds[key][1]
+    ]
 
 
 def _hinted(fault: Message, word: Any, known: Iterable[Any]) -> Message:

@@ -1,5 +1,5 @@
 """Encodes and decodes the trigger box's protocol ``eigenhead-trigger/1``: one message a line
-(docs/trigger-protocol.md)."""
+(docs/rig.md)."""
 
 from collections.abc import Iterator
 

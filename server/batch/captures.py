@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
-from rig.capture import TEXTURE_SETS
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file
-from rig.formats.captures.shot_files import BESIDE_PICTURES, listed_pictures
-from rig.formats.pictures.picture_names import is_junk
+from rig.formats.captures.shot_files import ASIDE, listed_pictures
+from rig.formats.pictures.picture_names import entry, is_junk
 from rig.messages.message import Message, compose
 from rig.text import suggest
 from server.tasks.settings_file import read_settings_file, reason_of
@@ -24,7 +23,6 @@ ARCHIVES = (".tar.gz", ".tgz", ".tar", ".zip")
 COLUMNS = ("capture", "name", "subject", "session", "settings")
 MIN_PICTURES = 3  # in a folder of photographs without cameras: fewer are no capture
 TAKEN_NAMES = ("heads.csv", "heads.parquet", "sheet.html", "sheet.pdf")  # files of OUT, which no capture may be called
-ASIDE = (*BESIDE_PICTURES, TEXTURE_SETS)  # folders of a capture that are none themselves
 MORE = "more"  # key of a row: how many cells it has beyond the columns
 NO_SETTINGS: Mapping[str, object] = MappingProxyType({})
 
@@ -47,7 +45,7 @@ def find_captures(folder: Path, out: Path) -> tuple[BatchCapture, ...]:
     Raises InputError if there is none, if the folder itself is one, and naming all captures whose results would share a
     folder.
     """
-    if is_capture(folder) and (find_rig_file(folder) is not None or (folder / "images").is_dir()):
+    if is_capture(folder) and (find_rig_file(folder) is not None or entry(folder, "images").is_dir()):
         raise InputError(folder.name, [compose("batch-folder-is-capture")])
     captures = [BatchCapture(_name(path, folder), path) for path in _walk(folder, out.resolve())]
     if not captures:
@@ -63,7 +61,7 @@ def is_capture(path: Path) -> bool:
     photographs."""
     if path.is_file():
         return is_archive(path)
-    if find_rig_file(path) is not None or (path / "images").is_dir():
+    if find_rig_file(path) is not None or entry(path, "images").is_dir():
         return True
     return len(listed_pictures(path)) >= MIN_PICTURES
 
@@ -102,7 +100,7 @@ def read_list(path: Path) -> tuple[BatchCapture, ...]:
 
 def _walk(folder: Path, out: Path) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
-        if is_junk(path.name) or path.resolve() == out or path.name.endswith(".truth") or path.name in ASIDE:
+        if is_junk(path.name) or path.resolve() == out or path.name.endswith(".truth") or path.name.lower() in ASIDE:
             continue
         if is_capture(path):
             yield path
@@ -209,10 +207,7 @@ def _name_faults(captures: list[BatchCapture], places: list[str]) -> list[Messag
     for name, where in folded.items():
         if len(where) > 1:
             faults.append(compose("batch-name-twice", name=name, where=where))
-        parents = [parent for parent in map("/".join, _parents(name.split("/"))) if parent in folded]
+        parts = name.split("/")
+        parents = [outer for count in range(1, len(parts)) if (outer := "/".join(parts[:count])) in folded]
         faults += [compose("batch-name-within", name=name, outer=parent) for parent in parents]
     return faults
-
-
-def _parents(parts: list[str]) -> Iterator[list[str]]:
-    yield from (parts[:count] for count in range(1, len(parts)))

@@ -132,10 +132,9 @@ def _captures_in(captures: Path, out: Path) -> "tuple[BatchCapture, ...]":
 
 def _run(tasks: "Sequence[BatchTask]", out: Path, workers: int | None, share: "Shard", json_out: bool) -> None:
     from server.batch.folder import BatchFolder
-    from server.batch.run import BatchRun
+    from server.batch.run import BatchRun, free_memory, threads_of_worker, usable_cores, worker_count
     from server.batch.summary import write_summary
     from server.batch.table_files import has_parquet
-    from server.batch.workers import free_memory, threads_of_worker, usable_cores, worker_count
     from server.cli.batch_display import BatchDisplay
 
     share_tasks = [task for task in tasks if share.takes(task.capture.name)]

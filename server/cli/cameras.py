@@ -21,14 +21,6 @@ from server.cli.answers import (
 app = typer.Typer(rich_markup_mode=None)
 
 
-def _sources() -> tuple[str, ...]:
-    return ("board", "scene")
-
-
-def _lenses() -> tuple[str, ...]:
-    return ("one", "each")
-
-
 def _formats() -> tuple[str, ...]:
     from rig.formats.cameras.cameras_file import FORMATS
 
@@ -81,11 +73,15 @@ def calibrate(
     out: Annotated[Path, typer.Option(help="The cameras.json to write; its report goes beside it.", dir_okay=False)],
     *,
     board: Annotated[Path | None, typer.Option(help="The board.toml.", exists=True, dir_okay=False)] = None,
-    source: Annotated[str, chosen("board, or scene: photographs of anything.", _sources, "--from")] = "board",
+    source: Annotated[
+        str, chosen("board, or scene: photographs of anything.", lambda: ("board", "scene"), "--from")
+    ] = "board",
     scale: Annotated[
         Path | None, typer.Option(help="From a scene: a known length, scale.json.", exists=True, dir_okay=False)
     ] = None,
-    lenses: Annotated[str | None, chosen("From a scene: one (all of one camera) or each; guessed.", _lenses)] = None,
+    lenses: Annotated[
+        str | None, chosen("From a scene: one (all of one camera) or each; guessed.", lambda: ("one", "each"))
+    ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
     anyway: Annotated[
@@ -221,13 +217,23 @@ def convert(
 ) -> None:
     """Convert calibrations to and from other programs."""
     from rig.errors import InputError
-    from rig.formats.cameras.cameras_file import FOLDER_FORMATS, NO_RIG, find_rig_file, read_cameras, write_rig_file
+    from rig.formats.cameras.cameras_file import (
+        FOLDER_FORMATS,
+        find_rig_file,
+        no_rig_fault,
+        read_cameras,
+        write_rig_file,
+    )
+    from rig.formats.pictures.picture_names import entry
+    from rig.plausibility import rig_faults
 
     file = find_rig_file(source) if source.is_dir() else source
     if file is None:
-        raise InputError(str(source), [NO_RIG])
+        raise InputError(str(source), [no_rig_fault(source)])
     read = read_cameras(file)
     rig = read.rig
+    if faults := rig_faults(rig, any_unit=entry(file.parent, "scale.json").is_file()):
+        raise InputError(file.name, faults)
     for remark in read.remarks:
         warn(f"{remark.code}: {remark}")
     prepare = prepare_folder if to in FOLDER_FORMATS else prepare_file

@@ -1,35 +1,25 @@
 """Implements ``eigenhead check``: finds what is wrong with a capture without fitting a head.
 
-Files, cameras, clean plates and feature points are checked as the service checks an upload (``server.tasks.ingest``),
-with one difference: pictures that belong to no camera are only warned of, since a reconstruction ignores them. If these
-checks find no fault, the outlines are extracted and used to check pictures and cameras
-(``pipeline.view_checks.usable_views``). A fault of this machine is no fault of the capture and is raised as an
-error."""
+Files, cameras, clean plates and feature points are checked as the service checks an upload (``server.tasks.ingest``):
+if these checks find no fault, the outlines are extracted and used to check pictures and cameras. A fault of this
+machine is no fault of the capture and is raised as an error."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TypedDict
 
-from rig.capture import Capture
+from pipeline.faces.networks import DamagedNetwork, load_networks
 from rig.errors import EigenheadError, InputError, WrongVariable
-from rig.formats.cameras.cameras_file import read_cameras, rig_files
-from rig.formats.captures.capture_folder import SCALE, capture_root, unread_files, unread_pictures
-from rig.formats.captures.shot_files import BESIDE_PICTURES, find_files, listed_pictures
+from rig.formats.captures.capture_folder import SCALE, capture_root, unread_files
+from rig.formats.captures.shot_files import BESIDE_PICTURES, listed_pictures
 from rig.formats.pictures.images import decode_image_file
+from rig.formats.pictures.picture_names import entry
 from rig.messages.message import MessageDocument, compose, documents_of, texts_of
 from rig.progress import Progress
 from server.cli.answers import service_settings
 from server.tasks.child import WorkFailed
-from server.tasks.ingest import check_capture
+from server.tasks.ingest import check_capture, check_views
 from server.tasks.photographs import photographs_alone, read_scaled_capture
-from server.tasks.prepare import prepare_kernels
 from server.tasks.reconstruct_folder import folder_of
-
-if TYPE_CHECKING:
-    from pipeline.imaging.silhouette import Silhouette
-    from pipeline.settings import Settings
-
-RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
 
 
 class Checked(TypedDict):
@@ -57,17 +47,17 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
     try:
         with folder_of(capture) as folder:
             if photographs_alone(folder):
+                document["warnings"] = documents_of(unread_files(capture_root(folder), []))
                 document["cameras"], document["will"] = _plan_for_photographs(folder, report)
                 _check_front(chosen.front, document["cameras"])
                 return document
-            document["warnings"] = _file_warnings(capture_root(folder))
-            content = check_capture(capture_root(folder), service_settings().image_pixels, report, strays_pass=True)
+            content = check_capture(capture_root(folder), service_settings().image_pixels, report)
             document["cameras"] = [camera.name for camera in content.cameras]
             _check_front(chosen.front, document["cameras"])
             document["front"] = chosen.front or content.front
-            outline_warnings = _outline_warnings(folder, chosen, report)
-            document["warnings"] += [warned for warned in outline_warnings if warned not in document["warnings"]]
-    except (WrongVariable, WorkFailed):
+            shot, rig = read_scaled_capture(folder)
+            document["warnings"] = documents_of(check_views(shot, rig, chosen, load_networks(), report=report))
+    except (DamagedNetwork, WrongVariable, WorkFailed):
         raise
     except InputError as error:
         document["faults"], document["fault_messages"] = texts_of(error.faults), documents_of(error.faults)
@@ -81,22 +71,6 @@ def _check_front(front: str | None, cameras: list[str]) -> None:
         raise InputError("front", [compose("front-of-other-capture", front=f"{front!r:.80}", cameras=cameras)])
 
 
-def _file_warnings(root: Path) -> list[MessageDocument]:
-    """Returns warnings about the files of a capture folder. It is empty where the cameras cannot be read, since
-    ``check_capture`` reports that fault."""
-    rigs = [*rig_files(root)]
-    try:
-        read = read_cameras(rigs[0]) if rigs else None
-    except InputError:
-        return []
-    if read is None:
-        return []
-    files = find_files(root, read.rig, read.left_out)
-    # Where a picture is missing, that fault names the strays already.
-    strays = () if files.faults else unread_pictures(root, files, read.rig)
-    return documents_of([*read.remarks, *unread_files(root, rigs), *strays])
-
-
 def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], list[str]]:
     """Returns the names of the photographs of a folder without cameras, and sentences on what a reconstruction will do.
 
@@ -107,20 +81,18 @@ def _plan_for_photographs(folder: Path, report: Progress) -> tuple[list[str], li
     root = capture_root(folder)
     photographs = find_photographs(root)
     names = photographs.names
-    beside = [path for kind in BESIDE_PICTURES for path in listed_pictures(root / kind)]
+    beside = [path for kind in BESIDE_PICTURES for path in listed_pictures(entry(root, kind))]
     _check_pictures([*(path for shots in photographs.files.values() for path in shots.values()), *beside], root, report)
-    known = (root / SCALE).is_file()
+    known = entry(root, SCALE).is_file()
     if known:
-        read_scale(root / SCALE, names)
+        read_scale(entry(root, SCALE), names)
     scale = (
         "scale.json tells the scale" if known else "the scale will be ASSUMED from a head's mean size: add scale.json"
     )
-    present = [kind for kind in ("masks", "background") if (root / kind).is_dir()]
+    present = [kind for kind in ("masks", "background") if entry(root, kind).is_dir()]
     masks = f"{present[0]}/ tells the subject" if present else "the subject will be found from the photographs"
-    aside = [path.name for path in sorted(root.iterdir()) if path.suffix in RIG_SUFFIXES and path.name != SCALE]
-    unread = [f"{name} will not be read: it is no rig's file of a known program" for name in aside]
     begun = f"no cameras.json: {len(names)} photographs will be calibrated from the scene"
-    return list(names), [begun, *unread, scale, masks]
+    return list(names), [begun, scale, masks]
 
 
 def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
@@ -132,33 +104,6 @@ def _check_pictures(files: list[Path], root: Path, report: Progress) -> None:
         faults += [] if fault is None else [fault]
     if faults:
         raise InputError("photographs", faults)
-
-
-def _outline_warnings(folder: Path, chosen: "Settings", report: Progress) -> list[MessageDocument]:
-    from pipeline.faces.networks import load_networks
-    from pipeline.faces.subject import SearchEffort, find_subject
-    from pipeline.segmentation.segment import segment
-    from pipeline.settings import OutputSettings
-    from pipeline.texturing.chart_colours import chart_colours
-    from pipeline.view_checks.guards import Guards
-    from pipeline.view_checks.lens_distortion import judge_distortion
-    from pipeline.view_checks.one_moment import judge_moments
-    from pipeline.view_checks.usable_views import usable_views
-
-    shot, rig = read_scaled_capture(folder)
-    prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
-
-    def segmented(capture: Capture) -> dict[str, "Silhouette"]:
-        return segment(capture, rig, report=report)
-
-    views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
-    images, without_eyes = views.capture.images, SearchEffort(with_eyes=False)
-    lenses = judge_distortion(images, views.silhouettes, rig)
-    faces = find_subject(images, rig, load_networks(), effort=without_eyes) if chosen.faces.find else None
-    moments = judge_moments(faces, rig)
-    warnings = [*chosen.warnings, *views.warnings, *lenses, *moments]
-    warnings += chart_colours(shot, rig)[1] if chosen.texture.chart else ()
-    return documents_of(warnings)
 
 
 def lines(document: Checked) -> list[str]:

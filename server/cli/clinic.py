@@ -110,16 +110,19 @@ def register(
         raise Overwrites(out / "registration.json")
     from typing import cast
 
+    from pipeline.applications.clinic.patient_files import write_registration
+    from pipeline.applications.clinic.registration import read_surface_landmarks
     from pipeline.applications.clinic.registration import register as register_head
-    from pipeline.applications.clinic.registration_files import write_registration
     from pipeline.applications.clinic.surface import read_surface
-    from pipeline.applications.clinic.surface_landmarks import read_surface_landmarks
     from pipeline.applications.clinic.visit import read_visit
     from rig.formats.meshes.markups import Axes
 
     patient = read_surface(surface, cast(Axes | None, axes))
     marks = None if landmarks is None else read_surface_landmarks(landmarks, patient.axes)
-    registered = register_head(read_visit(result, model), patient, marks)
+    visit = read_visit(result, model)
+    for warning in visit.warnings:
+        warn(str(warning))
+    registered = register_head(visit, patient, marks)
     prepare_folder(out)
     document = write_registration(out, registered)
     answer(document | {"out": str(out)}, json_out, _registration_lines(document, out))

@@ -1,12 +1,16 @@
 """Implements ``eigenhead export``, which writes a capture or a result for other programs."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from server.cli.answers import Json, Overwrite, Overwrites, answer, chosen, prepare_folder, progress_bar, warn
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder, progress_bar, warn
 from server.cli.clinic import axes_choices
+from server.cli.heads import Albedo, Morphs, TemplateName
+
+if TYPE_CHECKING:
+    from pipeline.settings import OutputSettings
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -15,9 +19,10 @@ SLICER = "slicer"
 
 
 def _forms() -> tuple[str, ...]:
+    from pipeline.settings import FORMATS
     from rig.formats.cameras.dataset_json import DATASET_FORMATS
 
-    return (*DATASET_FORMATS, SLICER)
+    return (*FORMATS, SLICER, *DATASET_FORMATS)
 
 
 def _planes() -> tuple[str, ...]:
@@ -27,17 +32,20 @@ def _planes() -> tuple[str, ...]:
 
 
 @app.command(
-    epilog="Example: eigenhead export shots/anna --as nerfstudio --result heads/anna --out sets/anna   For 3D Slicer: "
-    "eigenhead export heads/anna --as slicer --plane frankfurt --out clinic/anna"
+    epilog="Example: eigenhead export heads/anna --as usdz --out usd/anna   A capture: eigenhead export shots/anna "
+    "--as nerfstudio --result heads/anna --out sets/anna"
 )
 def export(
     capture: Annotated[
         Path,
         typer.Argument(
-            help="A capture folder, or a .zip, .tar or .tar.gz of one; for slicer a result folder.", exists=True
+            help="A result folder; for nerfstudio and gaussian-avatars a capture, or a .zip, .tar or .tar.gz of one.",
+            exists=True,
         ),
     ],
-    form: Annotated[str, chosen("nerfstudio, gaussian-avatars or slicer.", _forms, "--as")],
+    form: Annotated[
+        str, chosen("glb, ply, obj, usdz, stl, 3mf, slicer, nerfstudio or gaussian-avatars.", _forms, "--as")
+    ],
     out: Annotated[Path, typer.Option(help="The folder that is written.", file_okay=False)],
     *,
     result: Annotated[
@@ -55,17 +63,37 @@ def export(
             dir_okay=False,
         ),
     ] = None,
+    template: TemplateName = None,
+    morphs: Morphs = False,
+    albedo: Albedo = False,
+    data: Data = None,
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
-    """Write a capture or a head for other programs.
+    """Write a finished head, or a capture, for other programs.
 
-    A capture as a data set: undistorted pictures, masks and cameras in metres. A head for 3D Slicer: mesh and landmarks
-    in a patient's axes, mm."""
-    if form == SLICER:
+    A head in another format, without a new job; for 3D Slicer mesh and landmarks in a patient's axes, mm. A capture as
+    a data set: undistorted pictures, masks and cameras in metres."""
+    from pipeline.settings import FORMATS, OutputSettings
+
+    if form in FORMATS:
+        outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
+        _export_head(capture, out, outputs, overwrite=overwrite, json_out=json_out)
+    elif form == SLICER:
         _export_patient(capture, out, axes, plane, marked=marked, overwrite=overwrite, json_out=json_out)
-        return
-    _export_dataset(capture, out, form, result=result, settings=settings, overwrite=overwrite, json_out=json_out)
+    else:
+        _export_dataset(capture, out, form, result=result, settings=settings, overwrite=overwrite, json_out=json_out)
+
+
+def _export_head(result: Path, out: Path, outputs: "OutputSettings", *, overwrite: bool, json_out: bool) -> None:
+    """Writes a result's head in another format."""
+    from server.tasks.export_result import export_result
+
+    if out.resolve() == result.resolve() or ((out / f"head.{outputs.formats[0]}").exists() and not overwrite):
+        raise Overwrites(out / f"head.{outputs.formats[0]}")
+    prepare_folder(out)
+    files = export_result(result, out, outputs)
+    answer({"out": str(out), "files": files}, json_out, [f"{out}  {', '.join(files)}"])
 
 
 def _export_dataset(

@@ -100,6 +100,13 @@ Morphs = Annotated[
         "--morphs", help="Write posed.glb too, with morph targets by Apple's names; of a template head-NAME.glb."
     ),
 ]
+Albedo = Annotated[
+    bool, typer.Option("--albedo", help="Also texture/albedo.png: the texture with its light taken off.")
+]
+Model = Annotated[
+    str | None,
+    typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
+]
 Slicer = Annotated[bool, typer.Option("--slicer", help="Write landmarks.mrk.json too, a point list for 3D Slicer.")]
 CapColour = Annotated[
     str | None, typer.Option(help="Of a worn swim or wig cap, about: #rrggbb, or a name as blue.", metavar="COLOUR")
@@ -113,10 +120,7 @@ def reconstruct(
     out: Annotated[Path, typer.Option(help="The result folder.", file_okay=False)],
     *,
     method: Annotated[str | None, chosen("contour (the default) or simplex.", of_setting("method"))] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
-    ] = None,
+    model: Model = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
     anyway: Anyway = False,
     detail: Annotated[
@@ -124,9 +128,7 @@ def reconstruct(
     ] = None,
     surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
     formats: Formats = None,
-    albedo: Annotated[
-        bool, typer.Option("--albedo", help="Also texture/albedo.png: the texture with its light taken off.")
-    ] = False,
+    albedo: Albedo = False,
     cap: CapColour = None,
     cap_thickness: CapThickness = None,
     chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in clean plates.")] = False,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from server.cli.answers import Data, Json, answer
+from server.cli.answers import Data, Json, answer, warn
 
 if TYPE_CHECKING:
     from pipeline.applications.clinic.sizes import SizeTable
@@ -34,6 +34,7 @@ def measure(
     from pipeline.applications.clinic.fitting import ISO_NAMES, MEASURES, Fitted, fitting_measures
     from pipeline.applications.clinic.sizes import choose_size, read_size_tables
     from pipeline.applications.clinic.visit import read_visit
+    from rig.messages.message import documents_of
 
     tables = [] if sizes is None else read_size_tables(sizes)
     visit = read_visit(result, model)
@@ -44,7 +45,10 @@ def measure(
     measures |= fitting_measures(visit)
     _check_measures(sizes, tables, measures.keys())
     chosen = [choose_size(table, measures[table.measure].value, measures[table.measure].std) for table in tables]
+    for warning in visit.warnings:
+        warn(str(warning))
     document = {
+        "warnings": documents_of(visit.warnings),
         "measures": {
             name: {"value": of.value, "std": of.std, "unit": of.unit, "iso": ISO_NAMES.get(name)}
             for name, of in measures.items()

@@ -26,8 +26,8 @@ def model_info(
     json_out: Json = False,
 ) -> None:
     """Say what a head model is made of."""
-    from pipeline.head_model.info import model_info as describe
     from pipeline.head_model.model import load_model
+    from pipeline.head_model.model import model_info as describe
 
     document = describe(load_model(name))
     answer(document, json_out, [f"{key:<18} {_as_text(value)}" for key, value in document.items() if key != "figures"])

@@ -47,9 +47,8 @@ def template_add(
         raise Overwrites(path)
     prepare_file(path)
     from pipeline.applications.model_building.correspondence.scans import landmark_file, read_landmarks
-    from pipeline.applications.templates.make import make_template
+    from pipeline.applications.templates.make import make_template, template_picture
     from pipeline.applications.templates.template_file import save_template
-    from pipeline.applications.templates.write.picture import template_picture
     from pipeline.head_model.model import load_model
     from rig.formats.pictures.images import write_image
 

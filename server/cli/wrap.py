@@ -39,7 +39,7 @@ def wrap(
     if (out / "wrapped.obj").exists() and not overwrite:
         raise Overwrites(out / "wrapped.obj")
     from pipeline.applications.model_building.correspondence.scans import read_landmarks
-    from pipeline.applications.templates.load import load_template
+    from pipeline.applications.templates.template_file import load_template
     from pipeline.applications.wrapping.scan import read_raw_scan
     from pipeline.applications.wrapping.wrap import wrap as wrap_scan
     from pipeline.applications.wrapping.write import write_wrapped

@@ -47,7 +47,7 @@ from server.storage.records import CaptureRecord
 from server.tasks.child import WorkerContext
 from server.wire.batch_files import SheetFormat, TableFormat, send_sheet, send_table
 from server.wire.multipart import receive_calibration_pictures, receive_capture
-from server.wire.send_file import send_archive, send_file
+from server.wire.send_file import send_archive, send_file, send_zip
 
 WIDTH_MOST = 1600
 MM = 1000.0
@@ -278,6 +278,14 @@ def distance(who: Reader, job_id: str, other: str) -> Response:
 def all_files(who: Reader, request: Request, job_id: str) -> Response:
     """Returns all files of a result in one .zip."""
     return send_archive(request, result_folder(who[0], job_id), who[0].jobs.files(job_id), name=None)
+
+
+@pages.get("/console/jobs/{job_id}/exports/{form}.zip")
+async def exported(who: Reader, job_id: str, form: str, morphs: bool = False) -> Response:
+    """Returns a job's head in another format, as a .zip."""
+    service, caller = who
+    outputs = {"formats": [form], "morphs": morphs}
+    return send_zip(await service.threads.check(service.export, job_id, outputs, key=caller.key))
 
 
 @pages.get("/console/jobs/{job_id}/{name}")

@@ -129,6 +129,22 @@ class JobBulk(Received):
     ids: Ids
 
 
+class NewExport(Received):
+    """Requests a job's head in another format."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [{"as": "obj"}]})
+
+    form: Literal["glb", "ply", "obj", "usdz", "stl", "3mf"] = Field(alias="as")
+    template: str | None = Field(None, description="also head-NAME.obj, in this template's vertex order", max_length=40)
+    morphs: bool = Field(False, description="also posed.glb, with shapes, eyes and teeth")
+    albedo: bool = Field(False, description="also texture/albedo.png")
+
+    def outputs(self) -> dict[str, object]:
+        """Returns the settings of the pipeline's outputs that say the same."""
+        albedo = "file" if self.albedo else "none"
+        return {"formats": [self.form], "template": self.template, "morphs": self.morphs, "albedo": albedo}
+
+
 class NewDelivery(Received):
     """Requests that a job's result is delivered to an object store."""
 

@@ -1,5 +1,6 @@
 """Composes the parts of one service process, which HTTP's routes and the operator's pages share."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from server.storage.library import Library
 from server.storage.store import Store
 from server.tasks.calibrate import ingest_board_pictures, ingest_photographs
 from server.tasks.child import ChildProcessPool
+from server.tasks.export_archive import export_archive
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +112,9 @@ class Service:
         return job
 
     def deliver(self, job_id: str, to: str | None = None) -> Job:
-        """Delivers the result of a job to a place in an object store, None: the one that it was submitted with. Raises
-        NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a job without
-        result and while it is being delivered."""
+        """Delivers the result of a job to a place in an object store, by default the place that the job was submitted
+        with. Raises NotFound, InputError without a place, InvalidInput for one that is not allowed, and Conflict for a
+        job without result and while it is being delivered."""
         self.jobs.files(job_id)
         request = self.jobs.request(job_id) or {}
         if (place := to or request.get("deliver_to")) is None:
@@ -124,6 +126,15 @@ class Service:
         self.jobs.deliveries.forget(job_id)
         enqueue_delivery(self.jobs.client.enqueue, job_id, place, self.settings, request.get("webhook"))
         return self.jobs.get(job_id)
+
+    def export(self, job_id: str, outputs: Mapping[str, object]) -> bytes:
+        """Returns the files that the settings ``outputs`` name of a finished head, as a .zip. Raises NotFound, Conflict
+        for a job without result, InputError for settings that are not allowed, and DiskFull."""
+        folder = self.jobs.result_folder(job_id)
+        with self.store.incoming() as scratch, self.children.one() as child:
+            archive = scratch / "export.zip"
+            child.remote(export_archive)(result=str(folder), archive=str(archive), outputs=outputs)
+            return archive.read_bytes()
 
     def result_address(self, job_id: str, name: str) -> str | None:
         """Returns a signed address of a file of a job's result, as in ``Results.link``; None where the service sends it

@@ -385,7 +385,7 @@ class Store:
         return removed
 
     def _unfinished(self) -> Iterator[Path]:
-        """In the folders themselves and in those of one thing; what lies deeper goes with the thing."""
+        """Yields unfinished files of the folders and of the things in them; deeper ones go with their thing."""
         for kind in FOLDERS:
             yield from unfinished(self.data / kind)
             for entry in os.scandir(self.data / kind):

@@ -104,14 +104,15 @@ def _read_flame(result: Path, form: DatasetFormat) -> FlameParam | None:
 def _take_over_found(result: Path, kept: Path) -> str | None:
     """Copies cameras and masks that a reconstruction found, so that the data set has the world frame of its head.
     Returns the front camera that was chosen then."""
-    from server.tasks.photographs import CAMERAS, FIGURES, PAGE
+    from server.tasks.photographs import CACHE, CAMERAS, FIGURES, PAGE
 
     kept.mkdir(parents=True, exist_ok=True)
     for path in (result / name for name in (CAMERAS, FIGURES, PAGE)):
         if path.is_file():
             shutil.copyfile(path, kept / path.name)
-    if (result / "masks").is_dir():
-        shutil.copytree(result / "masks", kept / "masks", dirs_exist_ok=True)
+    for name in ("masks", CACHE):
+        if (result / name).is_dir():
+            shutil.copytree(result / name, kept / name, dirs_exist_ok=True)
     try:
         return json.loads((result / FIGURES).read_text(encoding="utf-8"))["made_of"]["front"] or None
     except (OSError, ValueError, KeyError, TypeError):

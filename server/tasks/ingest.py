@@ -1,54 +1,71 @@
 """Checks an uploaded archive or a capture folder before it is accepted; runs in a child process.
 
-It works camera by camera, so that a rig of 64 large cameras needs the memory of one.
+Files are checked camera by camera, so that a rig of 64 large cameras needs the memory of one; the outlines of an
+upload, at the size that jobs work at, or smaller.
 """
 
-import hashlib
 import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.alignment.feature_checks import feature_faults, unknown_landmarks
 from pipeline.faces.matching import EYE_DISTANCE_MM
 from pipeline.faces.networks import DamagedNetwork, FaceNetworks, load_networks
-from pipeline.faces.sighting import GLANCE_PX, SMALLEST_PX, reduce_picture, sight_face
+from pipeline.faces.sighting import GLANCE, GLANCE_PX, SMALLEST_PX, reduce_picture, sight_face
+from pipeline.faces.subject import find_subject
+from pipeline.view_checks.one_moment import judge_moments
 from pipeline.warnings import ReportWarning
 from rig.acquisition.face_sighting import FaceSighting
 from rig.acquisition.verdict import ViewCheck, check_view, view_faults
 from rig.camera import Camera
 from rig.capture import TEXTURE_SETS, Capture
-from rig.errors import InputError
-from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, no_rig_fault, read_cameras, rig_file_parts
+from rig.errors import EigenheadError, InputError
+from rig.formats.cameras.cameras_file import NO_RIG, find_rig_file, read_cameras, rig_file_parts
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.cameras.scale_json import read_scale
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
 from rig.formats.captures.capture_folder import (
+    FEATURES,
     SCALE,
     capture_root,
-    check_folders,
     has_known_length,
-    read_rig_of,
+    open_capture,
     read_shot,
     size_fault,
 )
 from rig.formats.captures.features_json import FEATURES_FORMAT, features_from_bytes
-from rig.formats.captures.shot_files import BESIDE_PICTURES, ShotFiles, find_files, picture_folder, stray_sentence
+from rig.formats.captures.shot_files import ASIDE, BESIDE_PICTURES, ShotFiles, picture_folder
 from rig.formats.pictures.images import IMAGE_SUFFIXES, picture_size
+from rig.formats.pictures.picture_names import entry
+from rig.formats.pictures.work_size import WORK_PIXELS
 from rig.formats.rig_toml import ShotConfig
 from rig.image import ImageRgb, plates_for
 from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
-from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
 from server.storage.records import CameraSize, CaptureContent
 from server.tasks.child import WorkerContext
-from server.tasks.photographs import CAMERAS, FIGURES, calibrate_photographs, check_sizes, photographs_alone
+from server.tasks.photographs import (
+    CAMERAS,
+    FIGURES,
+    calibrate_photographs,
+    check_sizes,
+    photographs_alone,
+    read_scaled_capture,
+    sha256_of,
+)
 
+if TYPE_CHECKING:
+    from pipeline.imaging.silhouette import Silhouette
+    from pipeline.settings import Settings
+
+UPLOAD_PIXELS = 64_000_000  # of all pictures whose outlines are checked: 1.3 GB with plates and distances, of 4 GiB
 PICTURES_MOST = 16  # of the largest size that one camera may have: picture, mask, eight plates, six texture sets
 Points = dict[str, dict[str, list[float]]]  # pixels by point and camera, as features.json has them
 
@@ -66,15 +83,68 @@ def ingest_archive(
     extract_archive(Path(archive), unpacked, limits)
     root = capture_root(unpacked)
     warnings = _calibrate(root, image_pixels, report) if photographs_alone(root) else None
-    _name_by_camera(root)
-    described = check_capture(root, image_pixels, report, networks=_face_networks(context))
+    networks = _face_networks(context)
+    described = check_capture(root, image_pixels, report, networks=networks)
     if warnings is not None:
         described = _with_calibration(described, root, warnings)
+    else:
+        described = replace(described, warnings=_outline_findings(root, len(described.cameras), networks, report))
+    filed = _filed_names(root)
     for name in described.inputs:
-        (target / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).rename(target / name)
+        path = target / filed.get(name, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        entry(root, name).rename(path)
     shutil.rmtree(unpacked)
-    return described
+    inputs = {filed.get(name, name): digest for name, digest in described.inputs.items()}
+    return replace(described, inputs=dict(sorted(inputs.items())))
+
+
+def _outline_findings(
+    root: Path, cameras: int, networks: FaceNetworks | None, report: Progress
+) -> tuple[ReportWarning, ...]:
+    """Returns what ``eigenhead check`` warns of. Raises InputError for cameras that contradict the pictures. Too few
+    usable outlines are a warning here: they are a matter of the photographs, which nobody can take again, and of a
+    job's settings."""
+    from pipeline.settings import Settings
+    from pipeline.view_checks.usable_views import TooFewViews
+
+    shot, rig = read_scaled_capture(root, pixels_most=min(WORK_PIXELS, UPLOAD_PIXELS // cameras))
+    try:
+        return check_views(shot, rig, Settings(), networks, report=report)
+    except TooFewViews as error:
+        return (compose("pose-doubtful", finding=error.message), *shot.remarks)
+    except (InputError, DamagedNetwork):
+        raise
+    except EigenheadError as error:
+        raise InputError("capture", [error.message]) from error
+
+
+def check_views(
+    shot: Capture, rig: Rig, chosen: "Settings", networks: FaceNetworks | None, *, report: Progress
+) -> tuple[ReportWarning, ...]:
+    """Returns what outlines and faces say about a capture's pictures and cameras, and all remarks on its files; nobody
+    looks for the face without ``networks``. Raises what the checks refuse with."""
+    from pipeline.faces.subject import SearchEffort, find_subject
+    from pipeline.segmentation.segment import segment
+    from pipeline.settings import OutputSettings
+    from pipeline.texturing.chart_colours import chart_colours
+    from pipeline.view_checks.guards import Guards
+    from pipeline.view_checks.lens_distortion import judge_distortion
+    from pipeline.view_checks.one_moment import judge_moments
+    from pipeline.view_checks.usable_views import usable_views
+    from server.tasks.prepare import prepare_kernels
+
+    prepare_kernels(report, replace(chosen, detail="span", outputs=OutputSettings(surface="head")))  # no dense loops
+
+    def segmented(capture: Capture) -> "dict[str, Silhouette]":
+        return segment(capture, rig, report=report)
+
+    views = usable_views(shot, rig, segmented, exchanged=chosen.exchanged_pictures, guards=Guards(chosen.anyway))
+    images, without_eyes = views.capture.images, SearchEffort(with_eyes=False)
+    lenses = judge_distortion(images, views.silhouettes, rig)
+    faces = find_subject(images, rig, networks, effort=without_eyes) if networks and chosen.faces.find else None
+    charts = chart_colours(shot, rig)[1] if chosen.texture.chart else ()
+    return (*chosen.warnings, *views.warnings, *lenses, *judge_moments(faces, rig), *charts)
 
 
 def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportWarning, ...]:
@@ -95,41 +165,20 @@ def _calibrate(root: Path, image_pixels: int, report: Progress) -> tuple[ReportW
     return warnings
 
 
-def _name_by_camera(root: Path) -> None:
-    """Gives files the names by which the service asks for them, images/<camera>.<ext>, masks/<camera>.<ext>,
-    texture_sets/<set>/<camera>.<ext>, background/<camera>.<ext> or background/<camera>/<anything>, wherever the archive
-    has them and those that are called otherwise and can be told. What cannot be told is left to ``check_capture``."""
-    rig_file = find_rig_file(root)
-    try:
-        read = None if rig_file is None else read_cameras(rig_file)
-    except InputError:
-        read = None
-    if read is not None:
-        files = find_files(root, read.rig, read.left_out)
-        for name in () if files.faults else read.rig.names:
-            camera_files = files.of_camera(name)
-            several = sum(kind == "background" for kind, _ in camera_files) > 1
-            for kind, path in camera_files:
-                _move(path, _filed_as(root, kind, name, path, several=several))
-    pictures, images = picture_folder(root), root / "images"
-    images.mkdir(exist_ok=True)
-    for path in [*pictures.iterdir()] if pictures != images else []:  # of a rig that cannot be read, and strays
-        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
-            path.rename(images / path.name)
-
-
-def _filed_as(root: Path, kind: str, name: str, path: Path, *, several: bool) -> Path:
-    if path.parent == root / kind and path.stem == name:
-        return path
-    if kind == "background" and (several or path.parent == root / kind / name):
-        return root / kind / name / path.name
-    return root / kind / (name + path.suffix.lower())
-
-
-def _move(path: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if not target.exists():
-        path.rename(target)
+def _filed_names(root: Path) -> dict[str, str]:
+    """Returns the names by which the service asks for files, by those that they have in the archive:
+    images/<camera>.<ext>, masks/<camera>.<ext>, texture_sets/<set>/<camera>.<ext>, background/<camera>.<ext> or
+    background/<camera>/<anything>."""
+    (rig_file, *_), read, files, _ = open_capture(root)
+    filed = {rig_file.name: CAMERAS} if rig_file == entry(root, CAMERAS) else {}
+    for name in read.rig.names:
+        of_camera = files.of_camera(name)
+        several = sum(kind == "background" for kind, _ in of_camera) > 1
+        for kind, path in of_camera:
+            called = path.name if path.stem == name else name + path.suffix.lower()
+            inside = kind == "background" and (several or path.parent.name == name)
+            filed[path.relative_to(root).as_posix()] = f"{kind}/{name}/{path.name}" if inside else f"{kind}/{called}"
+    return filed
 
 
 def _leave_out(root: Path, rig: Rig) -> None:
@@ -138,17 +187,13 @@ def _leave_out(root: Path, rig: Rig) -> None:
     for folder in (picture_folder(root), *(root / kind for kind in BESIDE_PICTURES), *sets):
         for path in [*folder.iterdir()] if folder.is_dir() else ():
             is_candidate = path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES
-            if (
-                is_candidate
-                and (path.name if path.is_dir() else path.stem) not in rig
-                and path.name not in (*BESIDE_PICTURES, TEXTURE_SETS)
-            ):
+            if is_candidate and (path.name if path.is_dir() else path.stem) not in rig and path.name not in ASIDE:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def _with_calibration(found: CaptureContent, root: Path, warnings: tuple[ReportWarning, ...]) -> CaptureContent:
     """With the figures of the calibration, of which a job reads what was said."""
-    inputs = dict(sorted({**found.inputs, FIGURES: _sha256(root / FIGURES)}.items()))
+    inputs = dict(sorted({**found.inputs, FIGURES: sha256_of(root / FIGURES)}.items()))
     return replace(found, inputs=inputs, bytes=found.bytes + (root / FIGURES).stat().st_size, warnings=warnings)
 
 
@@ -172,50 +217,32 @@ def ingest_board(context: WorkerContext, report: Progress, *, folder: str, image
     """Checks a shot of the calibration board and removes everything but its images from ``folder``: one a camera, of
     any size. Returns the content for the capture's record. Raises InputError naming the images that are too large."""
     root = Path(folder)
-    for entry in root.iterdir():
-        if entry.name != "images":
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    for path in root.iterdir():
+        if path.name != "images":
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
     files = sorted((root / "images").iterdir())
-    sizes = {}
-    for path in files:
-        sizes[path.stem] = picture_size(path)
-    huge = [f"{name} is {w} x {h} pixels" for name, (w, h) in sizes.items() if w * h > image_pixels]
-    if huge:
-        raise InputError("capture", [f"{fault}; at most {image_pixels:,} are accepted" for fault in huge])
+    check_sizes(files, image_pixels)
+    sizes = {path.stem: picture_size(path) for path in files}
     return CaptureContent(
         cameras=tuple(CameraSize(name, width, height) for name, (width, height) in sizes.items()),
         front=files[0].stem,
-        inputs={path.relative_to(root).as_posix(): _sha256(path) for path in files},
+        inputs={path.relative_to(root).as_posix(): sha256_of(path) for path in files},
         bytes=sum(path.stat().st_size for path in files),
         board=True,
     )
 
 
 def check_capture(
-    root: Path,
-    image_pixels: int,
-    report: Progress,
-    *,
-    measured: bool = False,
-    strays_pass: bool = False,
-    networks: FaceNetworks | None = None,
+    root: Path, image_pixels: int, report: Progress, *, measured: bool = False, networks: FaceNetworks | None = None
 ) -> CaptureContent:
     """Checks a capture folder and returns its content. Raises InputError naming every fault.
 
     ``measured``: only the subject's place is looked for in the pictures, since the shot measured the rest;
-    ``strays_pass``: accept pictures that belong to no camera; ``networks``: look for the subject's face with these.
+    ``networks``: look for the subject's face with these. Pictures that belong to no camera are no fault, since a
+    reconstruction ignores them with a warning.
     """
-    rig_file = find_rig_file(root)
-    if rig_file is None:
-        raise InputError("capture", [no_rig_fault(root)])
-    read = read_rig_of(rig_file)
-    rig = read.rig
-    check_folders(root, rig)
-    judged = rig_faults(rig, any_unit=has_known_length(root))
-    faults = [compose("located", where=rig_file.name, fault=fault) for fault in judged]
-    files = find_files(root, rig, read.left_out)
-    faults += files.faults
-    faults += [stray_sentence(files.strays, rig)] if files.strays and not strays_pass else []
+    rigs, read, files, faults = open_capture(root)
+    rig_file, rig = rigs[0], read.rig
     digests: dict[str, str] = {}
     empty: list[str] = []
     views: dict[str, ViewCheck] = {}
@@ -231,39 +258,34 @@ def check_capture(
             if networks is not None and image is not None and min(image.shape[:2]) >= SMALLEST_PX:
                 small[camera.name] = reduce_picture(image, camera, GLANCE_PX)
         faults += [*of_sizes, *of_files]
-    if (root / "features.json").is_file():
-        faults += _features_file_faults(root / "features.json", rig)
-        digests["features.json"] = _sha256(root / "features.json")
+    if (features := entry(root, FEATURES)).is_file():
+        of_points = feature_faults(features_from_bytes(features.read_bytes(), rig, faults), rig)
+        faults += of_points
+        digests[FEATURES] = sha256_of(features)
     if len(empty) == len(rig):
         faults.append(compose("every-picture-its-plate"))
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
     digests |= _camera_digests(root, rig_file, rig)
+    is_metric = not (has_known_length(root) or (root / FIGURES).is_file())  # no length follows, or was assumed
     return CaptureContent(
         cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
         front=rig.front_camera(),
         inputs=dict(sorted(digests.items())),
-        bytes=sum((root / name).stat().st_size for name in digests),
+        bytes=sum(entry(root, name).stat().st_size for name in digests),
         faults=tuple(view_faults(views, ShotConfig())),
         checks={name: view.document() for name, view in views.items()},
-        face=_face_of(small, rig, networks, is_metric=_is_metric(root)) if networks is not None and small else None,
+        face=_face_of(small, rig, networks, is_metric=is_metric) if networks is not None and small else None,
     )
 
 
 def _camera_digests(root: Path, rig_file: Path, rig: Rig) -> dict[str, str]:
     """Returns the SHA-256 of the rig's files and of scale.json. Raises InputError for a wrong scale.json."""
-    digests = {path.relative_to(root).as_posix(): _sha256(path) for path in rig_file_parts(rig_file)}
+    digests = {path.relative_to(root).as_posix(): sha256_of(path) for path in rig_file_parts(rig_file)}
     if has_known_length(root):
-        read_scale(root / SCALE, rig.names)
-        digests[SCALE] = _sha256(root / SCALE)
+        read_scale(entry(root, SCALE), rig.names)
+        digests[SCALE] = sha256_of(entry(root, SCALE))
     return digests
-
-
-def _features_file_faults(path: Path, rig: Rig) -> list[Message]:
-    """What is wrong with a features.json, as a file and as points."""
-    of_file: list[Message] = []
-    features = features_from_bytes(path.read_bytes(), rig, of_file)
-    return [*of_file, *feature_faults(features, rig)]
 
 
 def _face_of(
@@ -273,12 +295,9 @@ def _face_of(
     images = {name: image for name, (image, _) in small.items()}
     reduced = Rig(tuple(camera for _, camera in small.values()))
     limits = EYE_DISTANCE_MM if is_metric else None
-    return sight_face(images, reduced, networks, front=rig.front_camera(), eye_distance_mm=limits)
-
-
-def _is_metric(root: Path) -> bool:
-    """Whether cameras.json is in millimetres: not where a length follows, or was assumed."""
-    return not has_known_length(root) and not (root / FIGURES).is_file()
+    subject = find_subject(images, reduced, networks, eye_distance_mm=limits, effort=GLANCE)
+    sighting = sight_face(subject, reduced, front=rig.front_camera())
+    return replace(sighting, remarks=(*sighting.remarks, *judge_moments(subject, reduced)))
 
 
 def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
@@ -351,7 +370,3 @@ def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int
             compose("camera-pixels-many", camera=camera.name, pixels=pixels, most=PICTURES_MOST * image_pixels)
         )
     return faults
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

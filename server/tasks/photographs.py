@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from pipeline.imaging.silhouette import Silhouette
-from pipeline.multiview.spread_views import spread_views
 from pipeline.warnings import ReportWarning
 from rig.atomic_write import write_atomically
 from rig.camera import Intrinsics
@@ -25,7 +24,6 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_file import find_rig_file, read_rig_file
 from rig.formats.cameras.cameras_json import CAMERAS_MOST, read_rig, write_rig
 from rig.formats.cameras.scale_json import read_scale
-from rig.formats.cameras.unread_programs import unread_programs
 from rig.formats.captures.capture_folder import (
     SCALE,
     capture_root,
@@ -33,19 +31,22 @@ from rig.formats.captures.capture_folder import (
     read_capture,
     read_rig_of,
     read_shot,
+    unread_files,
     unread_pictures,
 )
 from rig.formats.captures.full_size import full_size_reader
 from rig.formats.captures.shot_files import find_files, picture_folder
 from rig.formats.pictures.images import is_picture, picture_size, write_image
+from rig.formats.pictures.picture_names import entry
 from rig.formats.pictures.work_size import WORK_PIXELS, work_rig
 from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose, documents_of, read_message
 from rig.plausibility import rig_faults
 from rig.progress import Progress
 from rig.rig import Rig
+from rig.spread_views import spread_views
 
-CAMERAS, FIGURES, PAGE = "cameras.json", "calibration.json", "calibration.html"
+CAMERAS, FIGURES, PAGE, CACHE = "cameras.json", "calibration.json", "calibration.html", ".cache"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +87,7 @@ def read_or_calibrate(folder: Path, kept: Path, *, front: str | None, report: Pr
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
     warnings += tuple(unread_pictures(root, files, rig))
-    digests = {**capture.digests, CAMERAS: _sha256(kept / CAMERAS)}
+    digests = {**capture.digests, CAMERAS: sha256_of(kept / CAMERAS)}
     return Prepared(replace(capture, digests=dict(sorted(digests.items()))), work_rig(rig, WORK_PIXELS), warnings)
 
 
@@ -103,7 +104,7 @@ def read_scaled_capture(folder: Path, *, pixels_most: int | None = WORK_PIXELS) 
         return capture, rig
     from calibration.scene.rig_scale import scaled_by_length
 
-    scaled, remarks = scaled_by_length(capture, rig, read_rig_file(rig_file), read_scale(root / SCALE, rig.names))
+    scaled, remarks = scaled_by_length(capture, rig, read_rig_file(rig_file), read_scale(entry(root, SCALE), rig.names))
     if faults := rig_faults(scaled):
         raise InputError("capture", [f"{rig_file.name}, scaled by {SCALE}: {fault}" for fault in faults])
     return replace(capture, remarks=(*capture.remarks, *remarks)), scaled
@@ -126,10 +127,10 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     from calibration.scene.report import write_scene_report
     from calibration.scene.scene import calibrate_scene
 
-    scale = root / SCALE
+    scale = entry(root, SCALE)
     found = calibrate_scene(root, scale=scale if scale.is_file() else None, front=front, report=report)
     warnings = [compose("view-left-out", remark=absence) for absence in found.absences()]
-    warnings += [compose("file-unread", remark=unread) for unread in unread_programs(root)]
+    warnings += unread_files(root, [])
     if found.scale.assumed:
         warnings.append(compose("scale-assumed", scale=found.scale.provenance))
     rig = found.rig
@@ -140,7 +141,7 @@ def calibrate_photographs(root: Path, kept: Path, *, front: str | None, report: 
     write_scene_report(found, kept / PAGE)
     document = {
         "made_of": made_of,
-        "cameras_sha256": _sha256(kept / CAMERAS),
+        "cameras_sha256": sha256_of(kept / CAMERAS),
         "told": documents_of(warnings),
         **found.document(),
     }
@@ -154,7 +155,7 @@ def calibration_warnings(kept: Path, made_of: Mapping[str, str] | None = None) -
     with suppress(OSError, ValueError, KeyError, TypeError):
         document = json.loads((kept / FIGURES).read_text(encoding="utf-8"))
         same = made_of is None or document["made_of"] == made_of
-        if same and document["cameras_sha256"] == _sha256(kept / CAMERAS):
+        if same and document["cameras_sha256"] == sha256_of(kept / CAMERAS):
             return tuple(map(read_message, document["told"]))
     return None
 
@@ -170,18 +171,18 @@ def check_sizes(files: Iterable[Path], image_pixels: int) -> None:
 
 def keep_masks(kept: Path, capture: Capture, rig: Rig, *, report: Progress) -> dict[str, Silhouette]:
     """Returns the silhouettes of a capture. If they had to be estimated from the photographs alone, they are also
-    written to masks/ in ``kept``, where a second run finds them."""
+    written to masks/ in ``kept``. A second run finds them in the hidden folder ``CACHE`` there."""
     from pipeline.segmentation.segment import segment
     from server.storage.silhouette_cache import SUFFIX, segment_once
 
     if capture.masks or capture.backgrounds:
         return segment(capture, rig, report=report)
-    masks = kept / "masks"
+    masks, cache = kept / "masks", kept / CACHE
     masks.mkdir(parents=True, exist_ok=True)
     full = read_rig(kept / CAMERAS) if (kept / CAMERAS).is_file() else rig
-    before = set(masks.glob(f"*{SUFFIX}"))
-    found = segment_once(masks, capture, rig, report=report)
-    made = set(masks.glob(f"*{SUFFIX}")) - before
+    before = set(cache.glob(f"*{SUFFIX}"))
+    found = segment_once(cache, capture, rig, report=report)
+    made = set(cache.glob(f"*{SUFFIX}")) - before
     for path in before if made else ():
         path.unlink(missing_ok=True)
     for name, silhouette in found.items():
@@ -201,11 +202,12 @@ def _made_of(root: Path, front: str | None) -> dict[str, str]:
     from importlib.metadata import version
 
     files = [path for path in sorted(picture_folder(root).rglob("*")) if is_picture(path)]
-    files += [path for path in sorted((root / "masks").glob("*")) if is_picture(path)]
-    files += [root / SCALE] if (root / SCALE).is_file() else []
-    digests = {path.relative_to(root).as_posix(): _sha256(path) for path in files}
+    files += [path for path in sorted(entry(root, "masks").glob("*")) if is_picture(path)]
+    files += [path for path in (entry(root, SCALE),) if path.is_file()]
+    digests = {path.relative_to(root).as_posix(): sha256_of(path) for path in files}
     return {**digests, "front": front or "", "version": version("eigenhead"), "pycolmap": version("pycolmap")}
 
 
-def _sha256(path: Path) -> str:
+def sha256_of(path: Path) -> str:
+    """Returns the SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rig.messages.message import compose
 from rig.progress import Progress
 from server.processes import share_one_heap, tidied
 from server.tasks.child import Report, WorkerContext
@@ -18,9 +19,13 @@ from server.tasks.child import Report, WorkerContext
 if TYPE_CHECKING:
     from pipeline.settings import Settings
     from pipeline.stages.context import Segment
+    from rig.render.compute import ComputeDevice
+    from rig.render.renderer import Renderer
     from server.tasks.photographs import Prepared
 
+
 DONE = "done"  # the pipeline's last word, when nothing is written yet
+SURE_SCALE = 0.02  # relative: 3 mm of a head; above it the warning says that lengths are estimates
 
 
 def reconstruct_capture(
@@ -83,7 +88,6 @@ def run_job(
     from pipeline.results.write import write_result
     from pipeline.stages.context import ReconstructionContext
     from rig.render.renderer import Renderer
-    from server.tasks.matching_device import matching_device
     from server.tasks.photographs import full_size_pictures
     from server.tasks.prepare import prepare_kernels
 
@@ -116,6 +120,31 @@ def run_job(
         )
     )
     report("write", 0.0)
-    done = replace(done, warnings=(*prepared.warnings, *done.warnings))
+    warnings = (*prepared.warnings, *done.warnings)
+    if done.scale_sigma > SURE_SCALE and all(warning.code != "scale-assumed" for warning in warnings):
+        estimated = compose("scale-estimated", share=done.scale_sigma)
+        warnings = (compose("scale-assumed", scale=estimated), *warnings)
+    done = replace(done, warnings=warnings)
     with span("stage", "write"):
         write_result(out, done, prepared.capture, writers)
+
+
+MOST_THREADS = 8  # of a processor that a GPU is faster than: of an H200 two threads take 1.5 times as long, 16 no
+# longer
+
+
+def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Renderer") -> "ComputeDevice | None":
+    """Opens the compute device that ``chosen.device`` names, once a process. Returns None if the processor compares:
+    with the device ``cpu``, and with ``auto`` without a GPU or with more than ``MOST_THREADS`` threads. Raises
+    ComputeUnavailable if ``gl`` was chosen and is not there."""
+    from pipeline.compute.threads import thread_count
+    from rig.render.compute import open_device
+
+    if chosen.device == "auto" and thread_count() > MOST_THREADS:
+        return None
+
+    description = renderer.context.description
+    device: ComputeDevice | None = context.keep(
+        f"device {chosen.device}", lambda: open_device(chosen.device, description)
+    )
+    return device

@@ -70,6 +70,12 @@ def send_archive(
     return StreamingResponse(blocks, headers=headers, media_type="application/zip")  # its length is not known yet
 
 
+def send_zip(data: bytes) -> Response:
+    """Returns the response that carries a .zip that was made for it."""
+    headers = {"Cache-Control": "no-store", "Content-Disposition": "attachment"}
+    return Response(data, headers=headers, media_type="application/zip")
+
+
 def _refuse_damaged(files: Sequence[StoredFile]) -> None:
     damaged = [file.path.name for file in files if not file.is_intact()]
     if damaged:

@@ -4,10 +4,8 @@ our own drawing of the same view."""
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from rig.formats.meshes.mesh_file import read_mesh
 from rig.formats.pictures.images import read_image
 from rig.geometry import look_at
 from rig.mesh import Mesh
+from tests.support.loopback import served
 from tests.support.shared_data import shared
 
 pytestmark = pytest.mark.slow
@@ -67,11 +66,6 @@ new GLTFLoader().load("./" + file, gltf => {
 </script></body>"""
 
 
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: Any) -> None:
-        pass
-
-
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[tuple[Path, str]]:
     """A folder served on the loopback, with three.js as it comes inside nicegui."""
@@ -79,13 +73,8 @@ def site(tmp_path: Path) -> Iterator[tuple[Path, str]]:
     shutil.copy(three, tmp_path / "three.js")
     page = PAGE % {"size": SIZE, "eye": ", ".join(map(str, EYE_M))}
     (tmp_path / "index.html").write_text(page)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path)))
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    yield tmp_path, f"http://127.0.0.1:{server.server_address[1]}/"
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with served(SimpleHTTPRequestHandler, tmp_path) as url:
+        yield tmp_path, f"{url}/"
 
 
 def open_page(url: str, shot: Path, profile: Path) -> tuple[dict[str, Any], list[str]]:

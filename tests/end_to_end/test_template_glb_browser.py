@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from pipeline.applications.templates.animated import AnimatedMesh, animated_mesh
-from pipeline.applications.templates.write.shapes import animated_glb
+from pipeline.applications.templates.write.shapes import animated_scene
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import load_model
 from pipeline.head_model.visemes import VISEMES
+from rig.formats.meshes.glb import scene_glb_bytes
 from rig.geometry import Similarity
 from rig.mesh import Mesh
 from tests.end_to_end.test_glb_browser import open_page, site
@@ -48,7 +49,7 @@ def animated() -> tuple[AnimatedMesh, bytes]:
     shapes, triangles = {name: morphs[name] for name in NAMES}, template.mesh.triangles()
     made = animated_mesh(template.surface_binding, triangles, mean, faces, shapes, model.landmarks)
     colours = np.full((len(made.neutral), 3), 180, np.uint8)
-    return made, animated_glb(made, triangles, colours, {}, {})
+    return made, scene_glb_bytes(animated_scene(made, triangles, colours, {}))
 
 
 @pytest.mark.timeout(600)

@@ -23,8 +23,6 @@ from tests.laboratory.experiments.shared_data import SHARED, Shared, facekit, tr
 from tests.laboratory.experiments.speed.growth import Size, sizes
 from tests.laboratory.experiments.speed.scaling import JobCommand
 
-SHORT_HAIR = ("draw-b", "beard-smile")  # of the shared captures
-
 Only = Annotated[Sequence[str], "these rows, sizes or captures alone; may be repeated"]
 
 
@@ -84,11 +82,6 @@ def requested_captures(
 def known_captures(*, shared: Shared = SHARED) -> dict[str, Path]:
     """Returns the shared captures that have a truth."""
     return {name: path.with_suffix("") for name, path in truths(shared).items()}
-
-
-def short_haired(*, only: Only = (), shared: Shared = SHARED) -> dict[str, Path]:
-    """Returns the shared captures of short hair, or those of ``--only``."""
-    return {name: path for name, path in known_captures(shared=shared).items() if name in (only or SHORT_HAIR)}
 
 
 def chosen_truths(*, only: Only = (), shared: Shared = SHARED) -> dict[str, Path]:

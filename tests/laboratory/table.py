@@ -61,6 +61,11 @@ EXPERIMENTS = {
         "Counts false alarms and hits of every check that can refuse a capture.",
         {"folders": inputs.folders_or_known},
     ),
+    "living": Record(
+        "experiments.people.living:living",
+        "Compares heads of living people from few and many cameras.",
+        {"folders": inputs.photograph_folders},
+    ),
     "planted": Record("experiments.faults.planted:planted", "Runs whole jobs on pictures with faults of studios."),
     "visible": Record(
         "experiments.surface.visible:visible",
@@ -88,11 +93,6 @@ EXPERIMENTS = {
         "Measures how close wrapping brings a template to scans.",
         {"truths": inputs.chosen_truths},
     ),
-    "hair-shell": Record(
-        "experiments.surface.hair_shells:hair_shells",
-        "Measures how much of the visible hair head_hair.ply can show.",
-        {"captures": inputs.short_haired},
-    ),
     "meshes": Record("experiments.surface.meshes:meshes", "Counts turned, folded and crossing triangles of results."),
     "scaling": Record(
         "experiments.speed.scaling:scaling",
@@ -110,18 +110,14 @@ EXPERIMENTS = {
         "Judges heads from real photographs by views that were not used.",
         {"folders": inputs.photograph_folders},
     ),
+    "reports": Record("experiments.faults.reports:reports", "Judges what each door answers to the shared reports."),
 }
 
 BENCHMARKS = {
     "attacks": Record("benchmarks.attacks:run", "Attacks a service over loopback, and says what held."),
     "capture_leaks": Record("benchmarks.capture_leaks:run", "Takes many captures, and measures what grows."),
     "captures": Record("benchmarks.captures:run", "Measures errors of the shared captures at every level of detail."),
-    "console_timings": Record("benchmarks.console_timings:run", "Times the console's pages in Chromium."),
-    "database_costs": Record("benchmarks.database_costs:run", "Counts a job's statements and bytes in PostgreSQL."),
-    "farm_cuts": Record("benchmarks.farm_cuts:run", "Kills and cuts off workers without a common folder."),
-    "image_stages": Record("benchmarks.image_stages:run", "Times the stages of a job."),
     "large_pictures": Record("benchmarks.large_pictures:run", "Writes, or times, a capture of 24 Mpx pictures."),
-    "long_lists": Record("benchmarks.long_lists:run", "Times lists of a hundred thousand captures."),
     "scene_calibration": Record("benchmarks.scene_calibration:run", "Judges calibration from photographs alone."),
     "side_by_side": Record("benchmarks.side_by_side:run", "Compares two checkouts on the same captures."),
     "studio_masks": Record("benchmarks.studio_masks:run", "Compares masks of the studio with the truth."),

@@ -20,7 +20,7 @@ def nested(depth: int) -> list[Any]:
     ("document", "fault"),
     [
         ({"front": "\ud800"}, r"front is '\ud800', wanted a text"),
-        ({"fail_on": ["\ud800"]}, "fail_on is "),
+        ({"fail_on": ["\ud800"]}, "fail_on[0] is "),
         ({"\ud800": 1}, r"unknown key '\ud800'"),
         ({"outputs": {"\ud800": 1}}, r"unknown key 'outputs.\ud800'"),
         ({"warnings": []}, "unknown key 'warnings'"),

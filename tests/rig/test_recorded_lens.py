@@ -10,6 +10,7 @@ MATRIX = np.array([[300.0, 0, 255.3], [0, 305.0, 190.1], [0, 0, 1]])
 LENSES = [
     RecordedLens("kannala-brandt", (-0.03, 0.011, -0.004, 0.0007)),
     RecordedLens("rational", (0.12, -0.05, 1e-3, -8e-4, 0.01, 0.31, 0.02, 0.003)),
+    RecordedLens("rational", (0.12, -0.05, 1e-3, -8e-4, 0.01, 0.0, 0.0, 0.0), skew=-0.01),
 ]
 PIXELS = np.random.default_rng(3).uniform([20, 20], [490, 360], (50, 2))
 

@@ -10,26 +10,17 @@ import numpy as np
 import trimesh
 
 from rig.atomic_write import write_atomically
-from rig.formats.meshes.glb import write_glb
 from rig.formats.meshes.ply import write_ply
 from rig.mesh import Mesh
 from rig.progress import Progress
 from server.tasks.child import WorkerContext
+from tests.support.glb import glb_bytes
 
 RADIUS_MM = 90.0
 QUALITY_MOST_MM = 2.0  # at the top of the ball; 1.0 at the bottom
 
 
-def work(
-    context: WorkerContext,
-    report: Progress,
-    *,
-    capture: str,
-    result: str,
-    cache: str,
-    model: str | None,
-    settings: dict[str, Any],
-) -> dict[str, Any]:
+def work(context: WorkerContext, report: Progress, *, result: str, **others: object) -> dict[str, Any]:
     """A grey ball about the world's origin; its standard deviation grows with its height; the upper half of the bust is
     hair. It takes ``EIGENHEAD_BALL_S`` seconds longer than it must."""
     time.sleep(float(os.environ.get("EIGENHEAD_BALL_S", "0")))
@@ -42,17 +33,9 @@ def work(
     quality = (1 + (QUALITY_MOST_MM - 1) * height).astype(np.float32)
     for name in ("head", "bust"):
         part = None if name == "head" else np.where(normals[:, 1] > 0, 2, 1).astype(np.uint8)
-        write_ply(
-            folder / f"{name}.ply",
-            ball,
-            normals=normals,
-            colours=colours,
-            quality=quality,
-            views=views,
-            part=part,
-            comments=["unit mm"],
-        )
-        write_glb(folder / f"{name}.glb", Mesh(ball.vertices, ball.faces, colours), normals=normals, colours=colours)
+        values = {"normals": normals, "colours": colours, "quality": quality, "views": views, "part": part}
+        write_ply(folder / f"{name}.ply", ball, comments=["unit mm"], **values)
+        (folder / f"{name}.glb").write_bytes(glb_bytes(Mesh(ball.vertices, ball.faces, colours), normals=normals))
     place = {"scale": 1.0, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}
     document = {"model": {"name": "ball", "sha256": "0"}, "method": "contour", "world_from_head": place}
     write_atomically(folder / "report.json", json.dumps(document).encode())

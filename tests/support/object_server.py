@@ -15,12 +15,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 
+from tests.support.loopback import served
 from tests.support.services import free_port
 
 KEYS = {"AWS_ACCESS_KEY_ID": "studio", "AWS_SECRET_ACCESS_KEY": "secret-of-the-tests", "AWS_REGION": "us-east-1"}
@@ -161,22 +162,8 @@ def network_before(url: str) -> Iterator[Network]:
 
         do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = _forward
 
-        def handle(self) -> None:
-            with suppress(OSError):  # whoever asked gave up
-                super().handle()
-
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    network.url = f"http://127.0.0.1:{server.server_port}"
-    try:
+    with served(Handler) as network.url:
         yield network
-    finally:
-        server.shutdown()
-        server.server_close()
 
 
 def _flipped(data: bytes) -> bytes:

@@ -57,15 +57,7 @@ def pinned_report(seed: int, settings: Mapping[str, object], seconds: float = 1.
 
 
 def work(
-    context: WorkerContext,
-    report: Progress,
-    *,
-    parent: int,
-    capture: str,
-    result: str,
-    scratch: str,
-    model: str | None,
-    settings: Mapping[str, object],
+    context: WorkerContext, report: Progress, *, parent: int, capture: str, result: str, scratch: str, **others: Any
 ) -> None:
     """Takes ``EIGENHEAD_PINNED_S`` seconds and writes what follows from the capture alone."""
     end_with_parent(parent)
@@ -83,7 +75,7 @@ def work(
     for name in ("head.ply", "head.glb", "overlays/cam00.png"):
         write_atomically(out / name, digest * 2000)
     (out / "turntable.png").write_bytes(picture_bytes(digest))
-    text = json.dumps(pinned_report(seed, settings, time.monotonic() - began))
+    text = json.dumps(pinned_report(seed, others["settings"], time.monotonic() - began))
     write_atomically(out / "report.json", text.encode())
     _note("ends", folder.name)
 

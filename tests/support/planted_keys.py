@@ -162,14 +162,14 @@ def plant_colmap(path: Path, key: str, value: object) -> None:
     elif key in ("CAMERA_ID", "WIDTH", "HEIGHT", "PARAMS[]"):
         words = path.read_text().splitlines()
         at = {"CAMERA_ID": 0, "WIDTH": 2, "HEIGHT": 3, "PARAMS[]": 4}[key]
-        words[1] = " ".join(str(value) if i == at else word for i, word in enumerate(words[1].split()))
+        words[3] = " ".join(str(value) if i == at else word for i, word in enumerate(words[3].split()))
         path.write_text("\n".join(words))
     elif key == "POINTS2D[]":
-        lines[5] = "1.5 2.5 -1 3.5 4.5 7"
+        lines[7] = "1.5 2.5 -1 3.5 4.5 7"
         images.write_text("\n".join([line for line in lines if line.strip()]))
     else:
         at = {"IMAGE_ID": 0, "QW QX QY QZ": 4, "TX TY TZ": 5, "NAME": 9}[key]
-        lines[4] = " ".join(str(value) if i == at else word for i, word in enumerate(lines[4].split()))
+        lines[6] = " ".join(str(value) if i == at else word for i, word in enumerate(lines[6].split()))
         images.write_text("\n".join(lines))
 
 

@@ -16,14 +16,7 @@ from tests.support.pinned_work import picture_bytes, pinned_report
 
 
 def work(
-    context: WorkerContext,
-    report: Progress,
-    *,
-    capture: str,
-    result: str,
-    cache: str,
-    model: str | None,
-    settings: dict[str, Any],
+    context: WorkerContext, report: Progress, *, capture: str, result: str, cache: str, settings: Any, **others: Any
 ) -> dict[str, Any]:
     """Takes ``EIGENHEAD_TINY_S`` seconds, or as many as ``front`` is. Its files follow from the capture alone."""
     shot, _ = read_capture(Path(capture))
@@ -63,16 +56,7 @@ def work(
     return {}
 
 
-def busy(
-    context: WorkerContext,
-    report: Progress,
-    *,
-    capture: str,
-    result: str,
-    cache: str,
-    model: str | None,
-    settings: dict[str, Any],
-) -> dict[str, Any]:
+def busy(context: WorkerContext, report: Progress, *, result: str, **others: Any) -> dict[str, Any]:
     """About a second of one core, by count and not by clock, so that a busy core takes longer."""
     digest = b""
     for step in range(100):
@@ -84,14 +68,7 @@ def busy(
 
 
 def reporting(
-    context: WorkerContext,
-    report: Progress,
-    *,
-    capture: str,
-    result: str,
-    cache: str,
-    model: str | None,
-    settings: dict[str, Any],
+    context: WorkerContext, report: Progress, *, capture: str, result: str, settings: dict[str, Any], **others: Any
 ) -> dict[str, Any]:
     """Writes what tables and sheets read of a head, its numbers drawn from the capture."""
     shot, _ = read_capture(Path(capture))

@@ -94,9 +94,10 @@ class Comparison:
 
     @property
     def warnings(self) -> tuple[Message, ...]:
-        """Returns what makes the comparison doubtful: forehead and bridge of the nose that differ for sure."""
-        share = self.regions["stable"].changed_share
-        return (compose("maybe-other-person", share=share),) if share > MAX_STABLE_CHANGED else ()
+        """Returns what makes the comparison doubtful: either head, and forehead and bridge of the nose that differ for
+        sure."""
+        share, doubts = self.regions["stable"].changed_share, (*self.earlier.warnings, *self.later.warnings)
+        return (*doubts, compose("maybe-other-person", share=share)) if share > MAX_STABLE_CHANGED else doubts
 
 
 def compare(earlier: Visit, later: Visit) -> Comparison:
@@ -108,7 +109,8 @@ def compare(earlier: Visit, later: Visit) -> Comparison:
     fit = trimmed_fit(patch, surface.index, _start(earlier, later), share=SHARE, beside=surface.beside)
     if fit is None or fit.std_mm > NOT_THIS_MM:
         off = float("inf") if fit is None else fit.std_mm
-        raise InputError(later.measured.name, [compose("not-same-person", earlier=head.name, off_mm=off)])
+        other = compose("not-same-person", earlier=head.name, off_mm=off)
+        raise InputError(later.measured.name, [other, *earlier.warnings, *later.warnings])
     there, facing = fit.motion.apply(head.mesh_world.vertices), normals @ fit.motion.rotation.T
     hits = surface.index.closest(there, facing=facing)
     known = (hits.distances < FAR_MM) & ~surface.beside(hits) & (np.einsum("nx,nx->n", facing, hits.normals) > FACING)

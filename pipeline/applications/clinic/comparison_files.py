@@ -24,8 +24,9 @@ from pipeline.results.clay import clay
 from pipeline.results.overlays import Resized, contact_sheet
 from pipeline.results.pdf_page import BAD, FAINT, LINE_MM, MARGIN_MM, PdfPage
 from rig.atomic_write import write_atomically
-from rig.formats.meshes.glb import glb_bytes
+from rig.formats.meshes.glb import scene_glb_bytes
 from rig.formats.meshes.ply import ply_bytes
+from rig.formats.meshes.scene import Part, Scene
 from rig.formats.pictures.images import write_image
 from rig.mesh import Mesh
 
@@ -152,8 +153,8 @@ def _write_meshes(folder: Path, comparison: Comparison, colours: UInt8[np.ndarra
         comments=comments,
     )  # fmt: skip
     write_atomically(folder / "difference.ply", data)
-    head = Mesh(before.head_from_world.apply(mesh.vertices), mesh.faces)
-    write_atomically(folder / "difference.glb", glb_bytes(head, normals=head.normals(), colours=colours))
+    head = Part("head", Mesh(before.head_from_world.apply(mesh.vertices), mesh.faces, colours))
+    write_atomically(folder / "difference.glb", scene_glb_bytes(Scene([head])))
     packed = io.BytesIO()
     np.savez_compressed(
         packed,

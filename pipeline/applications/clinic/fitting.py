@@ -13,7 +13,7 @@ plane's attitude (``anatomical_frame``), as a person holds the head:
 
 Standard deviations are those of ``DRAWS`` heads: the result's own deviation along the normals (``quality`` of
 head.ply), times a smooth random field with the correlation that the head models have (``gaussian_process.SCALES``).
-That of the frame angle has the plane's own tilt, too.
+That of the frame angle has the plane's own tilt, too, and lengths that of the cameras' scale.
 """
 
 from collections.abc import Callable, Mapping
@@ -86,16 +86,13 @@ def fitting_measures(visit: Visit) -> dict[str, Fitted]:
         for name, value in _all(moved).items():
             if name in drawn and value is not None:
                 drawn[name].append(value)
-    shared = {"frame_angle": frame.tilt_std_deg or 0.0}
-    return {
-        name: Fitted(
-            value,
-            float(np.hypot(np.std(drawn[name], ddof=1), shared.get(name, 0.0))),
-            "deg" if name.endswith("angle") else "mm",
-        )
-        for name, value in units.items()
-        if len(drawn[name]) > DRAWS // 2
-    }
+    found = {}
+    for name in (name for name in units if len(drawn[name]) > DRAWS // 2):
+        unit = "deg" if name.endswith("angle") else "mm"
+        tilt = frame.tilt_std_deg or 0.0
+        shared = visit.scale_sigma * units[name] if unit == "mm" else tilt if name == "frame_angle" else 0.0
+        found[name] = Fitted(units[name], float(np.hypot(np.std(drawn[name], ddof=1), shared)), unit)
+    return found
 
 
 def _all(head: UprightHead) -> dict[str, float | None]:

@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.applications.clinic.anatomical_frame import POINTS, AnatomicalFrame, head_axes
+from pipeline.applications.clinic.registration import Registration
 from pipeline.applications.clinic.visit import Visit
 from pipeline.applications.model_building.correspondence.scans import plain_name
+from pipeline.applications.verification.pictures import heat_colours
 from pipeline.results.slicer_landmarks import uncertainty
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.markups import Axes, MarkupPoint, markups_document, read_markups
@@ -103,3 +105,50 @@ def marked_points(path: Path | None, visit: Visit, axes: Axes) -> dict[str, Floa
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Writes a document, under a temporary name first."""
     write_atomically(path, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+
+REGISTRATION_FORMAT = "eigenhead-registration/1"
+REGISTRATION_FILE = "registration.json"
+COLOUR_END_MM = 2.0  # distance at which a colour of residual.ply is full
+
+
+def write_registration(folder: Path, found: Registration) -> dict[str, Any]:
+    """Writes head.ply, residual.ply, landmarks.mrk.json and registration.json, and returns what the last says. Raises
+    OSError."""
+    motion, axes = found.fit.motion, found.surface.axes
+    write_patient_mesh(folder / HEAD_FILE, found.visit, motion, axes)
+    write_patient_mesh(
+        folder / "residual.ply",
+        found.visit,
+        motion,
+        axes,
+        colours=heat_colours(found.distance_mm, COLOUR_END_MM),
+        quality=np.nan_to_num(found.distance_mm),
+        comments=("quality: signed distance from the surface, mm; grey: nothing of it there",),
+    )
+    write_json(folder / LANDMARK_FILE, patient_landmarks(found.visit, motion, axes))
+    document = registration_document(found)
+    write_json(folder / REGISTRATION_FILE, document)
+    return document
+
+
+def registration_document(found: Registration) -> dict[str, Any]:
+    """Returns what registration.json says."""
+    motion, surface = found.fit.motion, found.surface
+    deviations = np.sqrt(np.diag(found.fit.covariance))
+    return {
+        "format": REGISTRATION_FORMAT,
+        "surface": {
+            "name": surface.reference.name,
+            "sha256": surface.reference.sha256,
+            "axes": surface.axes,
+            "axes_stated": surface.stated,
+        },
+        "head": {"name": found.visit.measured.name, "model": found.visit.identity.model},
+        "start": found.start,
+        "patient_from_world": matrix_document(motion),
+        "patient_from_head": matrix_document(motion @ found.visit.measured.head_from_world.inverse()),
+        "std_turn_deg": np.degrees(deviations[:3]).tolist(),
+        "std_shift_mm": deviations[3:].tolist(),
+        "figures": found.figures(),
+    }

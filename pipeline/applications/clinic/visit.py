@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.applications.verification.measured import (
+    DOUBTFUL,
     Measured,
     ResultIdentity,
     identity_of,
@@ -19,7 +20,7 @@ from pipeline.head_model.model import load_model
 from pipeline.head_model.regions import stable_region
 from rig.errors import InputError
 from rig.formats.meshes.ply import read_view_counts
-from rig.messages.message import compose
+from rig.messages.message import Message, compose, read_message
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +33,8 @@ class Visit:
     measurements: Mapping[str, Measurement]
     identity: ResultIdentity
     stable: Bool[np.ndarray, " v"]  # forehead and bridge of the nose
+    scale_sigma: float = 0.0  # relative standard deviation of all lengths together, which the deviations include
+    warnings: tuple[Message, ...] = ()  # of the result, that doubt the head, each with the result's name
 
 
 def read_visit(folder: Path, model: str | None = None) -> Visit:
@@ -47,4 +50,6 @@ def read_visit(folder: Path, model: str | None = None) -> Visit:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder.name}/report.json", [compose("report-unread", reason=repr(error))]) from error
     views, stable = read_view_counts(folder / "head.ply"), stable_region(head_model)
-    return Visit(measured, views, marks, lengths, identity, stable)
+    doubts = (read_message(warning) for warning in report["warnings"] if warning["code"] in DOUBTFUL)
+    warnings = tuple(compose("located", where=measured.name, fault=doubt) for doubt in doubts)
+    return Visit(measured, views, marks, lengths, identity, stable, report.get("scale_sigma", 0.0), warnings)

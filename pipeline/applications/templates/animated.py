@@ -1,8 +1,9 @@
-"""A registered mesh that can be animated: Apple's 52 shapes and the visemes on it, without crossing, its pivots, and
-eyeballs, teeth and a tongue where its eyes are open and its lips part and it has none."""
+"""A head that can be animated, in a registered mesh or in the model's own: Apple's 52 shapes, its pivots, and
+eyeballs, teeth and a tongue where its eyes are open and its lips part and it has none. A registered mesh has the
+visemes, too, and shapes without crossing."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,6 +15,7 @@ from pipeline.applications.templates.inner_mouth import InnerMouth, kept_off_tee
 from pipeline.applications.templates.pivots import EYE_REACH_MM, Points, jaw_motions, pivots
 from pipeline.applications.templates.shape_carrying import Neutral, carried_shapes, loose_parts
 from pipeline.head_model.visemes import VISEMES, mixed
+from rig.geometry import RigidTransform
 
 LIDS = "eye"  # what the names of shapes that close or move lids begin with
 
@@ -66,17 +68,46 @@ def animated_mesh(
         for rows in balls
         if name.startswith("eye_") and np.linalg.norm(mesh[rows].mean(axis=0) - pivot) < 0.5 * EYE_REACH_MM
     }
-    lacking = {name: pivot for name, pivot in found.items() if name.startswith("eye_") and name not in eyes}
-    added = placed_eyeballs(mesh, triangles, landmarks, lacking, gazes)
-    found |= {name: eyeball.centre for name, eyeball in added.items()}
-    shapes_of_mesh = parted_shapes(rest_surface(mesh, triangles), carried)
-    if added:
-        shapes_of_mesh = {name: lifted(mesh, triangles, shape, added) for name, shape in shapes_of_mesh.items()}
+    parted = parted_shapes(rest_surface(mesh, triangles), carried)
     loose = np.where(surface_binding.wholes >= 0, -1, loose_parts(surface_binding, triangles, len(mesh)))
     jaw = jaw_motions(landmarks, vertices, shapes)
-    inner = placed_inner_mouth(mesh, triangles, shapes_of_mesh, landmarks, jaw, loose)
-    moves = kept_off_teeth(mesh, triangles, shapes_of_mesh, inner)
-    return AnimatedMesh(mesh, moves, found, eyes, added, inner, gazes)
+    bare = AnimatedMesh(mesh, parted, found, eyes, gazes=gazes)
+    return _with_parts(bare, triangles, landmarks, jaw, loose)
+
+
+def animated_head(
+    vertices: Float[np.ndarray, "v 3"],
+    opened: Int[np.ndarray, "f 3"],
+    shapes: Mapping[str, Float[np.ndarray, "v 3"]],
+    landmark_rows: Mapping[str, int],
+    *,
+    gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
+) -> AnimatedMesh:
+    """Adds pivots, eyeballs, teeth and a tongue to a model's full level (head frame, mm), whose triangles ``opened``
+    leave out what closes eyes and mouth. Its lips and lids are as the model's shapes have them."""
+    landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
+    bare = AnimatedMesh(vertices, shapes, pivots(landmarks, vertices, shapes, []), {}, gazes=gazes)
+    jaw = jaw_motions(landmarks, vertices, shapes)
+    return _with_parts(bare, opened, landmarks, jaw, np.full(len(vertices), -1))
+
+
+def _with_parts(
+    bare: AnimatedMesh,
+    triangles: Int[np.ndarray, "g 3"],
+    landmarks: Points,
+    jaw: Mapping[str, RigidTransform],
+    loose: Int[np.ndarray, " t"],
+) -> AnimatedMesh:
+    """Returns the mesh with the eyeballs, teeth and tongue that it lacks, and lids and lips that keep off them."""
+    mesh, shapes = bare.neutral, bare.shapes
+    lacking = {name: at for name, at in bare.pivots.items() if name.startswith("eye_") and name not in bare.eyeballs}
+    added = placed_eyeballs(mesh, triangles, landmarks, lacking, bare.gazes)
+    if added:
+        shapes = {name: lifted(mesh, triangles, shape, added) for name, shape in shapes.items()}
+    inner = placed_inner_mouth(mesh, triangles, shapes, landmarks, jaw, loose)
+    shapes = kept_off_teeth(mesh, triangles, shapes, inner)
+    centres = {name: eyeball.centre for name, eyeball in added.items()}
+    return replace(bare, shapes=shapes, pivots={**bare.pivots, **centres}, added=added, inner=inner)
 
 
 def parted_shapes(

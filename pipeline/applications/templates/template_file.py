@@ -20,6 +20,8 @@ from pipeline.applications.templates.header import (
     header_words,
     read_meta,
 )
+from pipeline.applications.templates.names import template_path
+from pipeline.head_model.model import HeadModel
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.messages.message import compose
@@ -141,3 +143,15 @@ def _check(path: Path, template: Template) -> None:
         raise BadTemplate(path, compose("template-not-finite"))
     if template.flame is not None and len(template.flame.template) != count:
         raise BadTemplate(path, compose("template-arrays-unfit"))
+
+
+def load_template(name: str | None, model: HeadModel) -> Template | None:
+    """Loads the named template for a job with this model; returns None if ``name`` is None.
+
+    Raises UnknownTemplate, BadTemplate, OtherModel.
+    """
+    if name is None:
+        return None
+    template = read_template(template_path(name))
+    template.check_model(model.name, model.sha256)
+    return template

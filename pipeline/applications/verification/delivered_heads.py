@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from pipeline.applications.model_building.training.build import FEWEST, Built, cages_through
 from pipeline.applications.model_building.training.delivered import Delivered, updated_model
-from pipeline.applications.verification.measured import Measured, identity_of, is_result, read_measured
+from pipeline.applications.verification.measured import DOUBTFUL, Measured, identity_of, is_result, read_measured
 from pipeline.head_model.model import HeadModel, assemble
 from pipeline.head_model.model_file import ModelParts, read_parts, save_model
 from pipeline.head_model.model_names import list_models, model_sha256
@@ -15,7 +15,6 @@ from rig.errors import InputError
 from rig.messages.message import Message, compose
 from rig.progress import Progress
 
-DOUBTFUL = ("face-elsewhere", "no-face", "pose-doubtful", "scale-assumed", "scale-implausible", "shape-implausible")
 MIN_DEVIATION_MM = 0.05  # no vertex is known better
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from pipeline.typed_tables import read_table
+from rig.typed_tables import read_table
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,9 @@ from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 from rig.messages.message import compose
 
+# Codes of warnings that doubt the head.
+DOUBTFUL = ("face-elsewhere", "no-face", "pose-doubtful", "scale-assumed", "scale-implausible", "shape-implausible")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:

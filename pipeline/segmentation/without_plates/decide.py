@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from pipeline.imaging.masks import dilated, eroded, spread, without_holes
 from pipeline.multiview.scene_points import ScenePoints, find_scene_points
-from pipeline.segmentation.background import COARSE_COLUMNS, coarse_size
-from pipeline.segmentation.foreground import Decision
-from pipeline.segmentation.without_plates.estimated_plate import decision_without_plate, plate_noise
+from pipeline.segmentation.background import COARSE_COLUMNS, Background, coarse_size, plate_tolerance
+from pipeline.segmentation.foreground import CONCLUSIVE, Decision, colours_apart, find_mixtures, whole_subject
 from pipeline.segmentation.without_plates.head_seed import HeadSeed, head_core
 from pipeline.segmentation.without_plates.local_cut import COLUMNS, cut_views
-from pipeline.segmentation.without_plates.mask_search import search_masks
-from pipeline.segmentation.without_plates.standing_plane import NEAR, ball_above, standing_plane
+from pipeline.segmentation.without_plates.mask_search import CoarseMask, search_masks
 from pipeline.segmentation.without_plates.viewing_volume import ViewingVolume, viewing_ball, viewing_volume
 from rig.rig import Rig
 
@@ -120,3 +119,156 @@ def _enlarged(share: Float32[np.ndarray, "_ _"], size: tuple[int, ...]) -> Float
 
 def _between(report: Callable[[float], None], start: float, end: float, share: float) -> None:
     report(start + (end - start) * share)
+
+
+MARGIN = 2  # coarse pixels beyond the mask in which the subject may still be
+NEARBY_PX = 2.5  # coarse pixels: sigma of the window that the plate is taken from
+NOISE_WINDOW_PX = 6.0  # of the window in which the guess is judged
+SOLID_ODDS = np.float32(4.0)  # of what a head encloses
+MIN_NOISE = 0.7  # levels: what a sensor and 8 bits leave
+
+
+def decision_without_plate(
+    image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], found: CoarseMask, *, solid: bool = False
+) -> Decision:
+    """Returns a decision for the matting, with a background estimated from the pixels around the mask. If ``solid``,
+    the subject is a head, and holes in the mask are filled as skin or hair of the wall's colour."""
+    mask, others = whole_subject(found.mask, found.odds < -1)
+    odds = found.odds
+    if solid:
+        holes = without_holes(mask) & ~mask
+        mask, odds = mask | holes, np.where(holes, np.maximum(odds, SOLID_ODDS), odds)
+    outside = ~dilated(mask, MARGIN)
+    background = estimated_background(image, coarse, outside)
+    tolerance = plate_tolerance(background.coarse)
+    variance = (background.noise**2 / 4 + tolerance**2).astype(np.float32)
+    away, mixture = find_mixtures(image, coarse, background)
+    paint = spread(coarse, eroded(mask, 1) * away / (1 + mixture**2), 2.0)
+    clear = colours_apart(paint, background.coarse, variance) > CONCLUSIVE
+    mixed = (mixture > 1) & (away > (2 * background.noise.mean(axis=2)) ** 2)
+    probability = 1 / (1 + np.exp(-odds.astype(np.float64)))
+    plain = outside & False
+    return Decision(coarse, background, odds, probability, mask, others, paint, odds, clear, plain, mixed)
+
+
+def estimated_background(
+    image: UInt8[np.ndarray, "_ _ 3"], coarse: Float32[np.ndarray, "h w 3"], outside: Bool[np.ndarray, "h w"]
+) -> Background:
+    """Estimates the background behind the subject from the pixels ``outside`` it; the noise includes the error of that
+    guess."""
+    guess = spread(coarse, outside.astype(np.float32), NEARBY_PX)
+    size = (image.shape[1], image.shape[0])
+    share = cv2.resize(cv2.GaussianBlur(outside.astype(np.float32), (0, 0), 1.0), size, interpolation=cv2.INTER_LINEAR)
+    behind = cv2.resize(guess, size, interpolation=cv2.INTER_LINEAR)
+    seen = np.clip(2 * share[:, :, None] - 1, 0, 1)
+    plate = np.rint(np.clip(seen * image + (1 - seen) * behind, 0, 255)).astype(np.uint8)
+    far = outside & ~dilated(~outside, 2)
+    test = spread(coarse, far.astype(np.float32), NEARBY_PX)
+    ring = (outside & ~far).astype(np.float32)
+    error = np.sqrt(spread((coarse - test) ** 2, ring, NOISE_WINDOW_PX))
+    pixel = _pixel_noise(image)
+    noise = np.sqrt(error**2 + np.maximum(pixel, MIN_NOISE) ** 2).astype(np.float32)
+    small = cv2.resize(plate, (coarse.shape[1], coarse.shape[0]), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return Background(plate[None], np.ones_like(coarse), small, noise, outside, np.ones(3, np.float32))
+
+
+def _pixel_noise(image: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, " 3"]:
+    """Returns the noise of one pixel (levels) in each channel, from differences of neighbours, most of which lie on no
+    edge."""
+    steps = image[::4, 1:].astype(np.float32) - image[::4, :-1]
+    return (1.4826 * np.median(np.abs(steps), axis=(0, 1)) / np.sqrt(2)).astype(np.float32)
+
+
+def plate_noise(decision: Decision) -> float:
+    """Returns the median noise (levels) of the estimated background along the subject's border; 0 without a border."""
+    rim = dilated(decision.mask, MARGIN) & ~eroded(decision.mask, MARGIN)
+    return float(np.median(decision.background.noise[rim])) if rim.any() else 0.0
+
+
+TRIPLES, SAMPLES = 20000, 2000  # drawn; of those far enough apart, tried
+OUTER, APART = 0.35, 0.4  # of the radius: how far from the middle, and from each other, the points of a sample are
+NEAR = 0.012  # of the volume's radius: how far a point of the plane may be from it; 3 mm of a head's picture
+MIN_POINTS, MIN_SHARE = 40, 0.08  # that lie on it; 0.11 of the Buddha's
+MAX_BEYOND = 0.01  # share of the points within the volume that may lie on its other side
+MIN_WIDTH = 0.45  # of the radius: root mean square distance of its points from their middle; of a face 0.25
+OUTLYING, ROOM = 0.01, 1.2  # share of points that are wrong; of their distance, room for what shows none
+MIN_OFF_CENTRE = 0.08  # of the radius: the place that all cameras look at is not on it
+
+
+def standing_plane(
+    points_world: Float[np.ndarray, "n 3"], centre_world: Float[np.ndarray, " 3"], radius_mm: float
+) -> Float[np.ndarray, " 4"] | None:
+    """Finds a plane that many scene points lie on and hardly any lie beyond. ``plane . (x, 1)`` is the distance (mm),
+    positive on the subject's side; None if there is no such plane."""
+    near = points_world[np.linalg.norm(points_world - centre_world, axis=1) < 2 * radius_mm]
+    if len(near) < MIN_POINTS:
+        return None
+    rng = np.random.default_rng(0)
+    best, most = None, 0
+    outer = near[np.linalg.norm(near - centre_world, axis=1) > OUTER * radius_mm]
+    if len(outer) < 3:
+        return None
+    triples = outer[rng.integers(len(outer), size=(TRIPLES, 3))]
+    sides = np.linalg.norm(triples - np.roll(triples, 1, axis=1), axis=2).min(axis=1)
+    for three in triples[sides > APART * radius_mm][:SAMPLES]:
+        plane = _through(three, centre_world)
+        if plane is None or plane[:3] @ centre_world + plane[3] < MIN_OFF_CENTRE * radius_mm:
+            continue
+        count = int((np.abs(near @ plane[:3] + plane[3]) < NEAR * radius_mm).sum())
+        if count > most and _holds(plane, near, centre_world, radius_mm):
+            best, most = plane, count
+    return None if best is None else _refined(best, near, centre_world, radius_mm)
+
+
+def ball_above(
+    plane_world: Float[np.ndarray, " 4"],
+    points_world: Float[np.ndarray, "n 3"],
+    centre_world: Float[np.ndarray, " 3"],
+    radius_mm: float,
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Returns the centre (world) and radius (mm) of a ball around the scene points above the plane, with some margin
+    for parts without points."""
+    height = points_world @ plane_world[:3] + plane_world[3]
+    inside = np.linalg.norm(points_world - centre_world, axis=1) < radius_mm
+    standing = points_world[inside & (height > 2 * NEAR * radius_mm)]
+    if len(standing) < MIN_POINTS:
+        return centre_world, radius_mm
+    low, high = np.quantile(standing, (OUTLYING, 1 - OUTLYING), axis=0)
+    middle = 0.5 * (low + high)
+    away = np.linalg.norm(standing - middle, axis=1)
+    return middle, min(radius_mm, ROOM * float(np.quantile(away, 1 - OUTLYING)))
+
+
+def _holds(
+    plane: Float[np.ndarray, " 4"], points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"], radius: float
+) -> bool:
+    height = points @ plane[:3] + plane[3]
+    on = points[np.abs(height) < NEAR * radius]
+    inside = np.linalg.norm(points - centre, axis=1) < radius
+    if len(on) < max(MIN_POINTS, MIN_SHARE * len(points)):
+        return False
+    spread = np.sqrt(((on - on.mean(axis=0)) ** 2).sum(axis=1).mean())
+    beyond = (height[inside] < -2 * NEAR * radius).mean() if inside.any() else 1.0
+    return bool(spread > MIN_WIDTH * radius and beyond < MAX_BEYOND)
+
+
+def _through(three: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 4"] | None:
+    normal = np.cross(three[1] - three[0], three[2] - three[0])
+    length = float(np.linalg.norm(normal))
+    if length < 1e-9:
+        return None
+    plane = np.append(normal, -normal @ three[0]) / length
+    return plane if plane[:3] @ centre + plane[3] > 0 else -plane
+
+
+def _refined(
+    plane: Float[np.ndarray, " 4"], points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, " 3"], radius: float
+) -> Float[np.ndarray, " 4"]:
+    """Returns the plane fitted by least squares to the points near it."""
+    for _ in range(3):
+        on = points[np.abs(points @ plane[:3] + plane[3]) < NEAR * radius]
+        middle = on.mean(axis=0)
+        normal = np.linalg.svd(on - middle)[2][2]
+        plane = np.append(normal, -normal @ middle)
+        plane = plane if plane[:3] @ centre + plane[3] > 0 else -plane
+    return plane

@@ -13,12 +13,16 @@ The layout is made from a model's mean head, so that texels of any two subjects 
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.sparse.linalg
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+from pipeline.compute.array_cache import cached_arrays
+from pipeline.head_model.model import HeadModel
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 
@@ -201,3 +205,45 @@ def _stretch(
     over = np.bincount(faces.ravel(), np.repeat(area * square, 3), len(points))
     found = np.sqrt(over / np.bincount(faces.ravel(), np.repeat(area, 3), len(points)))
     return found / np.median(found)
+
+
+def spread_texels(image: Float32[np.ndarray, "s s k"], known: Bool[np.ndarray, "s s"]) -> Float32[np.ndarray, "s s k"]:
+    """Returns the image with every unknown texel replaced by the nearest known one."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.asarray(labels).astype(np.int32)
+    values = np.ones((int(nearest.max()) + 1, image.shape[2]), np.float32)
+    values[nearest[known]] = image[known]
+    return values[nearest]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelLayout:
+    """Holds the texture coordinates of a model's full level and which of its vertices are neighbours."""
+
+    layout: Layout
+    around: Neighbourhood
+
+
+def model_layout(model: HeadModel) -> ModelLayout:
+    """Returns the texture layout of a model. It is made from the model's mean head, so that texels of any two subjects
+    correspond. Raises NoLayout for a surface that is not one piece with one open border."""
+    faces = model.levels["full"].faces
+    mean = model.vertices(np.zeros(0))
+
+    def make() -> dict[str, np.ndarray]:
+        found = unwrap(mean, faces)
+        around = Neighbourhood.of(*neighbours(faces, len(mean)))
+        return {
+            "uv": found.uv,
+            "faces": found.faces.astype(np.int32),
+            "source": found.source.astype(np.int32),
+            "starts": around.starts,
+            "indices": around.indices,
+            "opposite": around.opposite,
+        }
+
+    kept = cached_arrays("uv-layout", (model.mean, faces), make, made_by=(unwrap, neighbours, Neighbourhood))
+    layout = Layout(kept["uv"], kept["faces"], kept["source"])
+    return ModelLayout(layout, Neighbourhood(kept["starts"], kept["indices"], kept["opposite"]))

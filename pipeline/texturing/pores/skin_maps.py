@@ -16,12 +16,10 @@ from pipeline.compute.trace import traced
 from pipeline.geometry.projection import project_points
 from pipeline.texturing.chart_colours import CODES, ENCODED, LINEAR
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.model_layout import ModelLayout
-from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
 from pipeline.texturing.light import fit_light, transfer
 from pipeline.texturing.pores.close_views import CloseViews, halves_of
-from pipeline.texturing.pores.relief import MIN_SKIN, estimate_detail
-from pipeline.texturing.pores.strips import Strips
+from pipeline.texturing.pores.relief import MIN_SKIN, Strips, estimate_detail
 from pipeline.texturing.pores.texel_frames import TexelFrames, texel_frames
 from pipeline.texturing.vertex_colours import Texture
 from rig.colour_space import linear_from_srgb

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 
 from pipeline.geometry.raster_kernels import interpolate, rasterise
-from pipeline.texturing.layout.layout_image import spread_texels
-from pipeline.texturing.layout.uv_unwrap import Layout
+from pipeline.texturing.layout.uv_unwrap import Layout, spread_texels
 from pipeline.texturing.light import BAND_FACTORS, harmonics
 from rig.mesh import Mesh
 

@@ -23,8 +23,7 @@ from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.imaging.masks import box_around
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.layout.layout_image import spread_texels
-from pipeline.texturing.layout.uv_unwrap import Layout
+from pipeline.texturing.layout.uv_unwrap import Layout, spread_texels
 from pipeline.texturing.paint_kernels import TAPS
 from pipeline.texturing.visibility import LINEAR
 from rig.image import ImageRgb

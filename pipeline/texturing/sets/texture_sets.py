@@ -18,9 +18,8 @@ from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision, pack_pictures
-from pipeline.texturing.inpaint import fill_unknown
-from pipeline.texturing.layout.model_layout import ModelLayout
-from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout
+from pipeline.texturing.neighbourhood import fill_unknown
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.seam_levelling import level_views
 from pipeline.texturing.sets.specular import Specular, specular_light

@@ -12,10 +12,10 @@ import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
+from rig.formats.cameras.transforms_json import opengl_pose
 from rig.rig import Rig
 
 SENSOR_MM = 36.0
-OPENGL = np.diag([1.0, -1.0, -1.0])
 
 _SCRIPT = '''"""The cameras of a rig, for Blender: run it in the text editor, or by `blender --python`."""
 
@@ -57,9 +57,6 @@ def write_blender(rig: Rig, path: Path) -> None:
 
 def _entry(camera: Camera) -> dict[str, object]:
     k = camera.intrinsics
-    pose = camera.camera_from_world.inverse()
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation / 1000.0
     shift = [(0.5 * k.width - k.cx - 0.5) / k.width, (k.cy + 0.5 - 0.5 * k.height) * (k.fx / k.fy) / k.width]
     return {
         "name": camera.name,
@@ -68,7 +65,7 @@ def _entry(camera: Camera) -> dict[str, object]:
         "sensor_width_mm": SENSOR_MM,
         "shift": shift,
         "pixel_aspect": [1.0, k.fx / k.fy] if k.fx >= k.fy else [k.fy / k.fx, 1.0],
-        "matrix_world": matrix.tolist(),
+        "matrix_world": opengl_pose(camera),
         "note": _note(camera),
     }
 

@@ -8,44 +8,45 @@ all formats meet the same checks. Each format's module says where its layout is 
 Pixels: in this project and OpenCV the centre of the top-left pixel is (0, 0); in COLMAP, Metashape, RealityCapture and
 nerfstudio it is (0.5, 0.5). Lengths become millimetres: caliscope, Metashape and RealityCapture are in metres; COLMAP's
 scale is free and taken as millimetres; the unit of aniposelib, nerfstudio and OpenCV follows from the size of the
-rig.
+rig. Gaussian splatting's ``cameras.json`` and NeRSemble's ``camera_params.json`` are read, too.
 
 Keys of ``cameras.json`` that are not read, such as a misspelt ``covarianse`` or a ``k4`` that the lens model lacks, are
 no faults, because files may carry other programs' keys, but a warning tells the author that they have no effect.
 """
 
-import json
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rig.errors import InputError
 from rig.formats.cameras.blender_script import write_blender
-from rig.formats.cameras.cameras_json import FORMAT, read_rig, write_rig
+from rig.formats.cameras.cameras_json import CAMERAS_MOST, FORMAT, read_document, rig_from_document, write_rig
 from rig.formats.cameras.colmap import read_colmap, write_colmap
 from rig.formats.cameras.metashape import read_metashape, write_metashape
 from rig.formats.cameras.opencv_toml import looks_like_aniposelib, read_toml, write_aniposelib, write_caliscope
 from rig.formats.cameras.opencv_yaml import read_yaml, write_yaml
 from rig.formats.cameras.reading import CamerasRead
 from rig.formats.cameras.realitycapture import looks_like_csv, read_csv, read_xmp, write_csv, write_xmp
-from rig.formats.cameras.transforms_json import read_transforms, write_transforms
-from rig.formats.cameras.unread_programs import unread_programs
-from rig.formats.pictures.picture_names import is_junk
+from rig.formats.cameras.transforms_json import read_nersemble, read_splatting, read_transforms, write_transforms
+from rig.formats.cameras.unread_programs import head_of, program_of, unread_programs
+from rig.formats.pictures.picture_names import entry, is_junk
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
+from rig.spread_views import spread_views
 
 READ = {
-    "": {"format", "unit", "cameras"},
+    "": {"format", "unit", "cameras", "scale_sigma"},
     "cameras": {"name", "width", "height", "intrinsics", "distortion", "camera_from_world", "covariance", "serial"},
     "cameras.intrinsics": {"fx", "fy", "cx", "cy"},
     "cameras.camera_from_world": {"rotation", "translation"},
 }
 LENS_MODELS: dict[str, set[str]] = {
-    "brown-conrady": {"model", "k1", "k2", "p1", "p2", "k3"},
-    **{model: {"model", *keys} for model, keys in COEFFICIENTS.items()},
+    "brown-conrady": {"model", "k1", "k2", "p1", "p2", "k3", "skew"},
+    **{model: {"model", "skew", *keys} for model, keys in COEFFICIENTS.items()},
 }
 TOLD_MOST = 8  # keys named one by one; the others are counted
 
@@ -65,9 +66,17 @@ WRITERS: dict[str, Callable[[Rig, Path], None]] = {
 FORMATS = tuple(WRITERS)
 FOLDER_FORMATS = ("colmap", "colmap-text", "realitycapture", "opencv-yaml")  # formats of several files
 NO_RIG = compose("no-rig-file")
-COLMAP_FOLDERS = ("sparse/0", "sparse", ".")
 ARCHIVE_ENDINGS = (".zip", ".tar", ".tgz", ".gz", ".xz", ".bz2", ".7z", ".rar")
-HEAD_BYTES = 1 << 16  # read to recognise an XMP file; the names of the formats in it stand near its beginning
+JSON_READERS: tuple[tuple[Callable[[Any], bool], Callable[[Any, Path], CamerasRead]], ...] = (
+    (lambda document: isinstance(document, dict) and "frames" in document, read_transforms),
+    (lambda document: isinstance(document, list) and _are_of_splatting(document), read_splatting),
+    (lambda document: isinstance(document, dict) and "world_2_cam" in document, read_nersemble),
+)
+
+
+def _are_of_splatting(entries: list[Any]) -> bool:
+    wanted = {"img_name", "position", "rotation", "fx"}
+    return bool(entries) and all(isinstance(entry, dict) and wanted <= entry.keys() for entry in entries)
 
 
 def no_rig_fault(folder: Path) -> Message:
@@ -97,31 +106,31 @@ def rig_files(folder: Path) -> Iterator[Path]:
     any other YAML file of OpenCV's with a ``K_<camera>``; an XML file of Metashape's; RealityCapture's XMP files,
     beside the pictures or at the top, or its CSV.
     """
-    names = ("cameras.json", *(f"{inner}/cameras{end}" for inner in COLMAP_FOLDERS for end in (".bin", ".txt")))
-    native, *colmap = (folder / name for name in names)
-    caliscope, nerfstudio, easymocap = (folder / n for n in ("camera_array.toml", "transforms.json", "intri.yml"))
-    aniposelib = (path for path in sorted(folder.glob("*.toml")) if path != caliscope and looks_like_aniposelib(path))
-    yaml = sorted({*folder.glob("*.yml"), *folder.glob("*.yaml")} - {easymocap})
-    opencv = (path for path in yaml if b"\nK_" in _head(path))
-    metashape = (path for path in sorted(folder.glob("*.xml")) if b"<chunk" in _head(path))
-    sidecars = (
-        path
-        for place in ("images", ".")
-        for path in sorted((folder / place).glob("*.xmp"))
-        if b"capturingreality" in _head(path)
-    )
-    tables = (path for path in sorted(folder.glob("*.csv")) if looks_like_csv(_head(path)))
+    here = [path for path in sorted(folder.iterdir()) if path.is_file() and not is_junk(path.name)]
+    images = entry(folder, "images")
+    beside = [path for path in sorted(images.iterdir()) if path.is_file()] if images.is_dir() else []
+    names = ("cameras.json", "camera_array.toml", "transforms.json", "camera_params.json", "intri.yml")
+    native, caliscope, nerfstudio, nersemble, easymocap = (entry(folder, name) for name in names)
+    models = [entry(folder, "sparse"), folder]
+    models = [entry(models[0], "0"), *models]
+    colmap = [entry(model, f"cameras{end}") for model in models for end in (".bin", ".txt")]
+
+    def of(*endings: str, mark: str = "", among: Sequence[Path] = here) -> list[Path]:
+        ending = [path for path in among if path.suffix.lower() in endings and path not in (caliscope, easymocap)]
+        return [path for path in ending if not mark or re.search(mark, head_of(path))]
+
     for found in (
         [native],
         colmap,
         [caliscope],
-        aniposelib,
+        (path for path in of(".toml") if looks_like_aniposelib(path)),
         [nerfstudio],
+        [nersemble],
         [easymocap],
-        opencv,
-        metashape,
-        sidecars,
-        tables,
+        of(".yml", ".yaml", mark=r"\nK_"),
+        of(".xml", mark=r"<chunk\b"),
+        of(".xmp", mark="capturingreality", among=[*beside, *here]),
+        (path for path in of(".csv") if looks_like_csv(head_of(path))),
     ):
         first = next((path for path in found if path.is_file()), None)
         if first is not None:
@@ -136,28 +145,54 @@ def read_rig_file(path: Path) -> Rig:
 def read_cameras(path: Path) -> CamerasRead:
     """Returns the rig in a file of any known format, with its reader's remarks. Raises InputError naming every
     fault."""
-    if path.name == "transforms.json":
-        return read_transforms(path)
-    if path.suffix == ".json":
-        return CamerasRead(read_rig(path), tuple(compose("unknown-key", remark=remark) for remark in unread_keys(path)))
-    if path.suffix in (".bin", ".txt"):
-        return read_colmap(path.parent, path.suffix)
-    if path.suffix == ".xmp":
-        return read_xmp(path.parent)
-    readers = {".toml": read_toml, ".xml": read_metashape, ".csv": read_csv, ".yml": read_yaml, ".yaml": read_yaml}
-    if path.suffix not in readers:
-        endings = (".json", *readers, ".txt", ".bin", ".xmp")
-        raise InputError(path.name, [compose("no-rig-ending", endings=endings, formats=FORMATS[:-1])])
-    return readers[path.suffix](path)
+    suffix = path.suffix.lower()
+    readers = {
+        **{".json": _read_json, ".toml": read_toml, ".xml": read_metashape, ".csv": read_csv},
+        **{".yml": read_yaml, ".yaml": read_yaml, ".bin": read_colmap, ".txt": read_colmap, ".xmp": read_xmp},
+    }
+    try:
+        if suffix not in readers:
+            raise InputError(path.name, [compose("no-rig-ending", endings=[*readers], formats=FORMATS[:-1])])
+        return _thinned(readers[suffix](path), path.name)
+    except InputError:
+        if (program := program_of(path)) is None:
+            raise
+        raise InputError(path.name, [compose("cameras-of-program", files=[path.name], program=program)]) from None
+
+
+def _read_json(path: Path) -> CamerasRead:
+    """Reads the cameras of a JSON file, whose program is told by its content."""
+    document = read_document(path)
+    reader = next((read for is_of, read in JSON_READERS if is_of(document)), None)
+    if reader is not None:
+        return reader(document, path)
+    remarks = unread_keys_of(document, path.name)
+    return CamerasRead(
+        rig_from_document(document, path.name), tuple(compose("unknown-key", remark=remark) for remark in remarks)
+    )
+
+
+def _thinned(read: CamerasRead, file: str) -> CamerasRead:
+    """Leaves out cameras of more than ``CAMERAS_MOST``, so that those that take part stand well apart."""
+    if len(read.rig) <= CAMERAS_MOST:
+        return read
+    kept = set(spread_views(read.rig, CAMERAS_MOST))
+    rig = read.rig.subset([name for name in read.rig.names if name in kept])
+    why = compose("left-of-many", count=len(read.rig), most=CAMERAS_MOST)
+    others = [name for name in read.rig.names if name not in kept]
+    sentence = compose("cameras-left-out", cameras=some_of(others), why=why, file=file)
+    remarks = (*read.remarks, compose("view-left-out", remark=sentence))
+    return CamerasRead(rig, remarks, {**read.left_out, **dict.fromkeys(others, why)})
 
 
 def rig_file_parts(path: Path) -> tuple[Path, ...]:
     """Returns all files that ``read_rig_file`` reads for ``path``; most formats have one."""
-    if path.suffix in (".bin", ".txt"):
-        return path, path.with_stem("images")
-    if path.suffix == ".xmp":
-        return tuple(sorted(path.parent.glob("*.xmp")))
-    return (path, path.with_name("extri.yml")) if path.name == "intri.yml" else (path,)
+    suffix = path.suffix.lower()
+    if suffix in (".bin", ".txt"):
+        return path, entry(path.parent, f"images{suffix}")
+    if suffix == ".xmp":
+        return tuple(other for other in sorted(path.parent.iterdir()) if other.suffix.lower() == ".xmp")
+    return (path, entry(path.parent, "extri.yml")) if path.name.lower() == "intri.yml" else (path,)
 
 
 def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
@@ -165,28 +200,10 @@ def write_rig_file(rig: Rig, path: Path, kind: str) -> None:
     InputError for another kind."""
     if kind not in WRITERS:
         raise InputError("format", [compose("none-of", value=f"{kind!r}", known=FORMATS)])
+    skewed = [camera.name for camera in rig if camera.recorded is not None and camera.recorded.skew]
+    if skewed and kind != "eigenhead":
+        raise InputError(kind, [compose("format-without-skew", cameras=some_of(skewed))])
     WRITERS[kind](rig, path)
-
-
-def _head(path: Path) -> bytes:
-    """Returns the first bytes of a file, by which its format is recognised; no bytes if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(HEAD_BYTES).removeprefix(b"\xef\xbb\xbf")
-    except OSError:
-        return b""
-
-
-def unread_keys(path: Path) -> tuple[Message, ...]:
-    """Returns a message for every key of ``cameras.json`` that is not read. Returns nothing for other programs' files,
-    and for a file that cannot be parsed, which its reader refuses."""
-    if path.suffix != ".json" or path.name == "transforms.json":
-        return ()
-    try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError):
-        return ()
-    return unread_keys_of(document, path.name)
 
 
 def unread_keys_of(document: Any, subject: str = "cameras.json") -> tuple[Message, ...]:
@@ -206,19 +223,11 @@ def _unread(document: Any) -> Iterator[tuple[str, str]]:
     """Yields the place and name of each key that is not read."""
     if not isinstance(document, Mapping) or document.get("format") != FORMAT:
         return
-    yield from _beside(document, "")
-    cameras = document.get("cameras")
+    cameras, tables = document.get("cameras"), list[tuple[str, Any]]([("", document)])
     for camera in cameras if isinstance(cameras, list) else []:
-        if isinstance(camera, Mapping):
-            yield from _beside(camera, "cameras")
-            yield from _beside(camera.get("intrinsics"), "cameras.intrinsics")
-            yield from _beside(camera.get("camera_from_world"), "cameras.camera_from_world")
-            lens = camera.get("distortion")
-            if isinstance(lens, Mapping):
-                known = LENS_MODELS.get(str(lens.get("model", "brown-conrady")), set(lens))  # others are refused
-                yield from (("cameras.distortion", key) for key in lens if key not in known)
-
-
-def _beside(entry: Any, place: str) -> Iterator[tuple[str, str]]:
-    if isinstance(entry, Mapping):
-        yield from ((place, key) for key in entry if key not in READ[place])
+        inner = ("intrinsics", "camera_from_world", "distortion") if isinstance(camera, Mapping) else ()
+        tables += [("cameras", camera), *((f"cameras.{key}", camera.get(key)) for key in inner)]
+    for place, table in tables:
+        if isinstance(table, Mapping):
+            lens = LENS_MODELS.get(str(table.get("model", "brown-conrady")), set(table))  # others are refused
+            yield from ((place, key) for key in table if key not in READ.get(place, lens))

@@ -9,6 +9,7 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera, Distortion, Intrinsics
 from rig.errors import InputError
+from rig.formats.pictures.picture_names import safe_name
 from rig.geometry import RigidTransform, nearest_rotation
 from rig.messages.fault_groups import say_once
 from rig.messages.message import Message, compose
@@ -16,7 +17,8 @@ from rig.recorded_lens import COEFFICIENTS, LensModel, RecordedLens
 from rig.rig import Rig
 
 FORMAT = "eigenhead-cameras/1"
-CAMERAS_LEAST, CAMERAS_MOST = 3, 64
+CAMERAS_LEAST, CAMERAS_MOST = 3, 64  # that take part; of more, those that stand well apart are taken
+CAMERAS_READ_MOST = 1024  # in a file: six times the largest person scanner's
 SERIAL_MOST = 64
 UNITS_MM = {"m": 1000, "meter": 1000, "metre": 1000, "meters": 1000, "metres": 1000, "cm": 10, "in": 25.4, "inch": 25.4}
 PIXELS_MOST = 20_000  # a side; larger is a damaged or hostile file, not a camera
@@ -44,22 +46,27 @@ class CameraDocument(TypedDict):
 
 
 class CamerasDocument(TypedDict):
-    """Holds the content of ``cameras.json``."""
+    """Holds the content of ``cameras.json``. ``scale_sigma`` is as in ``Rig``."""
 
     format: str
     unit: str
     cameras: list[CameraDocument]
+    scale_sigma: NotRequired[float]
 
 
 def read_rig(path: Path) -> Rig:
     """Returns the rig in ``cameras.json``. Raises InputError naming every fault in it."""
+    return rig_from_document(read_document(path), path.name)
+
+
+def read_document(path: Path) -> Any:
+    """Returns a decoded JSON file. Raises InputError."""
     try:
-        document = json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
+        return json.loads(path.read_bytes())  # UTF-8, 16 or 32, which json recognises by the first bytes
     except OSError as error:
         raise InputError(path.name, [compose("no-file-read", reason=error.strerror or str(error))]) from error
     except (ValueError, RecursionError) as error:
         raise InputError(path.name, [compose("no-json", reason=str(error))]) from error
-    return rig_from_document(document, path.name)
 
 
 def write_rig(rig: Rig, path: Path) -> None:
@@ -69,7 +76,14 @@ def write_rig(rig: Rig, path: Path) -> None:
 
 def document_from_rig(rig: Rig) -> CamerasDocument:
     """Returns the content of ``cameras.json`` for a rig."""
-    return {"format": FORMAT, "unit": "mm", "cameras": [_camera_document(camera) for camera in rig]}
+    document: CamerasDocument = {
+        "format": FORMAT,
+        "unit": "mm",
+        "cameras": [_camera_document(camera) for camera in rig],
+    }
+    if rig.scale_sigma:
+        document["scale_sigma"] = rig.scale_sigma
+    return document
 
 
 def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
@@ -82,18 +96,22 @@ def rig_from_document(document: Any, subject: str = "cameras.json") -> Rig:
     if document.get("unit", "mm") != "mm":
         faults.append(_unit_fault(document["unit"]))
     entries = document["cameras"]
-    if not CAMERAS_LEAST <= len(entries) <= CAMERAS_MOST:
-        faults.append(compose("cameras-few-or-many", count=len(entries), least=CAMERAS_LEAST, most=CAMERAS_MOST))
-    places = [f"cameras[{i}]" for i in range(len(entries[:CAMERAS_MOST]))]
+    if not CAMERAS_LEAST <= len(entries) <= CAMERAS_READ_MOST:
+        most = CAMERAS_MOST if len(entries) < CAMERAS_LEAST else CAMERAS_READ_MOST
+        faults.append(compose("cameras-few-or-many", count=len(entries), least=CAMERAS_LEAST, most=most))
+    places = [f"cameras[{i}]" for i in range(len(entries[:CAMERAS_READ_MOST]))]
     cameras = [_read_camera(entry, place, faults) for entry, place in zip(entries, places, strict=False)]
     found = [camera for camera in cameras if camera is not None]
     names = [camera.name for camera in found]
     faults += _repeated(names) + _shared_serials(found)
+    scale_sigma = document.get("scale_sigma", 0.0)
+    if not is_number(scale_sigma) or not 0.0 <= scale_sigma < 1.0:
+        faults.append(compose("no-share", key="scale_sigma", value=f"{scale_sigma!r:.80}"))
     if faults:
-        read = [entry for entry in entries[:CAMERAS_MOST] if isinstance(entry, dict)]
+        read = [entry for entry in entries[:CAMERAS_READ_MOST] if isinstance(entry, dict)]
         written = [entry["name"] for entry in read if isinstance(entry.get("name"), str)]
         raise InputError(subject, say_once(faults, [*filter(None, written), *places]))
-    return Rig(tuple(found))
+    return Rig(tuple(found), float(scale_sigma))
 
 
 def _unit_fault(unit: Any) -> Message:
@@ -158,7 +176,8 @@ def _lens_document(camera: Camera) -> dict[str, str | float]:
     d, lens = camera.intrinsics.distortion, camera.recorded
     if lens is None:
         return {"model": "brown-conrady", "k1": d.k1, "k2": d.k2, "p1": d.p1, "p2": d.p2, "k3": d.k3}
-    return {"model": lens.model, **dict(zip(COEFFICIENTS[lens.model], lens.coefficients, strict=True))}
+    values: dict[str, str | float] = dict(zip(COEFFICIENTS[lens.model], lens.coefficients, strict=True))
+    return {"model": lens.model, **values} | ({"skew": lens.skew} if lens.skew else {})
 
 
 def _read_lens(lens: Any, where: str, faults: list[Message]) -> tuple[Distortion, RecordedLens | None]:
@@ -170,8 +189,10 @@ def _read_lens(lens: Any, where: str, faults: list[Message]) -> tuple[Distortion
         models = [f"{model!r}" for model in ("brown-conrady", *COEFFICIENTS)]
         faults.append(compose("value-none-of", key=f"{where}.model", value=f"{model!r:.80}", known=models))
     keys = COEFFICIENTS[known] if known else ("k1", "k2", "p1", "p2", "k3")
-    values = _read_numbers(lens, keys, where, faults, default=0.0)
-    return (Distortion(), RecordedLens(known, tuple(values))) if known else (Distortion(*values), None)
+    *values, skew = _read_numbers(lens, (*keys, "skew"), where, faults, default=0.0)
+    if known is None and skew:  # Brown and Conrady's lens is the rational one without quotient
+        known, values = "rational", [*values, 0.0, 0.0, 0.0]
+    return (Distortion(), RecordedLens(known, tuple(values), skew)) if known else (Distortion(*values), None)
 
 
 def _read_camera(entry: Any, where: str, faults: list[Message]) -> Camera | None:
@@ -179,11 +200,11 @@ def _read_camera(entry: Any, where: str, faults: list[Message]) -> Camera | None
     if not isinstance(entry, dict):
         faults.append(compose("no-object", key=where))
         return None
-    fault = name_fault(entry.get("name"))
-    if fault:
+    name = safe_name(entry["name"]) if isinstance(entry.get("name"), str) else ""
+    if fault := name_fault(name or entry.get("name")):
         faults.append(compose("of-key", key=f"{where}.name", fault=fault))
     else:
-        where = entry["name"]
+        where = name
     width, height = (_read_size(entry.get(key), f"{where}.{key}", faults) for key in ("width", "height"))
     fx, fy, cx, cy = _read_numbers(entry.get("intrinsics"), ("fx", "fy", "cx", "cy"), f"{where}.intrinsics", faults)
     distortion, recorded = _read_lens(entry.get("distortion", {}), f"{where}.distortion", faults)
@@ -208,7 +229,7 @@ def _read_camera(entry: Any, where: str, faults: list[Message]) -> Camera | None
         return None
     intrinsics = Intrinsics(width, height, fx, fy, cx, cy, distortion)
     pose = RigidTransform(nearest_rotation(rotation), translation)
-    return Camera(entry["name"], intrinsics, pose, covariance, recorded, serial)
+    return Camera(name, intrinsics, pose, covariance, recorded, serial)
 
 
 def _rotation_faults(rotation: np.ndarray, where: str) -> list[Message]:
@@ -227,12 +248,13 @@ def _is_covariance(matrix: np.ndarray) -> bool:
     return bool(np.abs(correlation - correlation.T).max() < 1e-6 and np.linalg.eigvalsh(correlation).min() > -1e-6)
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Tells whether a decoded value is a finite number of a size that occurs, and no truth value."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12  # NaN fails too
 
 
 def _read_size(value: Any, where: str, faults: list[Message]) -> int:
-    if not _is_number(value) or value != int(value) or not 16 <= value <= PIXELS_MOST:
+    if not is_number(value) or value != int(value) or not 16 <= value <= PIXELS_MOST:
         faults.append(compose("no-pixel-count", key=where, value=f"{value!r:.80}", most=PIXELS_MOST))
         return 0
     return int(value)
@@ -246,9 +268,9 @@ def _read_numbers(
         return [0.0] * len(keys)
     values = [entry.get(key, default) for key in keys]
     for key, value in zip(keys, values, strict=True):
-        if not _is_number(value):
+        if not is_number(value):
             faults.append(compose("no-finite-number", key=f"{where}.{key}", value=f"{value!r:.80}"))
-    return [float(value) if _is_number(value) else 0.0 for value in values]  # type: ignore[arg-type]
+    return [float(value) if is_number(value) else 0.0 for value in values]  # type: ignore[arg-type]
 
 
 def _read_array(value: Any, shape: tuple[int, ...], where: str, faults: list[Message]) -> np.ndarray | None:
@@ -261,7 +283,7 @@ def _read_array(value: Any, shape: tuple[int, ...], where: str, faults: list[Mes
         code = "rotation-vector" if vector else "no-numbers-of-shape"
         faults.append(compose(code, key=where, shape=" x ".join(map(str, shape))))
         return None
-    if not all(_is_number(entry) for entry in array.flat):
+    if not all(is_number(entry) for entry in array.flat):
         faults.append(compose("holds-no-finite-number", key=where))
         return None
     return array.astype(float)

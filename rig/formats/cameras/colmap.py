@@ -9,16 +9,17 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
-from rig.formats.cameras.cameras_json import CAMERAS_MOST
-from rig.formats.cameras.foreign import Malformed, camera_names, lens_entry, parsed
+from rig.formats.cameras.cameras_json import CAMERAS_READ_MOST
+from rig.formats.cameras.foreign import Malformed, camera_entry, camera_names, lens_entry, parsed
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
-from rig.geometry import vector_from_rotation
+from rig.formats.pictures.picture_names import entry
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -38,23 +39,19 @@ COLMAP_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
 }
 # Models that have no counterpart here, by their number.
 REFUSED_MODELS = {
-    7: "FOV",
-    10: "THIN_PRISM_FISHEYE",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-    12: "SIMPLE_DIVISION",
-    13: "DIVISION",
-    16: "EUCM",
-    17: "EQUIRECTANGULAR",
+    **{7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION"},
+    **{16: "EUCM", 17: "EQUIRECTANGULAR"},
 }
 
 
 COLMAP_NAMES = {number: name for name, (number, _) in COLMAP_MODELS.items()}
 
 
-def read_colmap(folder: Path, suffix: str = ".bin") -> CamerasRead:
-    """Returns the rig in a COLMAP model: each image becomes a camera of this project, named after the image file.
-    Raises InputError naming every fault."""
-    files = [folder / f"{kind}{suffix}" for kind in ("cameras", "images")]
+def read_colmap(path: Path) -> CamerasRead:
+    """Returns the rig in the COLMAP model of a ``cameras`` file: each image becomes a camera of this project, named
+    after the image file. Raises InputError naming every fault."""
+    folder, suffix = path.parent, path.suffix.lower()
+    files = [entry(folder, f"{kind}{suffix}") for kind in ("cameras", "images")]
     subject = "/".join([folder.name, f"cameras{suffix}"]) if folder.name else f"cameras{suffix}"
     binary = suffix == ".bin"
     cameras = parsed(files[0], _binary_cameras if binary else _text_cameras)
@@ -74,11 +71,22 @@ def read_colmap(folder: Path, suffix: str = ".bin") -> CamerasRead:
 
 
 def write_colmap(rig: Rig, folder: Path, *, binary: bool = False, suffix: str = ".png") -> None:
-    """Writes ``cameras``, ``images`` and an empty ``points3D``; images are called ``<camera><suffix>``."""
-    end = ".bin" if binary else ".txt"
-    encode = _binary_model if binary else _text_model
-    for kind, data in zip(("cameras", "images", "points3D"), encode(rig, suffix), strict=True):
-        write_atomically(folder / f"{kind}{end}", data)
+    """Writes ``cameras``, ``images``, ``rigs``, ``frames`` and an empty ``points3D``; images are called
+    ``<camera><suffix>``."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    for number, camera in enumerate(rig, start=1):
+        (kind, parameters), k, pose = _colmap_model(camera), camera.intrinsics, camera.camera_from_world
+        lens = pycolmap.Camera(camera_id=number, model=kind, width=k.width, height=k.height, params=parameters)
+        image = pycolmap.Image(name=f"{camera.name}{suffix}", camera_id=number, image_id=number)
+        model.add_camera_with_trivial_rig(lens)
+        posed = pycolmap.Rigid3d(np.column_stack([pose.rotation, pose.translation]))
+        model.add_image_with_trivial_frame(image, posed)
+    with TemporaryDirectory() as scratch:
+        model.write_binary(scratch) if binary else model.write_text(scratch)
+        for path in Path(scratch).iterdir():
+            write_atomically(folder / path.name, path.read_bytes())
 
 
 class _Records:
@@ -203,15 +211,9 @@ def _is_of_points(line: str) -> bool:
     10."""
     words = line.split()
     try:
-        return len(words) % 3 == 0 and all(
-            np.isfinite([float(x), float(y), int(i)]).all() for x, y, i in _triples(words)
-        )
+        return len(words) % 3 == 0 and bool(np.isfinite([float(word) for word in words]).all())
     except ValueError:
         return False
-
-
-def _triples(words: list[str]) -> Iterator[tuple[str, str, str]]:
-    return zip(words[0::3], words[1::3], words[2::3], strict=True)
 
 
 def _text_lines(data: bytes) -> Iterator[str]:
@@ -219,8 +221,8 @@ def _text_lines(data: bytes) -> Iterator[str]:
 
 
 def _limited(count: int) -> int:
-    if count > CAMERAS_MOST:
-        raise Malformed(compose("images-many", images=str(count), most=CAMERAS_MOST))
+    if count > CAMERAS_READ_MOST:
+        raise Malformed(compose("images-many", images=str(count), most=CAMERAS_READ_MOST))
     return count
 
 
@@ -229,33 +231,18 @@ def _model_fault(model: str | Message, number: Any) -> Message:
 
 
 def _colmap_entry(name: str, image: ColmapImage, camera: ColmapCamera, faults: list[Message]) -> dict[str, object]:
+    from scipy.spatial.transform import Rotation
+
     parameters = dict(zip(COLMAP_MODELS[camera.model][1], camera.values, strict=True))
     focal = parameters.get("f", 0.0)
-    w, x, y, z = _unit_quaternion(image.pose[:4])
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return {
-        "name": name,
-        "width": camera.width,
-        "height": camera.height,
-        "intrinsics": {
-            "fx": parameters.get("fx", focal),
-            "fy": parameters.get("fy", focal),
-            "cx": parameters["cx"] - 0.5,
-            "cy": parameters["cy"] - 0.5,
-        },
-        "distortion": lens_entry(parameters, name, faults, fisheye="FISHEYE" in camera.model),
-        "camera_from_world": {"rotation": rotation, "translation": list(image.pose[4:])},
-    }
-
-
-def _unit_quaternion(values: list[float]) -> tuple[float, ...]:
-    length = math.hypot(*values)
+    fx, fy = parameters.get("fx", focal), parameters.get("fy", focal)
+    lens = lens_entry(parameters, name, faults, fisheye="FISHEYE" in camera.model)
     # A length far from 1 is no rotation; NaN is named by the document's own check.
-    return tuple(value / length for value in values) if 0.9 < length < 1.1 else (math.nan,) * 4
+    is_unit = 0.9 < math.hypot(*image.pose[:4]) < 1.1
+    rotation = Rotation.from_quat(np.roll(image.pose[:4], -1)).as_matrix() if is_unit else np.full((3, 3), math.nan)
+    intrinsics = fx, fy, parameters["cx"] - 0.5, parameters["cy"] - 0.5
+    size = camera.width, camera.height
+    return camera_entry(name, size, intrinsics, lens, rotation, np.array(image.pose[4:]))
 
 
 def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
@@ -265,35 +252,3 @@ def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
     if lens is None:
         return "FULL_OPENCV", [*frame, *k.distortion.opencv().tolist(), 0.0, 0.0, 0.0]
     return "OPENCV_FISHEYE" if lens.model == "kannala-brandt" else "FULL_OPENCV", [*frame, *lens.coefficients]
-
-
-def _colmap_pose(camera: Camera) -> list[float]:
-    vector = vector_from_rotation(camera.camera_from_world.rotation)
-    angle = float(np.linalg.norm(vector))
-    imaginary = vector * (math.sin(angle / 2) / angle if angle > 1e-12 else 0.5)
-    return [math.cos(angle / 2), *imaginary.tolist(), *camera.camera_from_world.translation.tolist()]
-
-
-def _text_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
-    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
-    for number, camera in enumerate(rig, start=1):
-        k = camera.intrinsics
-        model, parameters = _colmap_model(camera)
-        cameras.append(f"{number} {model} {k.width} {k.height} {' '.join(map(repr, parameters))}")
-        images += [f"{number} {' '.join(map(repr, _colmap_pose(camera)))} {number} {camera.name}{suffix}", ""]
-    points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
-    return "\n".join([*cameras, ""]).encode(), "\n".join([*images, ""]).encode(), points.encode()
-
-
-def _binary_model(rig: Rig, suffix: str) -> tuple[bytes, bytes, bytes]:
-    count = struct.pack("<Q", len(rig))
-    cameras, images = [count], [count]
-    for number, camera in enumerate(rig, start=1):
-        k = camera.intrinsics
-        model, parameters = _colmap_model(camera)
-        head = struct.pack("<iiQQ", number, COLMAP_MODELS[model][0], k.width, k.height)
-        cameras.append(head + struct.pack(f"<{len(parameters)}d", *parameters))
-        images.append(struct.pack("<i7di", number, *_colmap_pose(camera), number))
-        images.append(f"{camera.name}{suffix}".encode() + b"\0" + struct.pack("<Q", 0))
-    return b"".join(cameras), b"".join(images), struct.pack("<Q", 0)

@@ -1,6 +1,8 @@
 """Holds what all readers of other programs' files share: errors for damaged files, cameras' names, conversion of
 lenses."""
 
+import codecs
+import csv
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -9,19 +11,30 @@ from typing import Any, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
+from jaxtyping import Float
 
 from rig.errors import InputError
-from rig.formats.cameras.cameras_json import name_fault
-from rig.formats.pictures.picture_names import IMAGE_SUFFIXES, picture_stem
+from rig.formats.pictures.picture_names import IMAGE_SUFFIXES, entry, picture_stem, safe_name
+from rig.geometry import rotation_from_vector
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS, LensModel
 
 T = TypeVar("T")
-MATRIX_PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 LENS_LOSS_PX = 0.02  # allowed error of a converted lens: a tenth of a calibration's error
+UTF16_DECLARED = re.compile(rb"(?i)^(\s*<\?xml[^>]*?)encoding=[\"']utf-(?:16|32)[^\"']*[\"']")
+SKEW_LEAST = 1e-6  # in focal lengths; far below a visible error, above the rounding of files
 LENS_KEY = re.compile(r"[kpst]\d")  # coefficients of OpenCV's lenses, among other parameters of a camera
-METRES_MOST = 30.0  # files with all cameras within 30 units are in metres: no rig is 30 mm wide
+METRES_MOST = 30.0  # files with all cameras within 30 units of each other are in metres: no rig is 30 mm wide
 BYTES_MOST = 1 << 29  # far above the few megabytes of a rig's sparse model, whose 2D points may be many
+
+
+MARKS = (  # longest first, since one begins with another
+    (codecs.BOM_UTF32_LE, "utf-32-le"),
+    (codecs.BOM_UTF32_BE, "utf-32-be"),
+    (codecs.BOM_UTF8, "utf-8"),
+    (codecs.BOM_UTF16_LE, "utf-16-le"),
+    (codecs.BOM_UTF16_BE, "utf-16-be"),
+)
 
 
 class Malformed(ValueError):
@@ -38,16 +51,24 @@ def parsed(path: Path, parse: Callable[[bytes], T]) -> T:
     try:
         if path.stat().st_size > BYTES_MOST:
             raise InputError(path.name, [compose("file-large", most_mib=BYTES_MOST >> 20)])
-        return parse(path.read_bytes())
+        return parse(as_utf8(path.read_bytes()))
     except FileNotFoundError as error:
         raise InputError(path.name, [compose("file-absent")]) from error
     except OSError as error:
         raise InputError(path.name, [compose("no-file-read", reason=str(error.strerror or error))]) from error
     except struct.error as error:
         raise InputError(path.name, [compose("record-cut-off")]) from error
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError, csv.Error) as error:
         reason = error.message if isinstance(error, Malformed) else str(error)[:400]
         raise InputError(path.name, [compose("file-not-understood", reason=reason)]) from error
+
+
+def as_utf8(data: bytes) -> bytes:
+    """Returns the bytes of a text without the mark of its encoding, in UTF-8 if the mark says UTF-16 or UTF-32."""
+    for mark, encoding in MARKS:
+        if data.startswith(mark):
+            return data.removeprefix(mark).decode(encoding).encode()
+    return data
 
 
 def camera_names(files: list[str]) -> list[str]:
@@ -64,11 +85,43 @@ def camera_names(files: list[str]) -> list[str]:
     return stems
 
 
+def camera_entry(
+    name: str,
+    size: Sequence[float | None],
+    intrinsics: Sequence[float],
+    lens: Mapping[str, str | float],
+    rotation: Float[np.ndarray, "3 3"],
+    translation: Float[np.ndarray, " 3"],
+) -> dict[str, object]:
+    """Returns a camera's entry of ``eigenhead-cameras/1``: width and height, fx fy cx cy, ``lens_entry``'s lens, and
+    rotation and translation (mm) of camera_from_world."""
+    return {
+        "name": name,
+        "width": size[0],
+        "height": size[1],
+        "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), map(float, intrinsics), strict=True)),
+        "distortion": lens,
+        "camera_from_world": {"rotation": rotation.tolist(), "translation": translation.tolist()},
+    }
+
+
+def matrix_intrinsics(matrix: Float[np.ndarray, "3 3"]) -> list[float]:
+    """Returns fx, fy, cx and cy of a camera matrix."""
+    return matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+
+
+def pose_rotation(value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Returns the matrix of a rotation vector, and any other array as it is."""
+    if value.size != 3:
+        return value
+    return rotation_from_vector(value.ravel()) if np.isfinite(value).all() else np.full((3, 3), np.nan)
+
+
 def lens_entry(
-    parameters: Mapping[str, float], where: str, faults: list[Message], *, fisheye: bool = False
+    parameters: Mapping[str, float], where: str, faults: list[Message], *, fisheye: bool = False, skew: float = 0.0
 ) -> dict[str, str | float]:
     """Returns the ``distortion`` entry of ``eigenhead-cameras/1`` for coefficients under OpenCV's names; missing ones
-    are 0.
+    are 0. ``skew`` is entry (0, 1) of the camera matrix in focal lengths fx.
 
     All foreign lenses get their model here. A coefficient other than 0 that the model does not have is a fault."""
     model: LensModel | None = "kannala-brandt" if fisheye else None
@@ -79,7 +132,8 @@ def lens_entry(
     if lost:
         kind = compose("a-fisheye" if fisheye else "this-lens")
         faults.append(compose("lens-coefficients-lost", camera=where, count=len(lost), lost=lost, lens=kind, held=keys))
-    return {"model": model or "brown-conrady", **{key: parameters.get(key, 0.0) for key in keys}}
+    found = {"model": model or "brown-conrady", **{key: parameters.get(key, 0.0) for key in keys}}
+    return found | {"skew": skew} if np.isfinite(skew) and abs(skew) > SKEW_LEAST else found
 
 
 def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: list[Message]) -> np.ndarray:
@@ -96,13 +150,42 @@ def number_array(value: Any, shape: tuple[int, ...] | None, where: str, faults: 
     return array
 
 
+def word_numbers(text: str | None, count: int, where: str, faults: list[Message]) -> Float[np.ndarray, " n"]:
+    """Returns the numbers in a text, as ``number_array`` does."""
+    try:
+        values = np.array([float(word) for word in (text or "").split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count:
+        faults.append(compose("no-numbers", key=where, count=count))
+        return np.full(count, np.nan)
+    return values
+
+
+def pose_matrix(value: Any, where: str, faults: list[Message]) -> Float[np.ndarray, "3 4"]:
+    """Converts the 4 x 4 numbers of a pose, or their first three rows, as ``number_array`` does."""
+    rows = 3 if isinstance(value, list) and len(value) == 3 else 4
+    return number_array(value, (rows, 4), where, faults)[:3]
+
+
+def matrix_skew(matrix: Float[np.ndarray, "3 3"]) -> float:
+    """Returns entry (0, 1) of a camera matrix in focal lengths fx."""
+    return float(matrix[0, 1] / matrix[0, 0]) if matrix.shape == (3, 3) and matrix[0, 0] else 0.0
+
+
+def millimetres_of(centres: Sequence[Float[np.ndarray, " 3"]]) -> float:
+    """Returns how many millimetres the unit of the cameras' places has: of metres 1000, else 1."""
+    known = [centre for centre in centres if np.isfinite(centre).all()]
+    return 1000.0 if known and np.ptp(known, axis=0).max() < METRES_MOST else 1.0
+
+
 def xml_root(data: bytes) -> ElementTree.Element:
     """Returns the root of an XML file. Raises Malformed for a file with declarations, because entities can expand to
     any size."""
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
         raise Malformed(compose("xml-declares"))
     try:
-        return ElementTree.fromstring(data)
+        return ElementTree.fromstring(UTF16_DECLARED.sub(rb"\1", data))  # a text in UTF-16 came as UTF-8
     except ElementTree.ParseError as error:
         raise Malformed(compose("no-xml", reason=str(error))) from None
 
@@ -114,10 +197,11 @@ def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
     If there is no picture, a fault is appended that says where to put it, and a placeholder size is returned."""
     from rig.formats.pictures.images import picture_size  # decoders, which most formats do without
 
-    for place in (folder, folder / "images", folder.parent / "images"):
-        here = sorted(place.glob(f"{name}.*")) if name_fault(name) is None else []
-        inside = sorted(place.glob(f"{name}/*")) if name_fault(name) is None else []  # a camera's own folder
-        for path in [*(path for path in here if picture_stem(path.name) == name), *inside]:
+    for place in (folder, entry(folder, "images"), entry(folder.parent, "images")):
+        here = sorted(place.iterdir()) if place.is_dir() else []
+        known = {safe_name(name), name}
+        inside = [path for inner in here if inner.is_dir() and inner.name in known for path in sorted(inner.iterdir())]
+        for path in [*(path for path in here if picture_stem(path.name) in known), *inside]:
             if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
                 try:
                     return picture_size(path)

@@ -96,7 +96,7 @@ METASHAPE: Table = {
     **_keys("refused", compose("key-other-type"), "calibration@type"),
     **_keys("read", "the focal length, and what fx has more", "calibration/f", "calibration/b1"),
     **_keys("read", "the principal point, off the middle of the picture", "calibration/cx", "calibration/cy"),
-    **_keys("read", "refused where it skews the picture by 0.02 px", "calibration/b2"),
+    **_keys("read", "the skew, taken out of the pictures", "calibration/b2"),
     **_keys(
         "read", "the lens", "calibration/k1", "calibration/k2", "calibration/k3", "calibration/p1", "calibration/p2"
     ),
@@ -185,7 +185,7 @@ TRANSFORMS: Table = {
     **_keys(
         "read", "the name: a picture's ending is taken off, and the folder is the name where names repeat", "file_path"
     ),
-    **_keys("read", "world_from_camera, axes as OpenGL's", "transform_matrix"),
+    **_keys("read", "world_from_camera, axes as OpenGL's, 4 x 4 or 3 x 4", "transform_matrix"),
     **_keys("refused", compose("key-moving"), "transform_matrix_start"),
     **_keys("refused", compose("key-moving"), "transform_matrix_end"),
     **_keys("refused", compose("key-rolling-shutter"), "rolling_shutter", silent=(0,)),
@@ -217,7 +217,7 @@ CALISCOPE: Table = {
     **_keys("read", "`true`: `distortions` are Kannala-Brandt's", "fisheye"),
     **_keys("refused", compose("key-turned"), "rotation_count", silent=(0,)),
     **_keys("read", "the size in pixels", "size"),
-    **_keys("read", "the camera matrix; with skew it is refused", "matrix"),
+    **_keys("read", "the camera matrix; skew is taken out", "matrix"),
     **_keys("read", "OpenCV's, at most 8 (of a fisheye 4); more are refused unless 0", "distortions"),
     **_keys("read", "camera_from_world, a matrix or a vector; without pose the camera takes no part", "rotation"),
     **_keys("read", "camera_from_world, in metres", "translation"),
@@ -234,7 +234,7 @@ ANIPOSELIB: Table = {
 
 OPENCV_YAML: Table = {
     **_keys("read", "the cameras that take part; others in the file do not, and a warning says so", "names"),
-    **_keys("read", "the camera matrix; with skew it is refused", "K_<name>"),
+    **_keys("read", "the camera matrix; skew is taken out", "K_<name>"),
     **_keys("read", "OpenCV's, at most 8; more are refused unless 0. Without it there is none", "dist_<name>"),
     **_keys("read", "camera_from_world: a rotation vector or matrix; refused where the two disagree", "R_<name>"),
     **_keys("read", "camera_from_world: a matrix", "Rot_<name>"),

@@ -18,10 +18,12 @@ from rig.errors import InputError
 from rig.formats.cameras.foreign import (
     LENS_LOSS_PX,
     brown_conrady,
+    camera_entry,
     camera_names,
     corner_radius,
     lens_entry,
     parsed,
+    word_numbers,
     xml_root,
 )
 from rig.formats.cameras.foreign_keys import METASHAPE
@@ -131,10 +133,13 @@ def _read_camera(
     if world.find("transform") is None:
         world = chunk
     _judge(sensor, "sensor", name, reading, tags=("calibration",))
-    matrix = _numbers(camera.find("transform"), 16, f"{name}.transform", reading.faults)
-    entry = _entry(name, sensor, matrix, _similarity(world, reading.faults))
-    _add_lens(entry, sensor, name, reading)
-    return entry
+    matrix = _numbers(camera.find("transform"), 16, f"{name}.transform", reading.faults).reshape(4, 4)
+    turn, shift, scale = _similarity(world, reading.faults)
+    rotation = (turn @ matrix[:3, :3]).T
+    translation = -rotation @ (scale * (turn @ matrix[:3, 3]) + shift)
+    size = sensor.find("resolution")
+    size = _size(sensor.find("calibration/resolution") if size is None else size)
+    return camera_entry(name, size, *_lens(sensor, size, name, reading), rotation, translation)
 
 
 def write_metashape(rig: Rig, path: Path) -> None:
@@ -161,24 +166,6 @@ def write_metashape(rig: Rig, path: Path) -> None:
     write_atomically(path, ElementTree.tostring(document, encoding="UTF-8", xml_declaration=True))
 
 
-def _entry(name: str, sensor: ElementTree.Element, matrix: np.ndarray, world: Similarity) -> dict[str, object]:
-    rotation, translation, scale = world
-    axes, centre = matrix.reshape(4, 4)[:3, :3], matrix.reshape(4, 4)[:3, 3]
-    from_world = (rotation @ axes).T
-    size = sensor.find("resolution")
-    if size is None:
-        size = sensor.find("calibration/resolution")
-    return {
-        "name": name,
-        "width": _whole(size, "width"),
-        "height": _whole(size, "height"),
-        "camera_from_world": {
-            "rotation": from_world.tolist(),
-            "translation": (-from_world @ (scale * (rotation @ centre) + translation)).tolist(),
-        },
-    }
-
-
 def _similarity(node: ElementTree.Element, faults: list[Message]) -> Similarity:
     """Returns the transform from the chunk to the world (mm). Without one the chunk's free scale is taken as
     millimetres."""
@@ -191,7 +178,10 @@ def _similarity(node: ElementTree.Element, faults: list[Message]) -> Similarity:
     return rotation, 1000.0 * translation, 1000.0 * float(scale)
 
 
-def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, reading: Reading) -> None:
+def _lens(
+    sensor: ElementTree.Element, size: tuple[int | None, int | None], name: str, reading: Reading
+) -> tuple[tuple[float, ...], dict[str, str | float]]:
+    """Returns fx, fy, cx and cy, and the lens's entry."""
     faults = reading.faults
     calibrations = sensor.findall("calibration")
     found = next((node for node in calibrations if node.get("class") == "adjusted"), None)
@@ -209,35 +199,27 @@ def _add_lens(entry: dict[str, object], sensor: ElementTree.Element, name: str, 
         del attributes["type"]
     below = {f"/{node.tag}": node.text for node in found}
     reading.judge(METASHAPE, {f"@{key}": value for key, value in attributes.items()} | below, name, place="calibration")
-    size = found.find("resolution")
-    if size is not None and (_whole(size, "width"), _whole(size, "height")) != (entry["width"], entry["height"]):
-        of_lens = f"{shown(size.get('width'), 20)} x {shown(size.get('height'), 20)}".replace("'", "")
-        faults.append(compose("lens-of-other-size", camera=name, size=of_lens))
-    width, height = (entry[key] if isinstance(entry[key], int) else 0 for key in ("width", "height"))
-    assert isinstance(width, int)
-    assert isinstance(height, int)
-    _name_lost(values, (width, height), name, faults, fisheye=TYPES.get(kind, False))
+    of_lens = found.find("resolution")
+    if of_lens is not None and _size(of_lens) != size:
+        other = f"{shown(of_lens.get('width'), 20)} x {shown(of_lens.get('height'), 20)}".replace("'", "")
+        faults.append(compose("lens-of-other-size", camera=name, size=other))
+    width, height = (side or 0 for side in size)
+    _drop_invisible(values, (width, height), fisheye=TYPES.get(kind, False))
     centre = values["cx"] + 0.5 * width, values["cy"] + 0.5 * height
     focal = values["f"] + values["b1"], values["f"]
-    entry["intrinsics"] = {"fx": focal[0], "fy": focal[1], "cx": centre[0] - 0.5, "cy": centre[1] - 0.5}
+    intrinsics = *focal, centre[0] - 0.5, centre[1] - 0.5
+    skew = values["b2"] / focal[0] if focal[0] else 0.0
     if TYPES.get(kind, False):
         held = {key: values[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
-        entry["distortion"] = lens_entry(held, name, faults, fisheye=True)
-        return
+        return intrinsics, lens_entry(held, name, faults, fisheye=True, skew=skew)
     radial = [values[key] for key in ("k1", "k2", "k3", "k4")]
     k1, k2, k3 = brown_conrady(radial, corner_radius((width, height), focal, centre), values["f"], name, faults)
     held = {"k1": k1, "k2": k2, "k3": k3, "p1": values["p2"], "p2": values["p1"]}
-    entry["distortion"] = lens_entry(held, name, faults)
+    return intrinsics, lens_entry(held, name, faults, skew=skew)
 
 
-def _name_lost(
-    values: dict[str, float], size: tuple[int, int], name: str, faults: list[Message], *, fisheye: bool
-) -> None:
-    """Appends a fault if the skew ``b2`` moves a border of the picture visibly, and drops a fisheye's ``p1`` and ``p2``
-    if they move a corner by less than ``LENS_LOSS_PX``."""
-    skewed_px = abs(values["b2"]) * size[1] / 2 / values["f"] if values["f"] > 0 else 0.0
-    if skewed_px > LENS_LOSS_PX:
-        faults.append(compose("picture-skewed", key=f"{name}.b2", skewed_px=skewed_px))
+def _drop_invisible(values: dict[str, float], size: tuple[int, int], *, fisheye: bool) -> None:
+    """Drops a fisheye's ``p1`` and ``p2`` if they move a corner by less than ``LENS_LOSS_PX``."""
     if fisheye and values["f"] > 0:
         reach = np.hypot(*size) / 2 / values["f"]  # of the corner, in radians
         if 3 * max(abs(values["p1"]), abs(values["p2"])) * reach**2 * values["f"] <= LENS_LOSS_PX:
@@ -262,17 +244,11 @@ def _write_sensor(sensors: ElementTree.Element, number: int, camera: Camera) -> 
 
 
 def _numbers(node: ElementTree.Element | None, count: int, where: str, faults: list[Message]) -> np.ndarray:
-    words = (node.text or "").split() if node is not None else []
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        values = np.zeros(0)
-    if len(values) != count:
-        faults.append(compose("no-numbers", key=where, count=count))
-        return np.full(count, np.nan)
-    return values
+    return word_numbers(None if node is None else node.text, count, where, faults)
 
 
-def _whole(node: ElementTree.Element | None, key: str) -> int | None:
-    text = node.get(key) if node is not None else None
-    return int(text) if text is not None and text.isdecimal() and len(text) < 7 else None
+def _size(node: ElementTree.Element | None) -> tuple[int | None, int | None]:
+    """Returns width and height; None where they are no numbers of pixels."""
+    texts = ["" if node is None else node.get(key, "") for key in ("width", "height")]
+    whole = [int(text) if text.isdecimal() and len(text) < 7 else None for text in texts]
+    return whole[0], whole[1]

@@ -9,14 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras.foreign import MATRIX_PLACES, METRES_MOST, lens_entry, number_array, parsed
+from rig.formats.cameras.foreign import (
+    camera_entry,
+    lens_entry,
+    matrix_intrinsics,
+    matrix_skew,
+    millimetres_of,
+    number_array,
+    parsed,
+    pose_rotation,
+)
 from rig.formats.cameras.foreign_keys import ANIPOSELIB, CALISCOPE
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
-from rig.geometry import rotation_from_vector, vector_from_rotation
+from rig.geometry import vector_from_rotation
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
 from rig.rig import Rig
@@ -27,7 +37,7 @@ UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}  # millimetres in each
 def read_toml(path: Path) -> CamerasRead:
     """Returns the rig in caliscope's ``camera_array.toml`` or in an aniposelib calibration. Raises InputError naming
     every fault."""
-    document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
+    document = parsed(path, lambda data: tomllib.loads(data.decode()))
     tables, reading = document.get("cameras"), Reading(path.name)
     if isinstance(tables, dict):
         pairs, keys = [(f"cam_{key}", table) for key, table in tables.items()], CALISCOPE
@@ -44,7 +54,7 @@ def read_toml(path: Path) -> CamerasRead:
         camera = table["name"] if isinstance(table.get("name"), str) else name
         if "ignore" in keys and _switch(table, "ignore", camera, reading.faults):
             reading.leave_out(camera, compose("left-switched-off", key="ignore = true"))
-        elif keys is CALISCOPE and not {"rotation", "translation"} & table.keys():
+        elif not {"rotation", "translation"} & table.keys():
             reading.leave_out(camera, compose("left-without-pose"))
         else:
             reading.judge(keys, table, camera)
@@ -98,24 +108,16 @@ def _toml_entry(name: str, table: Mapping[str, Any], millimetres: float, faults:
     rotation = number_array(table.get("rotation"), None, f"{name}.rotation", faults)
     translation = number_array(table.get("translation"), (3,), f"{name}.translation", faults)
     lens = number_array(table.get("distortions", [0.0] * 4), None, f"{name}.distortions", faults)
-    if rotation.shape == (3,):
-        rotation = rotation_from_vector(rotation) if np.isfinite(rotation).all() else np.full((3, 3), np.nan)
     names = COEFFICIENTS["kannala-brandt" if fisheye else "rational"]
     if lens.ndim != 1 or not 1 <= len(lens) <= 14 or lens[len(names) :].any():
         list_key = f"{name}.distortions"
         faults.append(compose("coefficients-at-most", key=list_key, most=len(names), names=" ".join(names)))
-    if matrix.shape == (3, 3) and abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
-        faults.append(compose("matrix-skewed", key=f"{name}.matrix"))
+    coefficients = dict(zip(names, lens.ravel().tolist(), strict=False))
     size = table.get("size")
     width, height = size if isinstance(size, list) and len(size) == 2 else (None, None)
-    return {
-        "name": name,
-        "width": width,
-        "height": height,
-        "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
-        "distortion": lens_entry(dict(zip(names, lens.ravel().tolist(), strict=False)), name, faults, fisheye=fisheye),
-        "camera_from_world": {"rotation": rotation.tolist(), "translation": (millimetres * translation).tolist()},
-    }
+    found = lens_entry(coefficients, name, faults, fisheye=fisheye, skew=matrix_skew(matrix))
+    translation = millimetres * translation
+    return camera_entry(name, (width, height), matrix_intrinsics(matrix), found, pose_rotation(rotation), translation)
 
 
 def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]], reading: Reading) -> float:
@@ -131,23 +133,25 @@ def _aniposelib_unit(document: Mapping[str, object], pairs: list[tuple[str, Any]
         return UNITS[unit]
     if unit is not None:
         reading.faults.append(compose("value-not-read", key="metadata.unit", value=shown(unit), known=[*UNITS]))
-    lengths = [
-        np.abs(number_array(table.get("translation"), (3,), "", [])).max()
-        for _, table in pairs
-        if isinstance(table, dict)
-    ]
-    # |t| is the distance to the world's origin, which lies at a camera or at the board and so within the rig.
-    return 1000.0 if lengths and max(lengths) < METRES_MOST else 1.0
+    return millimetres_of([_centre(table) for _, table in pairs if isinstance(table, dict)])
+
+
+def _centre(table: Mapping[str, Any]) -> Float[np.ndarray, " 3"]:
+    """Returns the place of a camera; NaN where its pose is none."""
+    translation = number_array(table.get("translation"), (3,), "", [])
+    rotation = pose_rotation(number_array(table.get("rotation"), None, "", []))
+    return -rotation.T @ translation if rotation.shape == (3, 3) else np.full(3, np.nan)
 
 
 def looks_like_aniposelib(path: Path) -> bool:
     """Tells whether a TOML file consists of aniposelib's camera tables."""
     try:
-        document = parsed(path, lambda data: tomllib.loads(data.decode("utf-8-sig")))
+        document = parsed(path, lambda data: tomllib.loads(data.decode()))
     except InputError:
         return False
     tables = [table for key, table in document.items() if key != "metadata" and isinstance(table, dict)]
-    return bool(tables) and all({"matrix", "rotation", "translation"} <= table.keys() for table in tables)
+    posed = [table for table in tables if {"rotation", "translation"} <= table.keys()]
+    return bool(posed) and all("matrix" in table for table in tables)
 
 
 def _toml_intrinsics(camera: Camera) -> dict[str, list]:

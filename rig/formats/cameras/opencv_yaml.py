@@ -3,7 +3,7 @@
 
 ``names``, ``K_<name>`` and ``dist_<name>`` are in ``intri.yml``; ``Rot_<name>`` (or ``R_<name>``, a rotation vector)
 and ``T_<name>`` are in ``extri.yml`` and give camera_from_world. All may also be in one file of another name. Lengths
-are metres if all cameras lie within 30 units of the origin, otherwise millimetres. ``W_<name>`` and ``H_<name>`` are
+are metres if all cameras lie within 30 units of each other, otherwise millimetres. ``W_<name>`` and ``H_<name>`` are
 the size; without them it is read from the pictures."""
 
 import re
@@ -16,10 +16,21 @@ from jaxtyping import Float
 
 from rig.atomic_write import write_atomically
 from rig.errors import InputError
-from rig.formats.cameras.foreign import MATRIX_PLACES, METRES_MOST, Malformed, lens_entry, number_array, parsed, sized
+from rig.formats.cameras.foreign import (
+    Malformed,
+    camera_entry,
+    lens_entry,
+    matrix_intrinsics,
+    matrix_skew,
+    millimetres_of,
+    number_array,
+    parsed,
+    pose_rotation,
+    sized,
+)
 from rig.formats.cameras.foreign_keys import OPENCV_YAML
 from rig.formats.cameras.reading import CamerasRead, Reading
-from rig.geometry import rotation_from_vector
+from rig.formats.pictures.picture_names import entry
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.recorded_lens import COEFFICIENTS
@@ -35,57 +46,42 @@ POSE_KEY = re.compile(r"(R|Rot|T)_")
 def read_yaml(path: Path) -> CamerasRead:
     """Returns the rig in ``intri.yml`` and the ``extri.yml`` beside it, or in ``path`` alone. Raises InputError naming
     every fault."""
-    parts = [path.with_name(name) for name in FILES] if path.name in FILES else [path, path]
+    parts = [entry(path.parent, name) for name in FILES] if path.name.lower() in FILES else [path, path]
     lenses, poses = (parsed(part, _matrices) for part in parts)
     held = [key.removeprefix("K_") for key in lenses if key.startswith("K_")]
     if not held:
         raise InputError(path.name, [compose("yaml-without-camera")])
     reading = Reading(path.name)
     faults = reading.faults
-    names = _taking_part(held, [*lenses["names"]] if isinstance(lenses.get("names"), list) else None, reading)
+    listed = _taking_part(held, [*lenses["names"]] if isinstance(lenses.get("names"), list) else None, reading)
+    for name in listed:
+        if not {f"R_{name}", f"Rot_{name}", f"T_{name}"} & poses.keys():
+            reading.leave_out(name, compose("left-without-pose"))
+    names = [name for name in listed if name not in reading.left_out]
     _judge(lenses | poses, held, reading)
     lacking = [key for key in poses if (m := POSE_KEY.match(key)) and key[m.end() :] not in held]
     if lacking:
         faults.append(compose("yaml-pose-alone", keys=some_of(lacking)))
-    entries: list[dict[str, Any]] = []
+    read: list[tuple[Any, ...]] = []
     for name in names:
         matrix = number_array(lenses[f"K_{name}"], (3, 3), f"K_{name}", faults)
         lens = number_array(lenses.get(f"dist_{name}", np.zeros(5)), None, f"dist_{name}", faults).ravel()
         keys = COEFFICIENTS["rational"]
         if lens[len(keys) :].any():
             faults.append(compose("coefficients-many", key=f"dist_{name}", most=len(keys), names=" ".join(keys)))
-        if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
-            faults.append(compose("matrix-skewed", key=f"K_{name}"))
-        turned, rodrigues = poses.get(f"Rot_{name}"), _array(poses, f"R_{name}")
-        if turned is None:
-            turned = rotation_from_vector(rodrigues.ravel()) if rodrigues.size == 3 else rodrigues
+        turned = poses.get(f"Rot_{name}", pose_rotation(_array(poses, f"R_{name}")))
         rotation = number_array(turned, (3, 3), f"Rot_{name}", faults)
         _check_alike(poses, name, faults)
         translation = number_array(_array(poses, f"T_{name}").ravel(), (3,), f"T_{name}", faults)
-        size: tuple[float, float]
         if f"W_{name}" in lenses and f"H_{name}" in lenses:
-            width, height = (
-                number_array(_array(lenses, key).ravel(), (1,), key, faults) for key in (f"W_{name}", f"H_{name}")
-            )
-            size = float(width[0]), float(height[0])
+            sides = [number_array(_array(lenses, f"{s}_{name}").ravel(), (1,), f"{s}_{name}", faults) for s in "WH"]
+            size = float(sides[0][0]), float(sides[1][0])
         else:
             size = sized(path.parent, name, faults)
-        entries.append(
-            {
-                "name": name,
-                "width": size[0],
-                "height": size[1],
-                "intrinsics": {key: float(matrix[at]) for key, at in MATRIX_PLACES.items()},
-                "distortion": lens_entry(dict(zip(keys, lens.tolist(), strict=False)), name, faults),
-                "camera_from_world": {"rotation": rotation.tolist(), "translation": translation},
-            }
-        )
-    reach = max((float(np.abs(entry["camera_from_world"]["translation"]).max()) for entry in entries), default=0.0)
-    millimetres = 1000.0 if reach < METRES_MOST else 1.0
-    for entry in entries:
-        pose = entry["camera_from_world"]
-        pose["translation"] = (millimetres * pose["translation"]).tolist()
-    return reading.finish(entries)
+        held_lens = lens_entry(dict(zip(keys, lens.tolist(), strict=False)), name, faults, skew=matrix_skew(matrix))
+        read.append((name, size, matrix_intrinsics(matrix), held_lens, rotation, translation))
+    millimetres = millimetres_of([-rotation.T @ translation for *_, rotation, translation in read])
+    return reading.finish([camera_entry(n, s, k, lens, r, millimetres * t) for n, s, k, lens, r, t in read])
 
 
 def _taking_part(held: list[str], listed: list[str] | None, reading: Reading) -> list[str]:
@@ -117,8 +113,7 @@ def _check_alike(poses: Mapping[str, Any], name: str, faults: list[Message]) -> 
     vector, matrix = _array(poses, f"R_{name}"), _array(poses, f"Rot_{name}")
     if vector.size not in (3, 9) or matrix.shape != (3, 3):
         return
-    other = rotation_from_vector(vector.ravel()) if vector.size == 3 else vector.reshape(3, 3)
-    if not np.abs(other - matrix).max() < 1e-3:
+    if not np.abs(pose_rotation(vector).reshape(3, 3) - matrix).max() < 1e-3:
         faults.append(compose("rotations-differ", one=f"R_{name}", other=f"Rot_{name}"))
 
 
@@ -167,7 +162,7 @@ def _matrices(data: bytes) -> dict[str, Any]:
     import cv2
 
     try:
-        file = cv2.FileStorage(data.decode("utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        file = cv2.FileStorage(data.decode(), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = file.root()
         found: dict[str, Any] = {}
         for key in root.keys():  # noqa: SIM118 a FileNode is no mapping

@@ -10,6 +10,7 @@ k4; t1 and t2 are OpenCV's p1 and p2."""
 
 import csv
 import io
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,10 +20,20 @@ from jaxtyping import Float
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras.foreign import brown_conrady, camera_names, corner_radius, lens_entry, parsed, sized, xml_root
+from rig.formats.cameras.foreign import (
+    brown_conrady,
+    camera_entry,
+    camera_names,
+    corner_radius,
+    lens_entry,
+    parsed,
+    sized,
+    word_numbers,
+    xml_root,
+)
 from rig.formats.cameras.foreign_keys import REALITYCAPTURE, REALITYCAPTURE_CSV
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
-from rig.formats.pictures.picture_names import picture_stem
+from rig.formats.pictures.picture_names import is_junk, picture_stem
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
@@ -49,13 +60,14 @@ _XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/">
 """
 
 
-def read_xmp(folder: Path) -> CamerasRead:
-    """Returns the rig in a folder of XMP files, one camera each. Cameras that are not aligned or not used for meshing
-    take no part. Raises InputError naming every fault."""
+def read_xmp(file: Path) -> CamerasRead:
+    """Returns the rig in an XMP file and those beside it, one camera each. Cameras that are not aligned or not used for
+    meshing take no part. Raises InputError naming every fault."""
+    folder = file.parent
     reading = Reading(f"{folder.name}/*.xmp")
     entries = []
     components = set()
-    for path in sorted(path for path in folder.glob("*.xmp") if not path.name.startswith(".")):
+    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() == ".xmp" and not is_junk(path.name)):
         try:
             values = _xmp_values(path)
         except InputError as error:
@@ -94,7 +106,7 @@ def write_xmp(rig: Rig, folder: Path) -> None:
 
 def read_csv(path: Path) -> CamerasRead:
     """Returns the rig in a CSV of internal and external camera parameters. Raises InputError naming every fault."""
-    rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(_with_commas(data.decode("utf-8-sig"))))))
+    rows = parsed(path, lambda data: list(csv.DictReader(io.StringIO(_with_commas(data.decode())))))
     if not rows or not set(COLUMNS[:8]) <= rows[0].keys():
         raise InputError(path.name, [compose("no-camera-csv", columns=",".join(COLUMNS))])
     reading = Reading(path.name)
@@ -102,30 +114,20 @@ def read_csv(path: Path) -> CamerasRead:
     entries = []
     for name, row in zip(camera_names([str(row["#name"]) for row in rows]), rows, strict=True):
         reading.judge(REALITYCAPTURE_CSV, {str(key): value for key, value in row.items() if key}, name)
-        values = {key: _number(row.get(key, "0"), f"{name}.{key}", faults) for key in COLUMNS[1:]}
+        values = {key: word_numbers(row.get(key, "0"), 1, f"{name}.{key}", faults)[0] for key in COLUMNS[1:]}
         size = sized(path.parent, name, faults)
         side = max(size)
         focal = values["f"] / FILM_MM * side
         offset = values["px"] / FILM_MM * side, values["py"] / FILM_MM * side
         position = np.array([values["x"], values["y"], values["alt"]])
-        entries.append(
-            _entry(
-                name,
-                size,
-                (focal, focal),
-                offset,
-                values,
-                DOWN @ _attitude(values).T,
-                position_m=position,
-                faults=faults,
-            )
-        )
+        rotation = DOWN @ _attitude(values).T
+        entries.append(_entry(name, size, (focal, focal), offset, values, rotation, position_m=position, faults=faults))
     return reading.finish(entries)
 
 
-def looks_like_csv(head: bytes) -> bool:
+def looks_like_csv(head: str) -> bool:
     """Tells whether a file that begins so is the CSV, as RealityCapture wrote it or as a spreadsheet saved it."""
-    return _with_commas(head.decode("utf-8", "replace")).startswith(",".join(COLUMNS[:8]))
+    return _with_commas(head).startswith(",".join(COLUMNS[:8]))
 
 
 def _with_commas(text: str) -> str:
@@ -138,15 +140,15 @@ def write_csv(rig: Rig, path: Path) -> None:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS)
+    from scipy.spatial.transform import Rotation
+
     for camera in _held(rig, "realitycapture-csv"):
         k, d, side = camera.intrinsics, camera.intrinsics.distortion, _side(camera)
         if abs(k.fx / k.fy - 1) * side > 0.02:
             raise InputError("realitycapture-csv", [compose("focal-lengths-differ", camera=camera.name)])
-        world_from_camera = camera.camera_from_world.rotation.T @ DOWN
-        pitch = np.arcsin(np.clip(world_from_camera[2, 1], -1.0, 1.0))
-        heading = np.arctan2(world_from_camera[0, 1], world_from_camera[1, 1])
-        roll = np.arctan2(-world_from_camera[2, 0], world_from_camera[2, 2])
-        angles = np.degrees([heading, pitch, roll]).tolist()
+        turned = Rotation.from_matrix(camera.camera_from_world.rotation.T @ DOWN)
+        with warnings.catch_warnings(action="ignore"):  # of a level camera, whose heading and roll are one angle
+            angles = (turned.as_euler("ZXY", degrees=True) * (-1.0, 1.0, 1.0)).tolist()
         offset = np.array([k.cx + 0.5 - 0.5 * k.width, k.cy + 0.5 - 0.5 * k.height]) / side * FILM_MM
         lens = [d.k1, d.k2, d.k3, 0.0, d.p1, d.p2]
         position = (camera.centre_world / 1000.0).tolist()
@@ -158,11 +160,10 @@ def write_csv(rig: Rig, path: Path) -> None:
 def _attitude(values: Mapping[str, float]) -> Float[np.ndarray, "3 3"]:
     """Returns ``world_from_camera`` in the CSV's axes: heading about z, clockwise, then pitch about x, then roll about
     y."""
-    heading, pitch, roll = np.radians([-values["heading"], values["pitch"], values["roll"]])
-    z = np.array([[np.cos(heading), -np.sin(heading), 0], [np.sin(heading), np.cos(heading), 0], [0, 0, 1]])
-    x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
-    y = np.array([[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]])
-    return z @ x @ y
+    from scipy.spatial.transform import Rotation
+
+    angles = [-values["heading"], values["pitch"], values["roll"]]
+    return Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
 
 
 def _xmp_values(path: Path) -> dict[str, str]:
@@ -175,11 +176,8 @@ def _xmp_values(path: Path) -> dict[str, str]:
 
 
 def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[Message]) -> dict[str, object]:
-    def numbers(key: str, count: int, default: str = "") -> list[float]:
-        found = [_number(word, f"{name}.{key}", faults) for word in values.get(key, default).split()]
-        if len(found) != count:
-            faults.append(compose("no-numbers", key=f"{name}.{key}", count=count))
-        return found if len(found) == count else [np.nan] * count
+    def numbers(key: str, count: int, default: str = "") -> np.ndarray:
+        return word_numbers(values.get(key, default), count, f"{name}.{key}", faults)
 
     model = values.get("DistortionModel", "perspective")
     bent = any(word.strip("0.-+") for word in values.get("DistortionCoeficients", "").split())
@@ -191,8 +189,8 @@ def _xmp_entry(folder: Path, name: str, values: Mapping[str, str], faults: list[
     aspect = numbers("AspectRatio", 1, "1")[0]
     offset = numbers("PrincipalPointU", 1, "0")[0] * side, numbers("PrincipalPointV", 1, "0")[0] * side
     lens = numbers("DistortionCoeficients", 6, "0 0 0 0 0 0")
-    rotation, position = np.array(numbers("Rotation", 9)).reshape(3, 3), np.array(numbers("Position", 3))
-    named: dict[str, float] = dict(zip(("k1", "k2", "k3", "k4", "t1", "t2"), lens, strict=True))
+    rotation, position = numbers("Rotation", 9).reshape(3, 3), numbers("Position", 3)
+    named: dict[str, float] = dict(zip(("k1", "k2", "k3", "k4", "t1", "t2"), lens.tolist(), strict=True))
     return _entry(name, size, (focal, focal * aspect), offset, named, rotation, position_m=position, faults=faults)
 
 
@@ -210,17 +208,9 @@ def _entry(
     centre = offset[0] + 0.5 * size[0], offset[1] + 0.5 * size[1]
     radial = [lens[key] for key in ("k1", "k2", "k3", "k4")]
     k1, k2, k3 = brown_conrady(radial, corner_radius(size, focal, centre), focal[1], name, faults)
-    return {
-        "name": name,
-        "width": size[0],
-        "height": size[1],
-        "intrinsics": {"fx": focal[0], "fy": focal[1], "cx": centre[0] - 0.5, "cy": centre[1] - 0.5},
-        "distortion": lens_entry({"k1": k1, "k2": k2, "k3": k3, "p1": lens["t1"], "p2": lens["t2"]}, name, faults),
-        "camera_from_world": {
-            "rotation": rotation.tolist(),
-            "translation": (-rotation @ (1000.0 * position_m)).tolist(),
-        },
-    }
+    held = lens_entry({"k1": k1, "k2": k2, "k3": k3, "p1": lens["t1"], "p2": lens["t2"]}, name, faults)
+    intrinsics = *focal, centre[0] - 0.5, centre[1] - 0.5
+    return camera_entry(name, size, intrinsics, held, rotation, -rotation @ (1000.0 * position_m))
 
 
 def _held(rig: Rig, kind: str) -> Rig:
@@ -236,11 +226,3 @@ def _side(camera: Camera) -> int:
 
 def _words(values: np.ndarray) -> str:
     return " ".join(map(repr, values.tolist()))
-
-
-def _number(word: str | None, where: str, faults: list[Message]) -> float:
-    try:
-        return float(word or "")
-    except ValueError:
-        faults.append(compose("no-number", key=where, value=shown(word)))
-        return np.nan

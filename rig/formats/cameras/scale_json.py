@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rig.errors import InputError
-from rig.formats.cameras.cameras_json import PIXELS_MOST
+from rig.formats.cameras.cameras_json import PIXELS_MOST, is_number
 from rig.messages.message import Message, compose
 from rig.text import printable
 
@@ -137,16 +137,11 @@ def _cameras(document: dict[str, Any], cameras: Collection[str], faults: list[Me
 
 def _length(document: dict[str, Any], key: str, faults: list[Message], where: str = "") -> float:
     value: Any = document.get(key)
-    if not _is_number(value) or not 0.1 <= value <= 1e5:
+    if not is_number(value) or not 0.1 <= value <= 1e5:
         faults.append(compose("no-length", key=f"{where}{key}", value=f"{value!r:.80}"))
         return 1.0
     return float(value)
 
 
 def _is_place(value: Any) -> bool:
-    return _is_number(value) and -1.0 < value < PIXELS_MOST  # a pixel's area reaches half of one beyond its centre
-
-
-def _is_number(value: Any) -> bool:
-    # NaN fails the comparison, and so does a whole number too large for a float
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9
+    return is_number(value) and -1.0 < value < PIXELS_MOST  # a pixel's area reaches half of one beyond its centre

@@ -16,7 +16,17 @@ import numpy as np
 from rig.atomic_write import write_atomically
 from rig.camera import Camera
 from rig.errors import InputError
-from rig.formats.cameras.foreign import METRES_MOST, camera_names, lens_entry, number_array, parsed, sized
+from rig.formats.cameras.cameras_json import is_number
+from rig.formats.cameras.foreign import (
+    camera_entry,
+    camera_names,
+    lens_entry,
+    matrix_intrinsics,
+    millimetres_of,
+    number_array,
+    pose_matrix,
+    sized,
+)
 from rig.formats.cameras.foreign_keys import TRANSFORMS
 from rig.formats.cameras.reading import CamerasRead, Reading, shown
 from rig.messages.message import Message, compose
@@ -28,19 +38,19 @@ LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PER_CAMERA = (*LENS, "k5", "k6", "rolling_shutter")  # keys at the top that hold for every camera
 
 
-def read_transforms(path: Path) -> CamerasRead:
-    """Returns the rig in a ``transforms.json``: each frame is a camera. Raises InputError naming every fault."""
-    document = parsed(path, json.loads)
+def read_transforms(document: Any, path: Path) -> CamerasRead:
+    """Returns the rig in a decoded ``transforms.json``: each frame is a camera. Raises InputError naming every
+    fault."""
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(path.name, [compose("no-frame-list")])
     reading = Reading(path.name)
     faults = reading.faults
     reading.judge(TRANSFORMS, {key: value for key, value in document.items() if key not in PER_CAMERA}, "")
-    names = camera_names([str(frame.get("file_path", f"frame{i:03}")) for i, frame in enumerate(frames)])
-    names, frames = _frames_of_one_moment(document, names, frames, reading)
+    listed = camera_names([str(frame.get("file_path", f"frame{i:03}")) for i, frame in enumerate(frames)])
+    names, frames = _frames_of_one_moment(document, listed, frames, reading)
     matrices = [
-        number_array(frame.get("transform_matrix"), (4, 4), f"{name}.transform_matrix", faults)
+        pose_matrix(frame.get("transform_matrix"), f"{name}.transform_matrix", faults)
         for name, frame in zip(names, frames, strict=True)
     ]
     for name, frame in zip(names, frames, strict=True):
@@ -51,8 +61,7 @@ def read_transforms(path: Path) -> CamerasRead:
     if applied <= 0:
         faults.append(compose("no-positive-number", key="applied_scale", value=f"{applied:g}"))
     scale = 1.0 / applied if applied > 0 else 1.0
-    reach = scale * max((np.abs(matrix[:3, 3]).max() for matrix in matrices), default=0.0)
-    millimetres = scale * (1000.0 if reach < METRES_MOST else 1.0)
+    millimetres = scale * millimetres_of([scale * matrix[:3, 3] for matrix in matrices])
     entries = [
         _entry(path.parent, name, document | frame, matrix, millimetres, faults)
         for name, frame, matrix in zip(names, frames, matrices, strict=True)
@@ -64,7 +73,12 @@ def _frames_of_one_moment(
     document: dict[str, Any], names: list[str], frames: list[dict[str, Any]], reading: Reading
 ) -> tuple[list[str], list[dict[str, Any]]]:
     """Returns the cameras and frames of one moment, and leaves the others out: of the first one that the file lists as
-    ``timestep_indices``, or the first one there is. Frames without a number belong to every moment."""
+    ``timestep_indices``, or the first one there is. Frames without a number belong to every moment, and a frame
+    without a pose to none."""
+    posed = [k for k, frame in enumerate(frames) if frame.get("transform_matrix") is not None]
+    for name in (name for k, name in enumerate(names) if k not in posed):
+        reading.leave_out(name, compose("left-without-pose"))
+    names, frames = [names[k] for k in posed], [frames[k] for k in posed]
     numbers = [frame.get("timestep_index") for frame in frames]
     moments = sorted({number for number in numbers if isinstance(number, int)})
     listed = document.get("timestep_indices")
@@ -77,6 +91,39 @@ def _frames_of_one_moment(
     return [names[k] for k in kept], [frames[k] for k in kept]
 
 
+def read_splatting(document: Any, path: Path) -> CamerasRead:
+    """Returns the rig in Gaussian splatting's ``cameras.json``: world_from_camera with OpenCV's axes, of pinholes with
+    the principal point in the middle. Its scale is free. Raises InputError naming every fault."""
+    reading = Reading(path.name)
+    faults, entries, names = reading.faults, [], camera_names([str(camera["img_name"]) for camera in document])
+    centres = [number_array(camera["position"], (3,), "position", faults) for camera in document]
+    millimetres = millimetres_of(centres)
+    for name, camera, centre in zip(names, document, centres, strict=True):
+        rotation = number_array(camera["rotation"], (3, 3), f"{name}.rotation", faults)
+        width, height, fx = (_number(camera.get(key), f"{name}.{key}", faults) for key in ("width", "height", "fx"))
+        fy = _number(camera.get("fy", fx), f"{name}.fy", faults)
+        intrinsics = fx, fy, 0.5 * width - 0.5, 0.5 * height - 0.5
+        translation = -rotation.T @ centre * millimetres
+        entries.append(camera_entry(name, (width, height), intrinsics, {}, rotation.T, translation))
+    return reading.finish(entries)
+
+
+def read_nersemble(document: Any, path: Path) -> CamerasRead:
+    """Returns the rig in NeRSemble's ``camera_params.json``: camera_from_world in metres, OpenCV's axes, one camera
+    matrix of all. The size is read from the pictures. Raises InputError naming every fault."""
+    reading = Reading(path.name)
+    faults, poses = reading.faults, document["world_2_cam"]
+    if not isinstance(poses, dict):
+        raise InputError(path.name, [compose("no-object", key="world_2_cam")])
+    intrinsics = matrix_intrinsics(number_array(document.get("intrinsics"), (3, 3), "intrinsics", faults))
+    entries = []
+    for name, value in poses.items():
+        pose = pose_matrix(value, f"world_2_cam.{name}", faults)
+        size = sized(path.parent, name, faults)
+        entries.append(camera_entry(name, size, intrinsics, {}, pose[:, :3], 1000.0 * pose[:, 3]))
+    return reading.finish(entries)
+
+
 def write_transforms(rig: Rig, path: Path) -> None:
     """Writes a ``transforms.json`` in metres, pictures called ``images/<camera>.png``."""
     frames = [frame_document(camera, f"images/{camera.name}.png") for camera in rig]
@@ -85,10 +132,15 @@ def write_transforms(rig: Rig, path: Path) -> None:
 
 def frame_document(camera: Camera, file_path: str) -> dict[str, object]:
     """Returns the frame of one camera, in metres. Raises InputError for a lens that the format does not hold."""
+    return {"file_path": file_path, **_lens(camera), "transform_matrix": opengl_pose(camera)}
+
+
+def opengl_pose(camera: Camera) -> list[list[float]]:
+    """Returns world_from_camera as 4 x 4 numbers, in metres, with OpenGL's axes of the camera."""
     matrix = np.eye(4)
     pose = camera.camera_from_world.inverse()
     matrix[:3, :3], matrix[:3, 3] = pose.rotation @ OPENGL, pose.translation / 1000.0
-    return {"file_path": file_path, **_lens(camera), "transform_matrix": matrix.tolist()}
+    return matrix.tolist()
 
 
 def _lens(camera: Camera) -> dict[str, object]:
@@ -119,17 +171,9 @@ def _entry(
         faults.append(compose("k4-of-no-fisheye", key=f"{name}.k4"))
         lens["k4"] = 0.0
     pose = (matrix[:3, :3] @ OPENGL).T
-    return {
-        "name": name,
-        "width": width,
-        "height": height,
-        "intrinsics": {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5},
-        "distortion": lens_entry(lens, name, faults, fisheye=fisheye),
-        "camera_from_world": {
-            "rotation": pose.tolist(),
-            "translation": (-pose @ (millimetres * matrix[:3, 3])).tolist(),
-        },
-    }
+    found = lens_entry(lens, name, faults, fisheye=fisheye)
+    translation = -pose @ (millimetres * matrix[:3, 3])
+    return camera_entry(name, (width, height), (fx, fy, cx - 0.5, cy - 0.5), found, pose, translation)
 
 
 def _is_fisheye(values: dict[str, Any], name: str, faults: list[Message]) -> bool:
@@ -179,8 +223,7 @@ def _focal(
 
 
 def _number(value: object, where: str, faults: list[Message]) -> float:
-    # NaN fails the comparison, and so does a whole number too large for a float
-    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12:
-        return value
+    if is_number(value):
+        return float(value)  # type: ignore[arg-type]
     faults.append(compose("no-finite-number", key=where, value=shown(value)))
     return math.nan

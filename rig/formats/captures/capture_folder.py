@@ -28,11 +28,12 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_file import no_rig_fault, read_cameras, rig_file_parts, rig_files
 from rig.formats.cameras.cameras_json import write_rig
 from rig.formats.cameras.reading import CamerasRead
+from rig.formats.cameras.unread_programs import program_of, unread_programs
 from rig.formats.captures.capture_masks import MaskSubjects, mask_subjects
 from rig.formats.captures.features_json import document_from_features, features_from_bytes
 from rig.formats.captures.shot_files import BESIDE_PICTURES, ShotFiles, find_files, listed_pictures, stray_sentence
 from rig.formats.pictures.images import cut_out_alpha, decode_image_file, page_count, picture_size, write_image
-from rig.formats.pictures.picture_names import is_junk
+from rig.formats.pictures.picture_names import entry, is_junk
 from rig.formats.pictures.picture_rims import fill_rims
 from rig.formats.pictures.picture_samples import WHOLE_BITS, measure_samples
 from rig.formats.pictures.work_size import work_features, work_rig, work_share
@@ -43,7 +44,8 @@ from rig.plausibility import rig_faults
 from rig.rig import Rig
 from rig.text import suggest
 
-SCALE = "scale.json"
+SCALE, FEATURES = "scale.json", "features.json"
+RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
 ENCLOSING_MOST = 8  # levels of single folders around a capture, as nested packing leaves them
 ALIKE_LEAST = 0.75  # likeness of two folders' names: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 SETS_ALIKE = 0.9  # to texture_sets: "texture_set" 0.96, "texture-sets" 0.92; "textures", other programs' folder, 0.8
@@ -55,33 +57,34 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     Pictures and feature points of a ``recorded`` lens are undistorted. Pictures of more than ``pixels_most`` pixels are
     reduced, and their cameras with them (``rig.formats.pictures.work_size``). Raises InputError naming every fault of
     the folder."""
-    faults: list[Message] = []
     folder = capture_root(folder)
-    rigs = [*rig_files(folder)]
-    if not rigs:
-        raise InputError(folder.name, [no_rig_fault(folder)])
-    rig_file = rigs[0]
-    read = read_rig_of(rig_file)
-    rig = read.rig
-    check_folders(folder, rig)
-    faults += [
-        compose("located", where=rig_file.name, fault=fault)
-        for fault in rig_faults(rig, any_unit=has_known_length(folder))
-    ]
-    files = find_files(folder, rig, read.left_out)
-    faults += files.faults
+    rigs, read, files, faults = open_capture(folder)
+    rig_file, rig = rigs[0], read.rig
     capture = read_shot(folder, rig, faults, files, pixels_most=pixels_most)
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
     digests = dict(capture.digests)
     for path in rig_file_parts(rig_file):
         digests[path.relative_to(folder).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
-    ordered = dict(sorted(digests.items()))
     if has_known_length(folder):
-        digests[SCALE] = hashlib.sha256((folder / SCALE).read_bytes()).hexdigest()
-        ordered = dict(sorted(digests.items()))
+        digests[SCALE] = hashlib.sha256(entry(folder, SCALE).read_bytes()).hexdigest()
+    ordered = dict(sorted(digests.items()))
     remarks = [*capture.remarks, *read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
     return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
+
+
+def open_capture(folder: Path) -> tuple[list[Path], CamerasRead, ShotFiles, list[Message]]:
+    """Returns the files of cameras in a capture's folder, of which the first is read, its cameras, the files of the
+    shot, and what is wrong with all of them. Raises InputError where no cameras can be read."""
+    rigs = [*rig_files(folder)]
+    if not rigs:
+        raise InputError("capture", [no_rig_fault(folder)])
+    read = read_rig_of(rigs[0])
+    check_folders(folder, read.rig)
+    judged = rig_faults(read.rig, any_unit=has_known_length(folder))
+    files = find_files(folder, read.rig, read.left_out)
+    faults = [compose("located", where=rigs[0].name, fault=fault) for fault in judged]
+    return rigs, read, files, [*faults, *files.faults]
 
 
 def read_rig_of(rig_file: Path) -> CamerasRead:
@@ -97,7 +100,7 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
     remarks = [stray_sentence(files.strays, rig)] if files.strays else []
     known = ("images", *BESIDE_PICTURES, TEXTURE_SETS, *rig.names)
     for path in sorted(folder.iterdir()):
-        is_other = path.is_dir() and path.name not in known and not is_junk(path.name)
+        is_other = path.is_dir() and not {path.name, path.name.lower()} & {*known} and not is_junk(path.name)
         used = any(file.is_relative_to(path) for name in rig.names for _, file in files.of_camera(name))
         if is_other and not used and listed_pictures(path) and not (path / "report.json").is_file():
             remarks.append(compose("folder-unread", folder=path.name))
@@ -105,10 +108,19 @@ def unread_pictures(folder: Path, files: ShotFiles, rig: Rig) -> list[Message]:
 
 
 def unread_files(folder: Path, rigs: Sequence[Path]) -> list[Message]:
-    """Returns remarks on the files of further rigs in the folder: only the first of ``rigs`` is read."""
-    read, *others = (path.relative_to(folder).as_posix() for path in rigs)
-    others += _other_models(folder, rigs[0])
-    remarks = [compose("cameras-unread", file=other, read=read) for other in others]
+    """Returns remarks on files of cameras in the folder that are not read: those of other programs, and further rigs,
+    since only the first of ``rigs`` is read. Beside photographs without a rig any file that may hold cameras counts."""
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and path not in rigs]
+    if rigs:
+        read, *others = (path.relative_to(folder).as_posix() for path in rigs)
+        others += [*_other_models(folder, rigs[0]), *(path.name for path in files if program_of(path))]
+        remarks = [compose("cameras-unread", file=other, read=read) for other in others]
+    else:
+        known = {SCALE, FEATURES, "calibration.json"}
+        strange = [path.name for path in files if path.suffix.lower() in RIG_SUFFIXES and program_of(path) is None]
+        strange = [name for name in strange if name.lower() not in known]
+        remarks = unread_programs(folder)
+        remarks += [compose("cameras-of-nobody", files=some_of(strange))] if strange else []
     return [compose("file-unread", remark=message) for message in remarks]
 
 
@@ -117,7 +129,7 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
     separately."""
     if rig_file.suffix not in (".bin", ".txt"):
         return []
-    twin = rig_file.with_suffix(".txt" if rig_file.suffix == ".bin" else ".bin")
+    twin = entry(rig_file.parent, "cameras.txt" if rig_file.suffix == ".bin" else "cameras.bin")
     sparse = sorted((folder / "sparse").glob("*/cameras.*")) if (folder / "sparse").is_dir() else []
     found = [twin] if twin.is_file() else []
     found += [path for path in sparse if path.suffix in (".bin", ".txt") and path.parent != rig_file.parent]
@@ -127,7 +139,7 @@ def _other_models(folder: Path, rig_file: Path) -> list[str]:
 def has_known_length(folder: Path) -> bool:
     """Tells whether scale.json fixes the unit of the cameras. It does not where it was used already when the cameras
     were calibrated from the photographs."""
-    return (folder / SCALE).is_file() and not (folder / "calibration.json").is_file()
+    return entry(folder, SCALE).is_file() and not (folder / "calibration.json").is_file()
 
 
 def capture_root(folder: Path) -> Path:
@@ -139,10 +151,10 @@ def capture_root(folder: Path) -> Path:
         raise InputError(str(folder.name or folder), [compose("no-capture-folder")])
     for _ in range(ENCLOSING_MOST):
         entries = [entry for entry in folder.iterdir() if not is_junk(entry.name)]
-        if len(entries) != 1 or not entries[0].is_dir() or entries[0].name == "sparse":
+        if len(entries) != 1 or not entries[0].is_dir() or entries[0].name.lower() == "sparse":
             break
         folder = entries[0]
-        if folder.name in ("images", *BESIDE_PICTURES):
+        if folder.name.lower() in ("images", *BESIDE_PICTURES):
             break
     return folder
 
@@ -153,14 +165,14 @@ def check_folders(folder: Path, rig: Rig) -> None:
     They would not be read, and the subject would be segmented without its clean plates, or every picture be missing."""
     kinds = ("images", *BESIDE_PICTURES)
     folders = [path.name for path in sorted(folder.iterdir()) if path.is_dir()]
-    others = {name.casefold(): name for name in folders if name not in (*kinds, *rig.names)}
+    others = {name.casefold(): name for name in folders if not {name, name.lower()} & {*kinds, *rig.names}}
     faults = []
     for kind in kinds:
         alike = suggest(kind, others, min_likeness=ALIKE_LEAST)
-        if alike and not (folder / kind).is_dir():
+        if alike and not entry(folder, kind).is_dir():
             faults.append(compose("folder-misnamed", folder=others[alike[0]], name=kind))
     alike = suggest(TEXTURE_SETS, others, min_likeness=SETS_ALIKE)
-    if alike and not (folder / TEXTURE_SETS).is_dir():
+    if alike and not entry(folder, TEXTURE_SETS).is_dir():
         faults.append(compose("folder-misnamed", folder=others[alike[0]], name=TEXTURE_SETS))
     if faults:
         raise InputError("capture", faults)
@@ -196,9 +208,9 @@ def read_shot(
         if kind.startswith(TEXTURE_SETS)
     }
     features: Features = {}
-    if with_features and (folder / "features.json").is_file():
-        data = (folder / "features.json").read_bytes()
-        digests["features.json"] = hashlib.sha256(data).hexdigest()
+    if with_features and entry(folder, FEATURES).is_file():
+        data = entry(folder, FEATURES).read_bytes()
+        digests[FEATURES] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
         features = work_features(features, rig, work_rig(rig, pixels_most))
     subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)

@@ -61,7 +61,7 @@ def with_serials(rig: Rig, pictures: Mapping[str, Path]) -> Rig:
     serials = {name: camera_serial(path) for name, path in pictures.items()}
     recorded = [serial for serial in serials.values() if serial is not None]
     unique = {name: serial for name, serial in serials.items() if serial is not None and recorded.count(serial) == 1}
-    return Rig(tuple(replace(camera, serial=unique.get(camera.name, camera.serial)) for camera in rig))
+    return replace(rig, cameras=tuple(replace(c, serial=unique.get(c.name, c.serial)) for c in rig))
 
 
 def pictures_by_serial(folder: Path, rig: Rig, faults: list[Message]) -> dict[str, Path]:

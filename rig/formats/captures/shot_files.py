@@ -13,13 +13,21 @@ from pathlib import Path
 from rig.capture import TEXTURE_SETS
 from rig.formats.captures.serials import pictures_by_serial
 from rig.formats.pictures.images import is_picture
-from rig.formats.pictures.picture_names import UNREAD_PICTURES, is_junk, match_names, picture_stem
+from rig.formats.pictures.picture_names import (
+    UNREAD_PICTURES,
+    entry,
+    has_raw_beside,
+    is_junk,
+    match_names,
+    picture_stem,
+)
 from rig.messages.fault_groups import some_of
 from rig.messages.message import Message, compose
 from rig.rig import Rig
 
 PLATES_MOST = 32  # clean plates read per camera
 BESIDE_PICTURES = ("masks", "background")  # folders of a capture that belong to no single camera
+ASIDE = (*BESIDE_PICTURES, TEXTURE_SETS)  # folders beside the pictures that are no camera's
 SETS_MOST = 8  # texture sets of a capture: every one is as large as its photographs
 SET_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 NAME_SHOWN = 60  # characters of a name that is too long
@@ -49,7 +57,7 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
     """Finds the files of one shot. Files of the cameras in ``left_out``, which take no part, are neither used nor
     strays."""
     names, faults = [*rig.names, *left_out], list[Message]()
-    places = {"images": picture_folder(folder), **{kind: folder / kind for kind in BESIDE_PICTURES}}
+    places = {"images": picture_folder(folder), **{kind: entry(folder, kind) for kind in BESIDE_PICTURES}}
     owned = {kind: _owned(place, names, kind, rig, faults) for kind, place in places.items()}
     images = {name: path for name in rig.names if (path := _one(owned["images"].get(name, []), folder, faults))}
     masks = {name: path for name in rig.names if (path := _one(owned["masks"].get(name, []), folder, faults))}
@@ -71,7 +79,7 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
 
 def _texture_sets(folder: Path, rig: Rig, names: Sequence[str], faults: list[Message]) -> dict[str, dict[str, Path]]:
     """Returns the pictures of each texture set by camera. Its name becomes that of a file, so it has small letters."""
-    place = folder / TEXTURE_SETS
+    place = entry(folder, TEXTURE_SETS)
     if not place.is_dir():
         return {}
     if alone := [path.relative_to(folder).as_posix() for path in sorted(place.iterdir()) if _shows_something(path)]:
@@ -108,14 +116,14 @@ def _texture_set(folder: Path, place: Path, rig: Rig, names: Sequence[str], faul
 
 def picture_folder(folder: Path) -> Path:
     """Returns the folder of a capture's photographs: images/ if it exists, otherwise the capture folder itself."""
-    return folder / "images" if (folder / "images").is_dir() else folder
+    return images if (images := entry(folder, "images")).is_dir() else folder
 
 
 def listed_pictures(folder: Path) -> list[Path]:
     """Returns the pictures in a folder, sorted; an empty list if the folder does not exist."""
     if not folder.is_dir():
         return []
-    return sorted(path for path in folder.iterdir() if is_picture(path))
+    return sorted(path for path in folder.iterdir() if is_picture(path) and not has_raw_beside(path))
 
 
 def stray_sentence(strays: Sequence[str], rig: Rig) -> Message:
@@ -129,8 +137,8 @@ def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[
         return {}
     inner = _unwrapped(place, names)
     pictures = listed_pictures(inner)
-    beside = () if kind != "images" or inner != place or place.name == "images" else (*BESIDE_PICTURES, TEXTURE_SETS)
-    folders = [path for path in _folders(inner) if path.name not in beside and listed_pictures(path)]
+    beside = () if kind != "images" or inner != place or place.name.lower() == "images" else ASIDE
+    folders = [path for path in _folders(inner) if path.name.lower() not in beside and listed_pictures(path)]
     found: dict[str, list[Path]] = {}
     for path in [*pictures, *folders]:
         camera = path.stem if path in pictures and path.stem in names else path.name
@@ -147,8 +155,8 @@ def _owned(place: Path, names: Sequence[str], kind: str, rig: Rig, faults: list[
 def _unwrapped(place: Path, names: Sequence[str]) -> Path:
     """Returns the single enclosing folder in a folder without pictures, unless it is a camera's own:
     ``images/shot01/cam00.png``."""
-    folders = [path for path in _folders(place) if path.name not in (*BESIDE_PICTURES, "images")]
-    alone = len(folders) == 1 and not listed_pictures(place) and place.name in ("images", *BESIDE_PICTURES)
+    folders = [path for path in _folders(place) if path.name.lower() not in (*BESIDE_PICTURES, "images")]
+    alone = len(folders) == 1 and not listed_pictures(place) and place.name.lower() in ("images", *BESIDE_PICTURES)
     alone = alone and not match_names([folders[0].name], names) and folders[0].name not in names
     return folders[0] if alone and len(listed_pictures(folders[0])) > 1 else place
 
@@ -181,13 +189,15 @@ def _strays(place: Path, used: set[Path], names: Sequence[str], kind: str) -> li
     """Returns pictures in a folder of the capture that belong to no camera, those of unreadable formats included."""
     if not place.is_dir():
         return []
-    is_root = kind == "images" and place.name != "images"
+    is_root = kind == "images" and place.name.lower() != "images"
     folders = [place, *(path for path in _folders(place) if not is_root or path.name in names)]
     here = [path for folder in folders for path in sorted(folder.iterdir()) if _shows_something(path)]
     return [path for path in here if path not in used and not (is_root and path.suffix.lower() in (".pdf", ".npy"))]
 
 
 def _shows_something(path: Path) -> bool:
+    if has_raw_beside(path):
+        return False
     return is_picture(path) or (path.suffix.lower() in UNREAD_PICTURES and not is_junk(path.name) and path.is_file())
 
 
@@ -205,7 +215,7 @@ def _missing(
 
     If no camera has a file of its name and other files are there, that is reported as one cause."""
     inside = "" if places["images"] == folder else "images/"
-    faults, alone, named = list[Message](), not any((folder / kind).is_dir() for kind in BESIDE_PICTURES), False
+    faults, alone, named = list[Message](), not any(entry(folder, kind).is_dir() for kind in BESIDE_PICTURES), False
     lacking = [name for name in rig.names if name not in images]
     if cause := _cause(rig, lacking, strays["images"], inside or compose("the-folder"), compose("a-picture")):
         faults.append(cause)

@@ -1,5 +1,12 @@
-"""Reads meshes of other programs: PLY, OBJ, GLB and, where it is asked for, STL, through trimesh."""
+"""Reads meshes of other programs: PLY, OBJ, GLB and, where it is asked for, STL, through trimesh.
 
+trimesh passes over glTF's normalised integers, sparse accessors and compressions without an error. A GLB with one of
+them is refused by its name (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, sections 3.6.2 and 3.12).
+"""
+
+import json
+import logging
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +20,11 @@ from rig.mesh import Mesh
 from rig.messages.message import compose
 
 MESH_ENDINGS = (".ply", ".obj", ".glb")
+UNDERSTOOD = ("KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_", "KHR_lights_")
+UNDECODED = {
+    **{"KHR_draco_mesh_compression": "Draco", "EXT_meshopt_compression": "meshopt"},
+    **{"normalized": "quantised numbers", "sparse": "sparse accessors"},
+}
 SURFACE_ENDINGS = (*MESH_ENDINGS, ".stl")  # STL has neither colours nor joined vertices
 
 
@@ -46,8 +58,11 @@ def read_textured_mesh(path: Path) -> TexturedMesh:
 def _loaded(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Any:
     import trimesh
 
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it would write to the user's terminal
     if path.suffix.lower() not in endings:
         raise InputError(path.name, [compose("no-mesh-ending" if endings == MESH_ENDINGS else "no-surface-ending")])
+    if path.suffix.lower() == ".glb":
+        _check_glb(path)
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh lets the parsers' own errors through, of any class
@@ -57,10 +72,40 @@ def _loaded(path: Path, endings: tuple[str, ...] = MESH_ENDINGS) -> Any:
     return loaded
 
 
+def _check_glb(path: Path) -> None:
+    """Raises InputError for a damaged GLB, and for what is stored in it in ways that trimesh does not decode."""
+    data = path.read_bytes()
+    try:
+        (length,) = struct.unpack_from("<I", data, 12)
+        document = json.loads(data[20 : 20 + length])
+        accessors, unread = document.get("accessors", []), set[str]()
+        unread |= {name for name in document.get("extensionsRequired", ()) if not name.startswith(UNDERSTOOD)}
+        for primitive in (each for mesh in document.get("meshes", ()) for each in mesh["primitives"]):
+            attributes = primitive["attributes"]
+            geometry = [attributes[key] for key in ("POSITION", "NORMAL", "TEXCOORD_0") if key in attributes]
+            for accessor in [
+                accessors[i] for i in (*geometry, *([primitive["indices"]] if "indices" in primitive else []))
+            ]:
+                unread |= {key for key in ("normalized", "sparse") if accessor.get(key)}
+                unread |= set() if "bufferView" in accessor else {*primitive.get("extensions", ())}
+    except (struct.error, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise InputError(path.name, [compose("mesh-unread", reason=f"no glTF 2.0, {type(error).__name__}")]) from error
+    if unread:
+        raise InputError(
+            path.name, [compose("glb-extensions-unread", extensions=[_called(name) for name in sorted(unread)])]
+        )
+
+
+def _called(what: str) -> str:
+    return f"{UNDECODED[what]} ({what})" if what in UNDECODED else what
+
+
 def _mesh(loaded: Any, path: Path) -> Mesh:
     vertices = np.asarray(loaded.vertices, dtype=float)
     if not np.isfinite(vertices).all():
         raise InputError(path.name, [compose("vertex-not-finite")])
+    if not np.ptp(vertices, axis=0).any() or not 0 <= np.min(loaded.faces) <= np.max(loaded.faces) < len(vertices):
+        raise InputError(path.name, [compose("mesh-without-extent", count=len(vertices))])
     coloured = loaded.visual is not None and loaded.visual.kind == "vertex"
     visual = getattr(loaded.visual, "vertex_colors", None) if coloured else None
     colours = None if visual is None else np.ascontiguousarray(np.asarray(visual)[:, :3].astype(np.uint8))

@@ -1,4 +1,4 @@
-"""Writes USDZ of a textured mesh, through OpenUSD (the extra ``usd``)."""
+"""Writes USDZ of parts, through OpenUSD (the extra ``usd``)."""
 
 import importlib
 import tempfile
@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from rig.colour_space import linear_from_srgb
 from rig.errors import EigenheadError, how_to_install
 from rig.formats.meshes.glb import ROUGHNESS
-from rig.mesh import Mesh
+from rig.formats.meshes.scene import Part, Scene, Skin, quaternion
 from rig.messages.message import compose
 
+ROOT = "/person"
+SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}  # what USDZ may hold
 ALIGNED = 64  # files of the package begin at multiples of so many bytes (https://openusd.org/release/spec_usdz.html)
 HEADER = 30  # bytes of a zip entry's header before its name
 PADDING = 4  # bytes of the header of a zip entry's padding field
@@ -36,31 +39,15 @@ def check_usd() -> None:
         raise NoUsd from None
 
 
-def usdz_bytes(
-    mesh: Mesh,
-    *,
-    normals: Float[np.ndarray, "v 3"],
-    uv: Float[np.ndarray, "n 2"],
-    faces_uv: Int[np.ndarray, "f 3"],
-    image: bytes,
-    suffix: str,
-) -> bytes:
-    """Returns one mesh, y up, metres, in a UsdPreviewSurface. The same input is the same bytes. Raises NoUsd.
-
-    Args:
-        mesh: head frame, mm.
-        normals: unit, of its vertices.
-        uv: texture coordinates, v downwards; USD's is upwards.
-        faces_uv: of each corner of each face.
-        image: encoded.
-        suffix: ".jpg" or ".png".
-    """
+def scene_usdz_bytes(scene: Scene) -> bytes:
+    """Encodes parts as meshes of one USDZ, y up, in metres, with a UsdPreviewSurface or vertex colours. A part's
+    translation and orientation are operations of its own. The same input is the same bytes. Raises NoUsd."""
     check_usd()
-    texture = f"texture{suffix}"
+    images = {f"{part.name}{SUFFIXES[part.skin.mime]}": part.skin.image for part in scene.parts if part.skin}
     with tempfile.TemporaryDirectory() as scratch:
         layer = Path(scratch) / "head.usdc"
-        _write_layer(layer, mesh, normals, uv, faces_uv, texture)
-        return package({"head.usdc": layer.read_bytes(), texture: image})
+        _write_layer(layer, scene)
+        return package({"head.usdc": layer.read_bytes()} | images)
 
 
 def openusd_module(name: str) -> Any:
@@ -68,55 +55,71 @@ def openusd_module(name: str) -> Any:
     return importlib.import_module(f"pxr.{name}")
 
 
-def _write_layer(
-    path: Path, mesh: Mesh, normals: np.ndarray, uv: np.ndarray, faces_uv: np.ndarray, texture: str
-) -> None:
-    Gf, Sdf, Usd, UsdGeom, UsdShade, Vt = map(openusd_module, ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "Vt"))
-
+def _write_layer(path: Path, scene: Scene) -> None:
+    Gf, Usd, UsdGeom = map(openusd_module, ("Gf", "Usd", "UsdGeom"))
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    root = UsdGeom.Xform.Define(stage, "/head")
-    stage.SetDefaultPrim(root.GetPrim())
-    shape = UsdGeom.Mesh.Define(stage, "/head/mesh")
-    points = np.ascontiguousarray(mesh.vertices / 1000.0, np.float32)
-    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
-    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.faces, np.int32).ravel()))
-    shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
-    shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
-        "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
-    )
-    coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv * (1, -1) + (0, 1), np.float32)))
-    coordinates.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces_uv, np.int32).ravel()))
-
-    skin = UsdShade.Material.Define(stage, "/head/skin")
-    surface = UsdShade.Shader.Define(stage, "/head/skin/surface")
-    surface.CreateIdAttr("UsdPreviewSurface")
-    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(ROUGHNESS)
-    surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
-    reader = UsdShade.Shader.Define(stage, "/head/skin/coordinates")
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    picture = UsdShade.Shader.Define(stage, "/head/skin/texture")
-    picture.CreateIdAttr("UsdUVTexture")
-    picture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(texture))
-    picture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
-    picture.CreateInput("wrapS", Sdf.ValueTypeNames.Token).Set("clamp")
-    picture.CreateInput("wrapT", Sdf.ValueTypeNames.Token).Set("clamp")
-    picture.CreateInput("fallback", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(0.5, 0.5, 0.5, 1.0))
-    picture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
-        reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    )
-    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(
-        picture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
-    )
-    skin.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-    UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(skin)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
+    for part in scene.parts:
+        vertices, place = scene.about(part)
+        shape = _write_mesh(stage, part, vertices)
+        if part.skin is None:
+            colours = np.full(vertices.shape, 200, np.uint8) if part.mesh.colours is None else part.mesh.colours
+            shown = shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+            shown.Set(_vectors("Vec3fArray", linear_from_srgb(colours / 255.0)))
+        else:
+            _write_skin(stage, shape, part, part.skin)
+        if scene.pivots_mm:
+            x, y, z, w = quaternion(place.rotation).tolist()
+            shape.AddTranslateOp().Set(Gf.Vec3d(*(place.translation / 1000.0).tolist()))
+            shape.AddOrientOp().Set(Gf.Quatf(w, x, y, z))
     stage.GetRootLayer().Save()
+
+
+def _vectors(kind: str, values: np.ndarray) -> Any:
+    dtype = np.int32 if kind == "IntArray" else np.float32
+    return getattr(openusd_module("Vt"), kind).FromNumpy(np.ascontiguousarray(values, dtype))
+
+
+def _write_mesh(stage: Any, part: Part, vertices: Float[np.ndarray, "v 3"]) -> Any:
+    UsdGeom, points, faces = openusd_module("UsdGeom"), vertices / 1000.0, part.mesh.faces
+    shape = UsdGeom.Mesh.Define(stage, f"{ROOT}/{part.name}")
+    shape.CreatePointsAttr(_vectors("Vec3fArray", points))
+    shape.CreateFaceVertexCountsAttr(_vectors("IntArray", np.full(len(faces), 3)))
+    shape.CreateFaceVertexIndicesAttr(_vectors("IntArray", faces.ravel()))
+    shape.CreateExtentAttr(_vectors("Vec3fArray", np.stack([points.min(axis=0), points.max(axis=0)])))
+    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shape.CreateNormalsAttr(_vectors("Vec3fArray", part.unit_normals()))
+    shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    return shape
+
+
+def _write_skin(stage: Any, shape: Any, part: Part, skin: Skin) -> None:
+    Gf, Sdf, UsdGeom, UsdShade = map(openusd_module, ("Gf", "Sdf", "UsdGeom", "UsdShade"))
+    kinds, path = Sdf.ValueTypeNames, f"{ROOT}/{part.name}_skin"
+    coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar("st", kinds.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
+    coordinates.Set(_vectors("Vec2fArray", skin.uv * (1, -1) + (0, 1)))  # USD's v is upwards
+    coordinates.SetIndices(_vectors("IntArray", (part.mesh.faces if skin.faces is None else skin.faces).ravel()))
+    material = UsdShade.Material.Define(stage, path)
+    surface, reader, picture = (
+        UsdShade.Shader.Define(stage, f"{path}/{name}") for name in ("surface", "coordinates", "texture")
+    )
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", kinds.Float).Set(ROUGHNESS)
+    surface.CreateInput("metallic", kinds.Float).Set(0.0)
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", kinds.String).Set("st")
+    picture.CreateIdAttr("UsdUVTexture")
+    picture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(f"{part.name}{SUFFIXES[skin.mime]}"))
+    picture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
+    for wrap in ("wrapS", "wrapT"):
+        picture.CreateInput(wrap, kinds.Token).Set("clamp")
+    picture.CreateInput("fallback", kinds.Float4).Set(Gf.Vec4f(0.5, 0.5, 0.5, 1.0))
+    picture.CreateInput("st", kinds.Float2).ConnectToSource(reader.CreateOutput("result", kinds.Float2))
+    surface.CreateInput("diffuseColor", kinds.Color3f).ConnectToSource(picture.CreateOutput("rgb", kinds.Float3))
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
+    UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
 
 
 def package(files: dict[str, bytes]) -> bytes:

@@ -131,7 +131,7 @@ def _constant_fault(value: float, common: tuple[float, float]) -> Message:
 
 
 def _levels(plane: Plane, span: tuple[float, float]) -> list[float]:
-    """Returns the values that fill areas, in rising order. Of values close together the most frequent one counts."""
+    """Returns the values that fill areas, in rising order. Of values close together it takes the most frequent one."""
     low, high = span
     exact = plane.dtype.kind in "ui" and high - low < BINS
     count = int(high - low) + 1 if exact else BINS

@@ -8,6 +8,10 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from rig.errors import InputError
+from rig.messages.message import compose
 
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 HEIC_SUFFIXES = (".heic", ".heif")
@@ -46,6 +50,34 @@ WORD = re.compile(r"\d+|[^\W\d_]+")
 def is_junk(name: str) -> bool:
     """Tells whether a file manager added a file or folder of that name, or it is hidden."""
     return name.casefold() in {junk.casefold() for junk in JUNK} or name.startswith(".")
+
+
+def entry(folder: Path, name: str) -> Path:
+    """Returns the file or folder of that name in a folder, in whatever case: programs and file systems write capitals.
+
+    Returns the path of exactly that name if there is none. Raises InputError if two differ in case alone."""
+    found = [path for path in sorted(folder.iterdir()) if path.name.casefold() == name] if folder.is_dir() else []
+    if len(found) > 1:
+        raise InputError(folder.name, [compose("names-of-other-case", names=[path.name for path in found])])
+    return found[0] if found else folder / name
+
+
+def has_raw_beside(path: Path) -> bool:
+    """Tells whether a camera wrote the picture twice, and its RAW file, which is read, is beside this one."""
+    if path.suffix.lower() not in IMAGE_SUFFIXES or path.suffix.lower() in RAW_SUFFIXES:
+        return False
+    return any(path.with_suffix(cased).is_file() for end in RAW_SUFFIXES for cased in (end, end.upper()))
+
+
+def safe_name(name: str) -> str:
+    """Returns a camera's name in letters, digits and ``-_.``, as files and addresses have it: blanks and signs become
+    ``_``, accents go, and other letters become their numbers. Names that lead into other folders, or that are hidden,
+    stay as they are."""
+    if name.startswith(".") or any(c in "/\\" or unicodedata.category(c) in ("Cc", "Cf", "Cs") for c in name):
+        return name
+    plain = unicodedata.normalize("NFKD", name.strip())
+    signs = [c if c.isascii() else f"u{ord(c):x}" for c in plain if not unicodedata.combining(c)]
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", "".join(signs)).strip("_.") or name
 
 
 def picture_stem(name: str) -> str:
@@ -88,7 +120,7 @@ Found = Mapping[str, Sequence[str]]
 def _words(name: str) -> Words:
     while (stem := picture_stem(name)) != name:
         name = stem
-    folded = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
+    folded = safe_name(name).casefold()
     return tuple(word.lstrip("0") or "0" if word.isdecimal() else word for word in WORD.findall(folded))
 
 

@@ -33,11 +33,12 @@ def work_share(intrinsics: Intrinsics, pixels_most: int | None) -> float:
 def work_rig(rig: Rig, pixels_most: int | None) -> Rig:
     """Returns the cameras for pictures that are read at the reduced size."""
     shares = {camera.name: work_share(camera.intrinsics, pixels_most) for camera in rig}
-    return Rig(
-        tuple(
+    return replace(
+        rig,
+        cameras=tuple(
             camera if shares[camera.name] == 1.0 else replace(camera, intrinsics=camera.intrinsics.scaled(share))
             for camera, share in zip(rig, shares.values(), strict=True)
-        )
+        ),
     )
 
 

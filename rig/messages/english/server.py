@@ -49,7 +49,7 @@ TEMPLATES = {
     "capture-missing": "Its pictures are neither in the data folder nor in the store of captures: restore them from a "
     "backup, or remove the capture.",
     "result-missing": "Its result is not in the data folder any more: restore it from a backup, or restart the job.",
-    "file-damaged": "Changed on the disk since the job made them, or cut: {files}. Restore them from a backup, or "
+    "file-damaged": "Changed or cut on the disk after the job made them: {files}. Restore them from a backup, or "
     "restart the job.",
     "worker-starting": "The worker is being started.",
     "no-worker": "No worker serves the queue {queue}: start one with `eigenhead worker --queue {queue_name}`.",

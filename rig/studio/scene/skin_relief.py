@@ -67,8 +67,8 @@ def draw_relief(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelievedSkin:
-    """Holds skin with its relief (head frame, mm). ``places`` are its points before they were moved, ``values`` are
-    interpolated from the vertices' own."""
+    """Holds skin with its relief (head frame, mm). ``places`` are its points before the relief moved them; ``values``
+    are interpolated from the values at the vertices."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]

@@ -95,6 +95,7 @@ export default spoken({
     measuring: false,
     lights: "studio",
     other: "",
+    form: "obj",
     scale: null,
     loading: false,
     fault: "",
@@ -223,6 +224,7 @@ export default spoken({
               <label class="field">Light<select v-model="lights"><option value="studio">studio</option><option value="side">from the side (shows shape)</option><option value="flat">flat</option></select></label></div>
             <div class="line"><h2 class="third grow">Downloads</h2><a class="b" id="all" :href="'/console/jobs/' + job.id + '/all.zip'" :download="fileName + '.zip'">All files (.zip)</a></div>
             <div class="line wrap"><button class="b" id="picture" title="What the view shows, on nothing, with the legend of its colours" @click="savePicture">Picture (PNG)</button><template v-if="video"><button class="b" id="turntable" :disabled="!!through || loading" :title="say(through ? 'Not through a camera' : 'One turn, as the view shows the head')" @click="turning === null ? turntable() : stopTurning()">{{ turning === null ? say('Turntable (video)') : say('Stop, {share} %', { share: Math.round(100 * turning) }) }}</button><select v-model.number="turnS" aria-label="Seconds of the turn"><option v-for="s in [4, 8, 16]" :key="s" :value="s">{{ s }} s</option></select></template></div>
+            <div class="line wrap"><label class="field">Another format<select v-model="form" id="form"><option v-for="f in ['glb', 'ply', 'obj', 'usdz', 'stl', '3mf']" :key="f" :value="f">{{ f }}</option></select></label><a class="b" id="export" :href="'/console/jobs/' + job.id + '/exports/' + form + '.zip'" :download="fileName + '-' + form + '.zip'">Export (.zip)</a></div>
             <table class="small"><tbody><tr v-for="(bytes, name) in job.files" :key="name"><td><a :href="'/console/jobs/' + job.id + '/' + name" :download="name">{{ name }}</a></td><td class="num muted">{{ size(bytes) }}</td></tr></tbody></table>
             <h2 class="third">Measurements, mm</h2>
             <table class="small" id="measurements"><thead v-if="theirs"><tr><th>of</th><th class="num">this</th><th class="num">other</th><th class="num" title="this less other">&Delta;</th></tr></thead><tbody><tr v-for="m in compared" :key="m.name"><td>{{ say(m.name.replaceAll('_', ' ')) }}</td><td class="num">{{ fixed(m.value, 1) }}</td><td v-if="!theirs" class="num muted">&plusmn; {{ fixed(m.std, 1) }}</td><template v-if="theirs"><td class="num">{{ fixed(m.theirs?.value, 1) }}</td><td class="num">{{ m.theirs ? fixed(m.value - m.theirs.value, 1) : '-' }}</td></template></tr></tbody></table>

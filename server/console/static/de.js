@@ -299,6 +299,8 @@ export default {
 
   // Verdict of a capture
   "This capture was made before pictures were judged.": "Diese Aufnahme stammt aus der Zeit, als Bilder noch nicht beurteilt wurden.",
+  "All {all} pictures are exposed and sharp. Whether a camera moved was not checked: there are no clean plates.": "Alle {all} Bilder sind richtig belichtet und scharf. Ob sich eine Kamera bewegt hat, wurde nicht geprüft: Leerbilder fehlen.",
+  "Look again": "Bitte ansehen",
   "All {all} pictures are exposed, sharp and framed, and no camera moved.": "Alle {all} Bilder sind richtig belichtet, scharf und im Rahmen, und keine Kamera hat sich bewegt.",
   "Something is wrong with all pictures: shoot again.": "Mit allen Bildern stimmt etwas nicht: noch einmal aufnehmen.",
   "{sound} of {all} cameras are without a fault.": "{sound} von {all} Kameras sind ohne Fehler.",
@@ -591,6 +593,8 @@ export default {
   "Picture (PNG)": "Bild (PNG)",
   "What the view shows, on nothing, with the legend of its colours": "Was die Ansicht zeigt, freigestellt, mit der Legende ihrer Farben",
   "Turntable (video)": "Drehung (Video)",
+  "Another format": "Anderes Format",
+  "Export (.zip)": "Exportieren (.zip)",
   "Stop, {share} %": "Anhalten, {share} %",
   "Not through a camera": "Nicht durch eine Kamera",
   "One turn, as the view shows the head": "Eine Umdrehung, wie die Ansicht den Kopf zeigt",

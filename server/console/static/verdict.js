@@ -18,7 +18,12 @@ const CODES = {
   swapped: "swapped",
 };
 
+// Warnings for which an operator wants another shot, though the pictures as such are good.
+const LOOK = ["eyes-closed", "moments-differ", "face-nowhere", "face-missing", "face-turned"];
+
 export function verdictTag(capture) {
+  if (capture.verdict === "good" && (capture.warnings || []).some((told) => LOOK.includes(told.code)))
+    return { text: say("Look again"), kind: "warn" };
   return capture.verdict
     ? { text: say(WORDS[capture.verdict]), kind: KINDS[capture.verdict] }
     : { text: say("not judged"), kind: "" };
@@ -62,7 +67,12 @@ export const Verdict = spoken({
         all = this.capture.cameras.length;
       if (!this.capture.verdict) return say("This capture was made before pictures were judged.");
       if (this.capture.verdict === "good")
-        return say("All {all} pictures are exposed, sharp and framed, and no camera moved.", { all });
+        return Object.keys(this.capture.inputs || {}).some((name) => name.startsWith("background/"))
+          ? say("All {all} pictures are exposed, sharp and framed, and no camera moved.", { all })
+          : say(
+              "All {all} pictures are exposed and sharp. Whether a camera moved was not checked: there are no clean plates.",
+              { all },
+            );
       if (named.has(null)) return say("Something is wrong with all pictures: shoot again.");
       const sound = say("{sound} of {all} cameras are without a fault.", { sound: all - named.size, all });
       return this.capture.verdict === "usable"

@@ -13,7 +13,18 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from rig.errors import InputError
 from rig.messages.message import compose
 from server.http.auth import ServiceOf, require
-from server.http.list_schemas import BulkOut, Cursor, JobBatch, JobBulk, JobList, Key, Limit, NewDelivery, Sought
+from server.http.list_schemas import (
+    BulkOut,
+    Cursor,
+    JobBatch,
+    JobBulk,
+    JobList,
+    Key,
+    Limit,
+    NewDelivery,
+    NewExport,
+    Sought,
+)
 from server.http.schemas import Idempotency, JobOut, NewJob, NewSessionJobs, Restart, ResultList, State
 from server.services.bulk import each
 from server.services.job_rows import FINISHED, STATUSES
@@ -23,11 +34,14 @@ from server.services.work import ReconstructionRequest
 from server.storage.job_index import JobOrder, JobQuery
 from server.storage.records import JobWebhook
 from server.wire.problems import Responses, documented
-from server.wire.send_file import media_type, send_archive, send_file
+from server.wire.send_file import media_type, send_archive, send_file, send_zip
 
 router = APIRouter(prefix="/v1", tags=["jobs"])
 Reader = Annotated[Caller, Depends(require("read"))]
 Submitter = Annotated[Caller, Depends(require("submit"))]
+
+
+EXPORT: Responses = {200: {"content": {"application/zip": {}}}, **documented(400, 404, 409, 413, 415, 507)}
 
 
 @router.post("/jobs", status_code=202, responses=documented(400, 404, 409, 413, 415, 507))
@@ -146,6 +160,13 @@ def deliver_job(service: ServiceOf, caller: Submitter, job_id: str, wanted: NewD
     """Delivers the result of a job to an object store: for the first time, again after a failure, or elsewhere. 409
     while it is being delivered."""
     return JobOut.model_validate(service.deliver(job_id, None if wanted is None else wanted.to))
+
+
+@router.post("/jobs/{job_id}/exports", responses=EXPORT, response_class=Response)
+async def export_job(service: ServiceOf, caller: Reader, job_id: str, wanted: NewExport) -> Response:
+    """Returns the head of a finished job in another format, with its materials and textures, as one .zip. No new job is
+    made."""
+    return send_zip(await service.threads.check(service.export, job_id, wanted.outputs(), key=caller.key))
 
 
 @router.delete("/jobs/{job_id}", status_code=204, responses=documented(404, 409))

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibration.adjustment.bundle import HUBER, BundleSolution, Free, bundle_problem
-from calibration.adjustment.corner_term import CornerTerm
+from calibration.adjustment.bundle import HUBER, BundleSolution, CornerTerm, Free, bundle_problem
 from calibration.adjustment.gauge import (
     align_world,
     gauge_projection,

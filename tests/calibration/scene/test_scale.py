@@ -6,12 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration.scene.photographs import find_photographs
-from calibration.scene.scale import ASSUMED, find_scale, find_tags, scale_from_head, scale_from_tags
+from calibration.scene.photographs import Photographs, find_photographs
+from calibration.scene.rig_scale import times
+from calibration.scene.scale import (
+    ASSUMED,
+    FACE_SHARE,
+    find_scale,
+    find_tags,
+    scale_from_face,
+    scale_from_head,
+    scale_from_tags,
+)
 from calibration.scene.scene import transformed
 from calibration.scene.structure import Structure
 from rig.errors import InputError
 from rig.formats.cameras.scale_json import CameraDistance, PointDistance, TagSize
+from rig.formats.pictures.images import write_image
+from tests.support.drawn_studio import drawn_pictures, drawn_studio
 from tests.support.textured_wedge import TAG_MM, TAG_NUMBER, wedge_rig, write_photographs
 
 UNIT = 0.0125  # of the structure in mm: what must come back is its inverse
@@ -86,6 +97,17 @@ def test_a_heads_size_is_an_assumption() -> None:
     found = scale_from_head(structure(points), HEAD)
     # The sphere that all cameras see whole has 120 mm: of a cloud of sigma 30 mm hardly a point is cut off.
     assert found.factor == pytest.approx(2 / UNIT, rel=0.05)
-    assert found.source == ASSUMED
+    assert found.source in ASSUMED
     assert found.assumed
     assert "ASSUMPTION" in found.provenance.text
+
+
+def test_a_face_in_the_photographs_gives_the_scale_of_an_adult(tmp_path: Path) -> None:
+    for name, picture in drawn_pictures().items():
+        write_image(tmp_path / f"{name}.png", picture)
+    shots = Photographs({name: {"shot": tmp_path / f"{name}.png"} for name in drawn_studio().names})
+    found = scale_from_face(times(drawn_studio(), UNIT), shots)
+    assert found is not None
+    assert found.factor == pytest.approx(1 / UNIT, rel=2 * FACE_SHARE)
+    assert found.assumed
+    assert scale_from_face(times(drawn_studio().subset(["cam4", "cam5"]), UNIT), shots) is None

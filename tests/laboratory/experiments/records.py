@@ -4,7 +4,7 @@ continue."""
 import hashlib
 import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -96,3 +96,13 @@ class Bench:
     def records(self, name: str, key: str) -> Records:
         """Returns the kept rows of this name, see ``Records``."""
         return Records(self.folder, name, key)
+
+
+def means_by(rows: Sequence[Row], group: str) -> dict[str, float]:
+    """Returns the mean of every figure over the rows of each ``group`` that have it."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        for key, value in row.items():
+            if isinstance(value, float):
+                values.setdefault(f"{row[group]}_{key}", []).append(value)
+    return {key: float(np.mean(found)) for key, found in values.items()}

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.applications.templates.inner_mouth import ANCHORS, PACK, InnerPart, save_inner_mouth
 from pipeline.fusion.crossings import crossing_faces
-from pipeline.head_model.inner_mouth_file import ANCHORS, PACK, InnerPart, save_inner_mouth
 from pipeline.head_model.model import load_model
 from pipeline.head_model.subdivision import refine
 from rig.geometry import rigid_fit

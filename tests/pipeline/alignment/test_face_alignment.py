@@ -1,22 +1,16 @@
 """A head of the population is found from its landmarks, as far as other heads and the network's errors allow."""
 
 import numpy as np
-import pytest
 
 from pipeline.alignment.face_alignment import POINTS, align_to_face, frontmost_camera, spread_points
 from pipeline.alignment.silhouette_search import turn_between_deg
 from pipeline.faces.landmark_map import LandmarkMap, landmark_map
 from pipeline.faces.matching import MatchedFaces
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity, rotation_from_vector
 from rig.studio.scene.layout import default_layout
 
 NOISE_MM = 0.5
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 def matched(points_world: np.ndarray, pose: Similarity) -> MatchedFaces:

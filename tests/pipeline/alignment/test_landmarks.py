@@ -18,7 +18,7 @@ from pipeline.alignment.landmarks import (
 )
 from pipeline.geometry.registration.procrustes import generalised_procrustes, procrustes
 from pipeline.head_model.landmarks import NAMES, SEVEN_POINTS, mirrored
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.camera import Camera, Intrinsics
 from rig.capture import Features
 from rig.geometry import Similarity, look_at, rotation_from_vector, vector_from_rotation
@@ -26,11 +26,6 @@ from rig.rig import Rig
 
 SOURCE = np.random.default_rng(1).normal(0, 50.0, (7, 3))
 vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @given(scale=st.floats(0.1, 10.0), turn=vectors, shift=vectors)

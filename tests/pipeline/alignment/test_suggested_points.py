@@ -10,7 +10,7 @@ from pipeline.faces.landmark_map import LandmarkMap, landmark_map
 from pipeline.faces.matching import MatchedFaces, complete_match
 from pipeline.faces.triangulated_face import triangulate_face
 from pipeline.head_model.landmarks import SEVEN_POINTS
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -18,11 +18,6 @@ from tests.support.drawn_faces import seen_face
 
 WORLD_FROM_HEAD = Similarity(1.03, rotation_from_vector(np.array([0.05, 0.1, 0.03])), np.array([12.0, 40.0, -40.0]))
 VIEWS = ("cam00", "cam05", "cam06", "cam07", "cam08")
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from pipeline.detail.folds import folded
 from pipeline.detail.refine import SHARED_ERROR, DeformedSurface, deform_to_points, refine_to_surface
 from pipeline.detail.surface_points import SurfacePoints, thinned, with_scaled_deviation
 from pipeline.fusion.untangling import head_topology, spoilt_faces
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from pipeline.head_model.regions import head_regions
 from pipeline.part_labels.codes import Part
 from rig.geometry import Similarity
@@ -115,11 +115,6 @@ def test_thinning_keeps_parts_and_sides_apart() -> None:
     thin = thinned(SurfacePoints(points, normals, np.full(4, 0.2), part), 1.0)
     assert sorted(zip(thin.part.tolist(), thin.normals[:, 2].tolist(), strict=True)) == [(1, -1.0), (1, 1.0), (2, 1.0)]
     np.testing.assert_allclose(thin.deviation_mm, 0.2)
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 def head_points(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> SurfacePoints:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibration.adjustment.corner_term import CornerTerm
+from calibration.adjustment.bundle import CornerTerm
 from calibration.adjustment.lens_prior import AspectTerm
 from calibration.adjustment.state import PER_CAMERA as PER_BUNDLE_CAMERA
 from calibration.adjustment.state import PER_SHOT, BundleState, Observations, moved_state, observations

@@ -6,17 +6,12 @@ import pytest
 from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.measurements import DISTANCES, landmarks, measurements
 from pipeline.head_model.gaussian_process import SCALES
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 
 COUNT = 8
 SIZE = COUNT + 7  # coefficients, rotation, translation, log scale
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 def fit_at(parameters: np.ndarray, covariance: np.ndarray | None = None) -> Fit:
@@ -129,3 +124,18 @@ def test_landmarks_slide_in_their_tangent_planes(model: HeadModel) -> None:
             expected = ((draws[:, j] - draws[:, i]) @ unit).std()
             found_std = measurements(model, fit)[name].std_mm
             assert found_std == pytest.approx(expected, rel=0.045)  # 4,000 draws, as above
+
+
+def test_an_unsure_scale_moves_landmarks_and_lengths_as_a_larger_head_would(model: HeadModel) -> None:
+    sigma, sure = 0.06, fit_at(np.zeros(SIZE), np.zeros((SIZE, SIZE)))
+    larger = fit_at(np.append(np.zeros(SIZE - 1), np.log(1.0 + sigma)))
+    origin, lengths = sure.world_from_head.translation, measurements(model, larger)
+    for name, length in measurements(model, sure).items():
+        wide = length.widen_by_scale(sigma).std_mm
+        assert wide == pytest.approx(np.hypot(lengths[name].value_mm - length.value_mm, length.std_mm or 0.0), rel=1e-3)
+    marks = landmarks(model, larger)
+    for name, mark in landmarks(model, sure).items():
+        moved, wide = marks[name].position_mm - mark.position_mm, mark.widen_by_scale(sigma, origin)
+        assert mark.std_mm is not None
+        assert wide.std_mm is not None
+        np.testing.assert_allclose(wide.std_mm, np.hypot(moved, mark.std_mm), atol=1e-3)

@@ -9,18 +9,13 @@ from pipeline.evidence.pose import cameras_in_front, judge_pose
 from pipeline.faces.detection import FaceDetection
 from pipeline.faces.landmark_map import landmark_map
 from pipeline.faces.subject import SubjectFaces, match_alone
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout, rig_from_directions
 
 FACING = ("cam00", "cam01", "cam02")
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

@@ -21,11 +21,6 @@ NEAR_MM = 9.0  # the finder's tip of the nose lies that far below the most forwa
 
 
 @pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
-
-
-@pytest.fixture(scope="module")
 def of_model(model: HeadModel) -> LandmarkMap:
     return landmark_map(model)
 

@@ -2,16 +2,10 @@
 
 import numpy as np
 
-from pipeline.faces.networks import load_networks
 from pipeline.faces.points import VIEW_TERMS_MIRRORED, place_face, point_table, view_bias, view_terms
 from rig.geometry import rotation_from_vector, vector_from_rotation
-from tests.support.landmark_map import measured_mirror_images
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
-
-
-def test_mirror_images_are_measured_the_same() -> None:
-    assert (measured_mirror_images(load_networks()) == point_table().mirror_images).all()
 
 
 def test_mirror_images_are_each_others() -> None:

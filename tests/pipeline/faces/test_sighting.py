@@ -1,12 +1,17 @@
 """The face at a glance: which cameras lack it, and where it looks, of drawn heads in small pictures."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import pytest
 
 from pipeline.faces.networks import FaceNetworks, load_networks
-from pipeline.faces.sighting import _turned, file_pixels, has_front, reduce_picture, sight_face
+from pipeline.faces.sighting import GLANCE, _turned, file_pixels, has_front, reduce_picture, sight_face
+from pipeline.faces.subject import find_subject
+from rig.acquisition.face_sighting import FaceSighting
 from rig.camera import Camera, Intrinsics
 from rig.geometry import RigidTransform, look_at
+from rig.image import ImageRgb
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
@@ -18,8 +23,13 @@ def networks() -> FaceNetworks:
     return load_networks()
 
 
+def glance(pictures: Mapping[str, ImageRgb], networks: FaceNetworks, rig: Rig | None = None) -> FaceSighting:
+    cameras = rig or drawn_studio()
+    return sight_face(find_subject(pictures, cameras, networks, effort=GLANCE), cameras, front=cameras.names[0])
+
+
 def test_nobody_blames_a_camera_behind_the_head(networks: FaceNetworks) -> None:
-    seen = sight_face(drawn_pictures(0.0), drawn_studio(), networks, front="cam0")
+    seen = glance(drawn_pictures(0.0), networks)
     assert seen.is_found
     assert seen.missing == ()
     assert seen.left_deg == pytest.approx(0.0, abs=4.0)
@@ -27,15 +37,13 @@ def test_nobody_blames_a_camera_behind_the_head(networks: FaceNetworks) -> None:
 
 
 def test_a_face_that_looks_aside_is_told_by_how_much(networks: FaceNetworks) -> None:
-    seen = sight_face(drawn_pictures(25.0), drawn_studio(), networks, front="cam0")
+    seen = glance(drawn_pictures(25.0), networks)
     assert seen.left_deg == pytest.approx(25.0, abs=5.0)
     assert seen.missing == ()
 
 
 def test_a_face_that_looks_up_is_told(networks: FaceNetworks) -> None:
-    straight, up = (
-        sight_face(drawn_pictures(0.0, angle), drawn_studio(), networks, front="cam0") for angle in (0.0, 20.0)
-    )
+    straight, up = (glance(drawn_pictures(0.0, angle), networks) for angle in (0.0, 20.0))
     assert straight.up_deg is not None
     assert up.up_deg is not None
     assert up.up_deg - straight.up_deg == pytest.approx(20.0, abs=6.0)
@@ -43,13 +51,13 @@ def test_a_face_that_looks_up_is_told(networks: FaceNetworks) -> None:
 
 def test_a_camera_that_should_show_the_face_and_does_not_is_named(networks: FaceNetworks) -> None:
     shown = hidden_from(("cam2", "cam4", "cam5"), drawn_pictures())  # cam4 stands 50 degrees aside
-    assert sight_face(shown, drawn_studio(), networks, front="cam0").missing == ("cam2",)
+    assert glance(shown, networks).missing == ("cam2",)
 
 
 def test_without_a_face_nobody_is_blamed_and_the_search_ends_early(networks: FaceNetworks) -> None:
     rig = default_layout().scaled(0.4)
     blank = {c.name: np.full((c.intrinsics.height, c.intrinsics.width, 3), 90, np.uint8) for c in rig}
-    seen = sight_face(blank, rig, networks, front="cam00")
+    seen = glance(blank, networks, rig)
     assert (seen.searched, seen.is_found, seen.has_faces, seen.missing, seen.left_deg) == (5, False, False, (), None)
 
 

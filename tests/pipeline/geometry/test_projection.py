@@ -6,22 +6,12 @@ import pytest
 
 from pipeline.geometry.projection import packed_camera, packed_lens, project_points
 from pipeline.geometry.projection_kernels import LENS, NOWHERE, distorted, pinhole, placed, project, projection_slopes
-from rig.camera import Camera, Distortion, Intrinsics
-from rig.geometry import look_at, vector_from_rotation
+from rig.camera import Distortion
+from rig.geometry import vector_from_rotation
 from rig.jit import njit
+from tests.rig.test_camera import LENSES, POSE, camera
 
-LENSES = [
-    Distortion(),
-    Distortion(k1=-0.15),
-    Distortion(-0.21, 0.09, 1.2e-3, -8e-4, -0.02),
-    Distortion(0.08, -0.04, -5e-4, 1e-3, 0.01),
-]
-POSE = look_at(np.array([400.0, 150.0, 1000.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
 POINTS = np.random.default_rng(0).uniform(-150.0, 150.0, (200, 3))
-
-
-def camera(lens: Distortion) -> Camera:
-    return Camera("cam", Intrinsics(1024, 768, 1480.0, 1510.0, 530.3, 371.8, lens), POSE)
 
 
 @njit(cache=False)

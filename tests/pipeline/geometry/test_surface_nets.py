@@ -1,10 +1,36 @@
 """Nets of planted spheres, and of signs drawn at random beside the plain loops."""
 
+import itertools
+
 import numpy as np
 import pytest
+from jaxtyping import Float, Float32, Int32
 
-from pipeline.geometry.surface_nets import SurfaceNet, link_nodes, surface_net, volume_net, volume_net_naive
+from pipeline.geometry.surface_nets import SurfaceNet, link_nodes, surface_net, volume_net
 from rig.mesh import boundary_edges
+
+
+def volume_net_naive(
+    field: Float32[np.ndarray, "nx ny nz"],
+) -> tuple[Float[np.ndarray, "v 3"], Int32[np.ndarray, "f 3"]]:
+    """Computes the same mesh as ``volume_net``, in plain Python; the order of the triangles differs."""
+    shape, unit = np.array(field.shape), np.eye(3, dtype=int)
+    crossings: dict[tuple[int, ...], list[np.ndarray]] = {}
+    quads = []
+    for axis, node in itertools.product(range(3), np.ndindex(*field.shape)):
+        low, high = np.array(node), np.array(node) + unit[axis]
+        if (high >= shape).any() or (field[tuple(low)] < 0) == (field[tuple(high)] < 0):
+            continue
+        start, end = float(field[tuple(low)]), float(field[tuple(high)])
+        first, second = unit[(axis + 1) % 3], unit[(axis + 2) % 3]
+        cells = [tuple(int(i) for i in low - back) for back in (first + second, second, 0 * first, first)]
+        for cell in cells:
+            crossings.setdefault(cell, []).append(low + unit[axis] * (start / (start - end)))
+        quads.append(cells if start < 0 else [cells[0], cells[3], cells[2], cells[1]])
+    rows = {cell: row for row, cell in enumerate(sorted(crossings))}
+    vertices = np.array([np.mean(crossings[cell], axis=0) for cell in rows]).reshape(-1, 3)
+    faces = [[rows[quad[i]] for i in corners] for quad in quads for corners in ((0, 1, 2), (0, 2, 3))]
+    return vertices, np.array(faces, np.int32).reshape(-1, 3)
 
 
 def random_volume(seed: int, shape: tuple[int, int, int] = (7, 6, 8)) -> np.ndarray:

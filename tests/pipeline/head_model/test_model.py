@@ -10,13 +10,8 @@ from pipeline.head_model import landmarks
 from pipeline.head_model.model import HeadModel, load_model, with_modes
 from pipeline.head_model.model_file import BadModel, read_parts, save_model
 from pipeline.head_model.model_names import UnknownModel, list_models, model_path
-from pipeline.head_model.subdivision import boundary_loops, check_manifold
+from pipeline.head_model.subdivision import boundary_loops, check_manifold, opened_faces
 from rig.mesh import face_normals, vertex_normals
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 def test_the_database_is_the_papers(model: HeadModel) -> None:
@@ -160,3 +155,18 @@ def test_fewer_modes(model: HeadModel) -> None:
     assert few.basis("cage", 5).shape == (5, model.mean.shape[0], 3)
     with pytest.raises(ValueError, match="coefficients"):
         few.vertices(np.zeros(6))
+
+
+def test_the_default_model_opens_at_eyes_and_mouth(model: HeadModel) -> None:
+    """Two lids' borders and one of lips besides the neck's; nothing else is left out."""
+    full = model.levels["full"].faces
+    opened = opened_faces({name: model.levels[name].faces for name in ("cage", "full")})
+    loops, mean = boundary_loops(opened), model.vertices(np.zeros(0))
+    assert len(loops) == 4
+    for name in ("stomion", "endocanthion_left", "exocanthion_right"):
+        near = min(np.linalg.norm(mean[loop] - mean[model.landmarks[name]], axis=1).min() for loop in loops)
+        assert near < 8.0
+    np.testing.assert_array_equal(opened, full[: len(opened)])
+    assert len(boundary_loops(full)) == 1
+    closed = {name: full[: len(opened)] for name in ("cage", "full")}
+    assert len(opened_faces(closed)) == len(opened)  # what is open is left as it is

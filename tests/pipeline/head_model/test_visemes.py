@@ -9,7 +9,7 @@ from pipeline.head_model.expressions import ARKIT
 from pipeline.head_model.visemes import VISEMES, mixed
 
 NAMES = ["sil", "PP", "FF", "TH", "DD", "kk", "CH", "SS", "nn", "RR", "aa", "E", "I", "O", "U"]
-PAGE = Path(__file__).parents[3] / "docs" / "shapes.md"
+PAGE = Path(__file__).parents[3] / "docs" / "templates.md"
 
 
 def test_the_fifteen_are_mixtures_of_apples_shapes() -> None:

@@ -134,19 +134,20 @@ def test_surface_says_which_are_written(
 def test_a_head_is_written_pushed_out_to_the_hair(
     result: Reconstruction, photographed, renderer: Renderer, tmp_path: Path
 ) -> None:
-    """The head is a ball of 57 mm, the bust one of 60 mm whose upper half is hair."""
-    bust, capture, _ = photographed
+    """The head is a ball of 57 mm, the bust one of 60 mm whose upper half is hair; a ball has no texture layout."""
+    bust, capture, silhouettes = photographed
     part = np.where(bust.mesh_world.vertices[:, 1] > 0.0, Part.HAIR, Part.SKIN).astype(np.uint8)
     bust = replace(bust, shaped=replace(bust.shaped, surface=replace(bust.surface, part=part)))
     sphere = trimesh.creation.icosphere(4, 57.0)
     head = Mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces, np.int32))
     refined = RefinedHead(head, np.ones(len(head.vertices)), Detail("photo", verbatim("planted")))
-    settings = replace(SETTINGS, outputs=OutputSettings(surface="hair"))
+    settings = replace(SETTINGS, outputs=OutputSettings(surface="hair", formats=("ply",)))
     context = ReconstructionContext(capture, pinhole_fan(), load_model(), settings, renderer)
-    staged = push_out_hair(context, refined, bust)
+    views = Views(capture, silhouettes, {})
+    staged = push_out_hair(context, views, refined, bust, context.capture)
     assert staged.product is not None
     assert list(staged.warnings) == []
-    assert push_out_hair(replace(context, settings=SETTINGS), refined, bust).product is None
+    assert push_out_hair(replace(context, settings=SETTINGS), views, refined, bust, context.capture).product is None
     made = made_up_result(head, result.head.fit, settings=settings, bust=bust, hair=staged.product)
     write_result(tmp_path, made, capture)
     assert {path.stem for path in tmp_path.glob("*.ply")} == {"head", "bust", "head_hair"}

@@ -12,18 +12,19 @@ import numpy as np
 import pytest
 import trimesh
 
+from pipeline.applications.templates.write.writers import load_template_writers
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.head_model.model import load_model
-from pipeline.results.head_files import printable, write_head
+from pipeline.results.head_files import head_mesh, printable, write_formats, write_head_ply, write_skin_maps
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.results.report import report_document
-from pipeline.results.write import head_mesh, write_result
+from pipeline.results.report import report_document, skin_document
+from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings, settings_from_document
 from pipeline.texturing.albedo import Albedo
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.reduced_layout import reduced_layout
-from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.layout.normal_map import reduced_layout
+from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, model_layout
 from pipeline.texturing.light import Light
+from pipeline.texturing.pores.skin_maps import SkinMaps, codes_of
 from pipeline.texturing.sets.specular import Specular
 from pipeline.texturing.sets.texture_sets import SetTextures
 from rig.capture import Capture
@@ -31,6 +32,7 @@ from rig.errors import InputError
 from rig.formats.meshes.ply import read_head_ply
 from rig.mesh import Mesh
 from tests.rig.formats.pictures.test_exr import read_exr
+from tests.support.glb import opened_glb
 from tests.support.made_up_results import textured_result
 
 ALL = ("glb", "ply", "obj", "usdz", "stl", "3mf")
@@ -57,7 +59,8 @@ def reduced_result(result: Reconstruction) -> Reconstruction:
 
 def written(result: Reconstruction, folder: Path, **outputs: object) -> set[str]:
     chosen = replace(result, settings=Settings(outputs=replace(OutputSettings(), **outputs)))
-    write_head(folder, chosen, head_mesh(chosen))
+    write_head_ply(folder, chosen)
+    write_formats(folder, chosen, head_mesh(chosen))
     return {path.name for path in folder.iterdir()}
 
 
@@ -171,7 +174,7 @@ def test_texture_sets_are_written_and_the_glb_mirrors_what_polarised_light_shows
     assert float(scattered[5, 5, 1]) == pytest.approx(0.4564, rel=1e-3)  # linear light of code 180
     coded = cv2.imread(str(tmp_path / "texture" / "specular.png"))
     assert np.asarray(coded)[5, 900].tolist() == [149] * 3  # sRGB's code of 0.3
-    document, payload = opened_glb(tmp_path / "head.glb")
+    document, payload = opened_glb((tmp_path / "head.glb").read_bytes())
     assert document["extensionsUsed"] == ["KHR_materials_specular"]
     assert "extensionsRequired" not in document
     material = document["materials"][0]
@@ -212,7 +215,7 @@ def test_outputs_of_versions_before_0_3_are_refused_by_name(name: str) -> None:
 def test_a_normal_map_stands_on_fewer_vertices_of_the_same_head(reduced_result: Reconstruction, tmp_path: Path) -> None:
     mapped = reduced_result
     written(mapped, tmp_path)
-    document, payload = opened_glb(tmp_path / "head.glb")
+    document, payload = opened_glb((tmp_path / "head.glb").read_bytes())
     primitive, head = document["meshes"][0]["primitives"][0], head_mesh(mapped)
     rows = document["asset"]["extras"]["rows_of_ply"]
     view = document["bufferViews"][document["accessors"][primitive["attributes"]["POSITION"]]["bufferView"]]
@@ -238,17 +241,13 @@ def test_the_khronos_validator_has_nothing_to_say(
         blendshape_rig = build_blendshape_rig(model, result.head.fit.world_from_head, result.mesh_world, ())
         evidence = replace(result.evidence, blendshape_rig=blendshape_rig)
         settings = Settings(outputs=OutputSettings(morphs=True, neutral=True))
-        write_result(tmp_path, replace(result, evidence=evidence, settings=settings), Capture({}))
-        assert validated(tmp_path / "neutral.glb", gltf_validator) == (0, 0, [])
+        made = replace(result, evidence=evidence, settings=settings)
+        write_result(tmp_path, made, Capture({}), load_template_writers(None, model))
+        for other in ("neutral.glb", "head.glb"):
+            assert validated(tmp_path / other, gltf_validator) == (0, 0, [])
     else:
         written(result, tmp_path, image=kind)
     assert validated(tmp_path / name, gltf_validator) == (0, 0, [])
-
-
-def opened_glb(path: Path) -> tuple[dict[str, Any], bytes]:
-    data = path.read_bytes()
-    (length,) = struct.unpack_from("<I", data, 12)
-    return json.loads(data[20 : 20 + length]), data[28 + length :]
 
 
 def validated(path: Path, validator: Path) -> tuple[int, int, list[Any]]:
@@ -273,3 +272,27 @@ def gltf_validator(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ".then(report => console.log(JSON.stringify(report.issues)));"
     )
     return folder
+
+
+def maps() -> SkinMaps:
+    heights = np.linspace(-0.1, 0.1, 64, dtype=np.float32).reshape(8, 8)
+    return SkinMaps(codes_of(heights), np.full((8, 8, 3), (128, 127, 255), np.uint8), (0.5, 0.25), ("a", "b"))
+
+
+def test_a_program_reads_millimetres_by_what_the_report_says(tmp_path: Path) -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    image[..., 0] = 200
+    atlas = Atlas(Layout(np.zeros((3, 2)), np.array([[0, 1, 2]]), np.arange(3)), image)
+    write_skin_maps(tmp_path, atlas, maps())
+    document = json.loads(json.dumps(skin_document(maps())))
+    stored = cv2.imread(str(tmp_path / "displacement.png"), cv2.IMREAD_UNCHANGED)
+    assert stored is not None
+    assert stored.dtype == np.uint16
+    heights = (stored.astype(float) - document["mid_code"]) * document["mm_per_code"]
+    np.testing.assert_allclose(heights.ravel(), np.linspace(-0.1, 0.1, 64), atol=2e-5)
+    for name, first in (("colour", (0, 0, 200)), ("normals", (255, 127, 128))):  # blue first
+        read = cv2.imread(str(tmp_path / f"{name}.png"))
+        assert read is not None
+        assert tuple(read[0, 0].tolist()) == first
+    assert document["repeated"] == [0.5, 0.25]
+    assert document["views"] == ["a", "b"]

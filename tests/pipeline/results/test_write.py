@@ -11,10 +11,15 @@ import pytest
 from pipeline.contour_fit.fit import Fit
 from pipeline.evidence.camera_metrics import CameraFigures
 from pipeline.evidence.measurements import Landmark, Measurement
+from pipeline.faces.matching import complete_match
+from pipeline.faces.subject import SubjectFaces
+from pipeline.faces.triangulated_face import triangulate_face
 from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
+from pipeline.results import report
 from pipeline.results.overlays import FITTED_COLOUR, INPUT_COLOUR, PART_COLOURS, TINT, overlay
 from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.report_types import FaceReport
 from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
 from rig.capture import Capture
@@ -23,6 +28,8 @@ from rig.formats.pictures.images import read_image
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.messages.message import compose
+from tests.support.drawn_faces import seen_face
+from tests.support.drawn_studio import drawn_studio
 from tests.support.made_up_results import made_up_result
 from tests.support.scenes import ellipsoid, fan, pattern
 from tests.support.shared_data import shared
@@ -225,3 +232,28 @@ def test_the_shared_checker_finds_no_breach_of_the_contract(folder: Path, monkey
     faults, mesh = score.check_result(str(folder))
     assert faults == []
     assert mesh is not None
+
+
+def test_each_camera_has_its_face_and_nothing_else() -> None:
+    rig, rng = drawn_studio(), np.random.default_rng(3)
+    placed = Similarity(1.0, np.eye(3), np.zeros(3))
+    detections = {name: seen_face(placed, rig[name], rng, score=31.5) for name in ("cam0", "cam1", "cam2")}
+    face = triangulate_face(detections, rig)
+    assert face is not None
+    subject = SubjectFaces({"cam3": (), **{n: (d,) for n, d in detections.items()}}, complete_match(face, {}, rig), ())
+    found = report._faces(subject, rig.names)
+    assert list(found) == list(rig.names)
+    for name, of_camera in found.items():
+        assert of_camera.keys() == FaceReport.__annotations__.keys()
+        assert of_camera.keys() == {"found", "box_px", "roll_deg", "landmarks", "score"}
+        assert of_camera["found"] == (name in detections)
+    assert found["cam0"]["landmarks"] == 468
+    assert found["cam0"]["score"] == 31.5
+    assert found["cam0"]["box_px"] == pytest.approx(detections["cam0"].box_px.tolist())
+    assert found["cam5"] == {"found": False, "box_px": None, "roll_deg": None, "landmarks": 0, "score": None}
+
+
+def test_where_views_do_not_agree_no_camera_has_the_subject() -> None:
+    rig, rng = drawn_studio(), np.random.default_rng(3)
+    seen = {"cam0": (seen_face(Similarity(1.0, np.eye(3), np.zeros(3)), rig["cam0"], rng),)}
+    assert not any(one["found"] for one in report._faces(SubjectFaces(seen, None, ()), rig.names).values())

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import (
     Silhouette,
     ViewQuality,
@@ -40,11 +40,6 @@ PLACES_DEG = [
     (90, 30),
 ]
 POSE = Similarity(1.01, rotation_from_vector(np.array([0.05, -0.1, 0.02])), np.array([4.0, -6.0, 3.0]))
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

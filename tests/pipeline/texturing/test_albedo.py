@@ -7,9 +7,8 @@ from pipeline.geometry.raster import depth_maps
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.settings import TextureSettings
 from pipeline.texturing.albedo import DIM_SHARE, Albedo, estimate_albedo, shine_left
-from pipeline.texturing.inpaint import neighbours
 from pipeline.texturing.layout.uv_unwrap import Atlas, Layout, unwrap
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.vertex_colours import Texture, texture, underexposed_views
 from rig.camera import Camera
@@ -77,7 +76,7 @@ def found(mesh: Mesh, layout: Layout) -> dict[str, tuple[Atlas, Albedo, np.ndarr
         silhouettes = {key: silhouette_from_mask(mask) for key, (_, mask) in shots.items()}
         depths, settings = depth_maps(rig, mesh), TextureSettings()
         coloured = texture(
-            mesh, normals, capture, silhouettes, rig, depths, settings=settings, around=around, dim_share=DIM_SHARE
+            mesh, capture, silhouettes, rig, depths, settings=settings, around=around, dim_share=DIM_SHARE
         )
         assert coloured.decision is not None
         atlas = paint_texture(layout, mesh, coloured.colours, coloured.decision, 1024)

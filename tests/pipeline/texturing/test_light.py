@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.texturing.inpaint import neighbours
 from pipeline.texturing.light import RETURNED, fit_light, harmonics, spread_directions, transfer
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
 

@@ -8,9 +8,8 @@ import pytest
 
 from pipeline.geometry.raster import depth_maps
 from pipeline.settings import TextureSettings
-from pipeline.texturing.inpaint import neighbours
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture, texture_size
 from pipeline.texturing.vertex_colours import Texture, texture
 from rig.colour_space import srgb_from_linear
@@ -41,9 +40,7 @@ def coloured(shot: Shot) -> Texture:
     mesh = shot.mesh
     around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
     depths, settings = depth_maps(shot.rig, mesh), TextureSettings()
-    return texture(
-        mesh, mesh.normals(), shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around
-    )
+    return texture(mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around)
 
 
 @pytest.fixture(scope="module")

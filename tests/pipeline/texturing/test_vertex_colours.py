@@ -9,11 +9,14 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from pipeline.geometry.raster import depth_map, depth_maps
+from pipeline.head_model.subdivision import boundary_loops, close_loop
 from pipeline.imaging.colour_balance import balance
 from pipeline.imaging.silhouette import ViewQuality, silhouette_from_mask
 from pipeline.settings import TextureSettings
-from pipeline.texturing.inpaint import fill_unknown
-from pipeline.texturing.vertex_colours import Texture, texture
+from pipeline.texturing.layout.uv_unwrap import unwrap
+from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown, neighbours
+from pipeline.texturing.paint import paint_texture
+from pipeline.texturing.vertex_colours import Texture, fill_unobserved_patches, texture
 from pipeline.texturing.vertex_colours_kernels import OUTLIER
 from pipeline.texturing.visibility import sharpened
 from rig.capture import Capture
@@ -21,7 +24,7 @@ from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from tests.support.photographs import SCREEN, Shot, shoot, trace
-from tests.support.scenes import ellipsoid, fan
+from tests.support.scenes import ellipsoid, fan, pattern
 
 EXPOSURES = np.array([0.8, 1.2, 0.9, 1.1, 1.2, 0.8, 1.0])[:, None] * np.array([1.0, 0.98, 1.03])
 
@@ -30,7 +33,6 @@ def colour(shot: Shot, outlier: float = OUTLIER, **settings) -> Texture:
     chosen = TextureSettings(**settings)
     return texture(
         shot.mesh,
-        shot.mesh.normals(),
         shot.capture,
         shot.silhouettes,
         shot.rig,
@@ -117,9 +119,7 @@ def test_hidden_surfaces_take_no_colour_from_what_hides_them() -> None:
     image = np.rint(255 * srgb_from_linear(np.where(np.isfinite(depth)[:, :, None], linear, 0.3))).astype(np.uint8)
     silhouette = silhouette_from_mask(np.isfinite(depth))
     capture = Capture({"cam00": image})
-    found = texture(
-        mesh, mesh.normals(), capture, {"cam00": silhouette}, rig, {"cam00": depth}, settings=TextureSettings()
-    )
+    found = texture(mesh, capture, {"cam00": silhouette}, rig, {"cam00": depth}, settings=TextureSettings())
     lit = found.views[:count] > 0
     assert lit.sum() > 500
     assert (found.colours[:count][lit][:, 0] < 80).all()
@@ -242,3 +242,62 @@ def test_the_tracer_and_the_mesh_agree() -> None:
     mesh = ellipsoid()
     _, mask = trace(camera, 0.0)
     assert np.count_nonzero(mask ^ np.isfinite(depth_map(camera, mesh.vertices, mesh.faces)[0])) < 0.01 * mask.sum()
+
+
+OPENING_MM = 12.0
+
+
+def with_strip(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
+    """The ellipsoid, open below, with a flat strip across an opening in its front; and which faces are the strip's."""
+    tip = mesh.vertices[mesh.vertices[:, 2].argmax()]
+    off = np.linalg.norm(mesh.vertices - tip, axis=1)
+    above = mesh.vertices[mesh.faces][:, :, 1].min(axis=1) > 0.8 * mesh.vertices[:, 1].min()
+    kept = above & (off[mesh.faces] > OPENING_MM).any(axis=1)
+    used, joined = np.unique(mesh.faces[kept], return_inverse=True)
+    vertices, faces = mesh.vertices[used], joined.reshape(-1, 3).astype(np.int32)
+    (loop,) = (loop for loop in boundary_loops(faces) if vertices[loop, 2].min() > 0.5 * tip[2])
+    strip = close_loop(vertices, loop)
+    whole = np.concatenate([faces, strip]).astype(np.int32)
+    return Mesh(vertices, whole), np.arange(len(faces), len(whole))
+
+
+def test_a_strip_across_an_opening_takes_one_photograph() -> None:
+    shot = shoot()
+    mesh, strip = with_strip(ellipsoid(5))
+    settings, depths = TextureSettings(), depth_maps(shot.rig, mesh)
+    around = Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
+    found = texture(mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around)
+    assert found.decision is not None
+    rim = np.unique(mesh.faces[strip])  # hidden by lids, as it were
+    weights, slots, shares = (
+        array.copy() for array in (found.decision.weights, found.decision.slots, found.decision.shares)
+    )
+    weights[:, rim], slots[rim], shares[rim] = 0.0, -1, 0.0
+    hidden = replace(found.decision, weights=weights, slots=slots, shares=shares)
+    skin = found.colours.copy()
+    skin[rim] = (150, 110, 90)
+    layout = unwrap(mesh.vertices, mesh.faces)
+    seen = fill_unobserved_patches(hidden, mesh, shot.silhouettes, depths)
+    assert len(np.unique(seen.slots[rim, 0])) == 1  # no seams in it
+    assert fill_unobserved_patches(hidden, mesh, shot.silhouettes, depths, np.ones(len(skin), bool)) is hidden
+    others = np.setdiff1d(np.arange(len(mesh.vertices)), rim)
+    np.testing.assert_array_equal(seen.slots[others], hidden.slots[others])
+    truth = 255 * srgb_from_linear(pattern(mesh.vertices[mesh.faces[strip]].mean(axis=1)))
+    off = []
+    for decision in (hidden, seen):
+        image = np.ascontiguousarray(paint_texture(layout, mesh, skin, decision, 1024).image)
+        middle = (1024 * layout.uv[layout.faces[strip]].mean(axis=1) - 0.5).astype(np.float32)
+        shown = cv2.remap(image, middle[None, :, 0], middle[None, :, 1], cv2.INTER_LINEAR)[0]
+        off.append(np.median(np.abs(shown - truth)))
+    assert off[1] < 5 < 15 < off[0]
+
+
+def test_what_views_see_by_its_vertices_stays() -> None:
+    shot = shoot()
+    settings, depths = TextureSettings(), depth_maps(shot.rig, shot.mesh)
+    around = Neighbourhood.of(*neighbours(shot.mesh.faces, len(shot.mesh.vertices)))
+    coloured = texture(shot.mesh, shot.capture, shot.silhouettes, shot.rig, depths, settings=settings, around=around)
+    decision = coloured.decision
+    assert decision is not None
+    again = fill_unobserved_patches(decision, shot.mesh, shot.silhouettes, depths)
+    np.testing.assert_array_equal(again.slots, decision.slots)

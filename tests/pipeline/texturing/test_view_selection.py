@@ -7,8 +7,7 @@ import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 
-from pipeline.texturing.inpaint import neighbours
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.seam_levelling import LEVELLING, level_views
 from pipeline.texturing.view_selection import add_similar_views, select_views
 from pipeline.texturing.view_selection_kernels import RING_SHARE, differences, fill_slots, propagate

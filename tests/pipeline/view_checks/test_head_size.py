@@ -10,7 +10,14 @@ from calibration.scene.rig_scale import times
 from pipeline.head_model.model import load_model
 from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.view_checks.guards import FaceEvidence, Guards
-from pipeline.view_checks.head_size import WrongScale, crown_disc, head_diameter_mm, judge_head_size
+from pipeline.view_checks.head_size import (
+    SKULL_MM,
+    WrongScale,
+    crown_disc,
+    find_low_crowns,
+    head_diameter_mm,
+    judge_head_size,
+)
 from rig.rig import Rig
 from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
@@ -126,11 +133,27 @@ def test_a_face_of_a_humans_size_overrules_the_outlines(heads):
     rig, of = heads
     scaled = times(rig, 3.3)
     front = scaled[scaled.front_camera()]
-    up = -front.camera_from_world.rotation[1]
-    face = FaceEvidence(3.3 * head_middle(of["short"], rig), up, rig.names[:3], ())
+    turn = front.camera_from_world.rotation.T * (1.0, -1.0, -1.0)  # a camera looks along z, with y down
+    face = FaceEvidence(3.3 * head_middle(of["short"], rig), turn, rig.names[:3], ())
     (warning,) = judge_head_size(of["short"], scaled, lambda: face)
     assert warning.code == "scale-implausible"
     assert "scale.json" not in warning.text
+
+
+@pytest.mark.parametrize("hair", STYLES)
+@pytest.mark.parametrize("count", [3, 11])
+def test_a_mask_that_lacks_the_crown_is_named(heads, hair, count):
+    rig, of = heads
+    some = rig.subset(rig.names[:count])
+    turn = rig[rig.front_camera()].camera_from_world.rotation.T * (1.0, -1.0, -1.0)
+    face = FaceEvidence(head_middle(of[hair], rig) - turn @ SKULL_MM, turn, rig.names[:3], ())
+    whole = {name: of[hair][name] for name in some.names}
+    assert find_low_crowns(whole, some, lambda: face) == {}
+    mask = whole[some.names[0]].mask.copy()
+    mask[: np.flatnonzero(mask.any(axis=1))[0] + 24] = False  # 50 mm
+    cut = whole | {some.names[0]: silhouette_from_mask(mask)}
+    assert find_low_crowns(cut, some, lambda: face).keys() == {some.names[0]}
+    assert find_low_crowns(cut, some, lambda: None) == {}
 
 
 def test_anyway_turns_the_refusal_into_a_doubtful_pose(heads):

@@ -64,9 +64,8 @@ def test_unknown_keys_are_refused_with_the_nearest() -> None:
     changed = document(shot={"skew_most": 3.0}, triger={"port": "x"})
     changed["cameras"][0]["identty"] = "x"
     message = faults_of(changed)
-    assert "shot.skew_most: no such key; did you mean 'skew_most_ms'?" in message
-    assert "triger: no such key; did you mean 'trigger'?" in message
-    assert "cameras.cam00.identty: no such key; did you mean 'identity'?" in message
+    for key, near in (("shot.skew_most", "skew_most_ms"), ("triger", "trigger"), ("cameras.cam00.identty", "identity")):
+        assert f"unknown key '{key}'; did you mean '{near}'?" in message
 
 
 @pytest.mark.parametrize("identity", ["0", "11", "/dev/video0", "usb:001,004", "cam#2", " 3 "])
@@ -94,15 +93,15 @@ def test_a_trigger_port_by_index_is_refused(port: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"format": "eigenhead-rig/9"}, "format: 'eigenhead-rig/9' is not allowed"),
+        ({"format": "eigenhead-rig/9"}, "format is 'eigenhead-rig/9', wanted 'eigenhead-rig/1'"),
         ({"cameras": []}, "add one [[cameras]] table"),
-        ({"cameras": {}}, "cameras: is no list"),
-        ({"cameras": [7]}, "cameras[0]: is no table"),
+        ({"cameras": {}}, "cameras is {}, wanted a list"),
+        ({"cameras": [7]}, "cameras[0] is no object"),
         ({"front": "cam0"}, "did you mean 'cam00'?"),
         ({"lights": {"outputs": [5]}}, "5 is no output"),
-        ({"lights": {"keep_on": 1}}, "lights.keep_on: 1 is no true or false"),
-        ({"shot": {"warm_up_frames": 0}}, "warm_up_frames: 0 is too small; at least 1"),
-        ({"shot": {"timeout_s": "2"}}, "shot.timeout_s: '2' is no number"),
+        ({"lights": {"keep_on": 1}}, "lights.keep_on is 1, wanted true or false"),
+        ({"shot": {"warm_up_frames": 0}}, "shot.warm_up_frames: 0 is not between 1 and 1000"),
+        ({"shot": {"timeout_s": "2"}}, "shot.timeout_s is '2', wanted a finite number"),
         ({"trigger": {}}, "trigger.port: missing"),
         ({"trigger": {"port": "/dev/serial/by-id/x", "pulse_us": 0}}, "pulse_us: 0"),
     ],
@@ -114,13 +113,13 @@ def test_wrong_values_are_named(changes: dict[str, Any], expected: str) -> None:
 @pytest.mark.parametrize(
     ("camera", "expected"),
     [
-        ({"driver": "opencvv"}, "did you mean 'opencv'?"),
-        ({"rotation_deg": 45}, "one of 0, 90, 180, 270"),
-        ({"rotation_deg": True}, "rotation_deg: True is not allowed"),
+        ({"driver": "opencvv"}, "driver is 'opencvv', wanted 'opencv' or 'gphoto'"),
+        ({"rotation_deg": 45}, "rotation_deg is 45, wanted 0 or 90 or 180 or 270"),
+        ({"rotation_deg": True}, "rotation_deg is True, wanted 0 or 90"),
         ({"channel": 12}, "channel: 12"),
         ({"channel": 1}, "there is no [trigger] table"),
         ({"delay_us": -1}, "delay_us: -1"),
-        ({"width": 1.5}, "width: 1.5 is no whole number"),
+        ({"width": 1.5}, "width is 1.5, wanted a whole number or null"),
         ({"name": "a/b"}, "name: "),
         ({"identity": ""}, "identity: empty"),
     ],
@@ -151,10 +150,10 @@ def test_files_that_are_no_rig(tmp_path: Path) -> None:
     ("changes", "fault"),
     [
         ({"lights": {"settle_s": -1.0}}, "lights.settle_s: -1.0 is not between 0 and 60"),
-        ({"shot": {"timeout_s": float("nan")}}, "shot.timeout_s: nan is no finite number"),
-        ({"shot": {"open_timeout_s": float("inf")}}, "shot.open_timeout_s: inf is no finite number"),
-        ({"shot": {"timeout_s": 1e6}}, "shot.timeout_s: 1000000.0 is too large; at most 600"),
-        ({"shot": {"plates": 1_000_000_000}}, "shot.plates: 1000000000 is too large; at most 32"),
+        ({"shot": {"timeout_s": float("nan")}}, "shot.timeout_s is nan, wanted a finite number"),
+        ({"shot": {"open_timeout_s": float("inf")}}, "shot.open_timeout_s is inf, wanted a finite number"),
+        ({"shot": {"timeout_s": 1e6}}, "shot.timeout_s: 1000000.0 is not between 0.001 and 600"),
+        ({"shot": {"plates": 1_000_000_000}}, "shot.plates: 1000000000 is not between 1 and 32"),
         ({"trigger": {"port": "/dev/serial/by-id/box", "baud": 0}}, "trigger: baud: 0 is not between 300 and 4000000"),
     ],
 )

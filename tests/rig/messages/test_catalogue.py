@@ -33,7 +33,6 @@ RAW = {
     "server/cli/refine.py": 2,
     "server/cli/studio.py": 1,
     "server/cli/verify.py": 4,
-    "server/tasks/ingest.py": 2,
     "server/tasks/photographs.py": 3,
     "server/tasks/simulate.py": 1,
 }

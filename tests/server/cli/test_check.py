@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,17 @@ import pytest
 
 from pipeline.head_model.model import load_model
 from rig.capture import Capture, reassign_images
-from rig.errors import WrongVariable
+from rig.errors import InputError, WrongVariable
 from rig.formats.cameras.cameras_file import write_rig_file
-from rig.formats.captures.archive import pack_folder
+from rig.formats.captures.archive import ArchiveLimits, pack_folder
 from rig.formats.captures.capture_folder import write_capture
+from rig.messages.message import texts_of
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from server.cli.check import Checked, checked, lines
+from server.tasks.child import WorkerContext
+from server.tasks.ingest import ingest_archive
 from tests.server.cli.test_main import run
 from tests.server.http.test_hostile import SPOILT
 from tests.support.services import small_capture
@@ -40,9 +44,9 @@ def masked(renderer: Renderer) -> tuple[Capture, Rig]:
 
 def test_every_fault_is_told_at_once_and_is_status_2(tmp_path: Path) -> None:
     folder = small_capture(tmp_path / "capture")
-    for case in ("every camera at one place", "an image without a camera", "features of a third eye"):
+    for case in ("every camera at one place", "features of a third eye"):
         SPOILT[case][0](folder)
-    (folder / "images" / "cam01.png").unlink()
+    (folder / "images" / "cam01.png").rename(folder / "images" / "foo.png")
     pack_folder(folder, tmp_path / "capture.tar")
     for capture in (folder, tmp_path / "capture.tar"):
         done = run("check", str(capture), "--json")
@@ -67,6 +71,26 @@ def test_a_good_capture_is_nothing_to_speak_of(masked: tuple[Capture, Rig], tmp_
 
 
 @pytest.mark.gl
+@pytest.mark.parametrize("name", ["cam03", "cam00", "cam09"])
+@pytest.mark.parametrize(
+    ("turn", "word"),
+    [
+        (lambda of: of[::-1, ::-1], "turned by 180 degrees"),
+        (lambda of: of[:, ::-1], "flipped left to right"),
+        (lambda of: of[::-1], "flipped upside down"),
+    ],
+)
+def test_a_camera_whose_pictures_are_turned_is_named(
+    masked: tuple[Capture, Rig], name: str, turn: Callable[[np.ndarray], np.ndarray], word: str, tmp_path: Path
+) -> None:
+    capture, rig = masked
+    images, masks = ({**of, name: np.ascontiguousarray(turn(of[name]))} for of in (capture.images, capture.masks))
+    write_capture(tmp_path / "shot", replace(capture, images=images, masks=masks), rig)
+    said = [warning["message"] for warning in found_in(tmp_path / "shot")["warnings"] if name in warning["message"]]
+    assert any(word in message for message in said), said
+
+
+@pytest.mark.gl
 def test_outlines_name_exchanged_pictures_as_a_warning_or_as_a_fault(
     masked: tuple[Capture, Rig], tmp_path: Path
 ) -> None:
@@ -77,6 +101,21 @@ def test_outlines_name_exchanged_pictures_as_a_warning_or_as_a_fault(
     assert [w for w in found["warnings"] if w["code"] == "cameras-exchanged" and "cam02 and cam07" in w["message"]]
     refused = found_in(tmp_path / "shot", exchanged_pictures="refuse")
     assert [fault for fault in refused["faults"] if "cam02 and cam07" in fault]
+
+
+@pytest.mark.gl
+def test_mirrored_pictures_are_refused_by_an_upload_in_the_same_words(
+    masked: tuple[Capture, Rig], tmp_path: Path
+) -> None:
+    capture, rig = masked
+    kinds = capture.images, capture.masks
+    images, masks = ({name: np.ascontiguousarray(p[:, ::-1]) for name, p in of.items()} for of in kinds)
+    write_capture(tmp_path / "shot", replace(capture, images=images, masks=masks), rig)
+    pack_folder(tmp_path / "shot", tmp_path / "shot.tar")
+    archive = {"archive": str(tmp_path / "shot.tar"), "folder": str(tmp_path / "kept"), "limits": ArchiveLimits()}
+    with pytest.raises(InputError) as refusal:
+        ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=10**8)
+    assert texts_of(refusal.value.faults) == found_in(tmp_path / "shot")["faults"] != []
 
 
 @pytest.mark.gl

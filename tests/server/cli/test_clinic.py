@@ -1,6 +1,7 @@
 """The commands of a clinic, on result folders that hold what they read."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,12 @@ def test_a_measure_comes_with_its_deviation_and_size(result: Path, tmp_path: Pat
     helmet = document["sizes"]["helmet"]
     limits = {"S": (480, 540), "M": (540, 600), "L": (600, 660)}[helmet["best"]]
     assert limits[0] <= girth["value"] < limits[1]
+    report = json.loads((result / "report.json").read_text())
+    doubt = {"code": "scale-assumed", "message": "an assumption", "parameters": {"scale": "an assumption"}}
+    doubted = shutil.copytree(result, tmp_path / "doubted")
+    (doubted / "report.json").write_text(json.dumps(report | {"scale_sigma": 0.06, "warnings": [doubt]}))
+    done = CliRunner().invoke(app, ["measure", str(doubted)])
+    assert "doubted: an assumption" in done.output
     table.write_text(table.read_text().replace("head_circumference", "hat"))
     refused = CliRunner().invoke(app, ["measure", str(result), "--sizes", str(table)])
     assert "helmet: hat is no measure of this head" in str(refused.exception)

@@ -5,10 +5,7 @@ import hashlib
 import hmac
 import json
 import socket
-import threading
-import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,8 @@ from rig.formats.captures.archive import pack_folder
 from server.services.keys import SCOPES, Keys
 from server.settings import ServiceSettings
 from server.storage.database import open_database
-from tests.support.services import RunningService, await_state, packed, running_service, small_capture
+from tests.support.loopback import hooked
+from tests.support.services import RunningService, await_state, await_true, packed, running_service, small_capture
 
 
 @pytest.fixture(scope="module")
@@ -135,39 +133,19 @@ def test_a_key_has_a_limit_of_jobs(guarded: tuple[RunningService, dict[str, str]
 
 @pytest.mark.slow
 def test_webhooks_are_signed_and_tried_again(tmp_path: Path) -> None:
-    received: list[tuple[dict[str, str], bytes]] = []
-
-    class Receiver(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["content-length"]))
-            received.append(({k.lower(): v for k, v in self.headers.items()}, body))
-            self.send_response(500 if len(received) == 1 else 204)  # the first attempt fails
-            self.end_headers()
-
-        def log_message(self, format: str, *args: Any) -> None:
-            pass
-
-    receiver = HTTPServer(("127.0.0.1", 0), Receiver)
-    threading.Thread(target=receiver.serve_forever, daemon=True).start()
-    try:
-        with running_service(tmp_path / "data") as service, client_of(service, None) as client:
-            url = f"http://127.0.0.1:{receiver.server_port}/hook"
-            hook = client.post("/v1/webhooks", json={"url": url}).json()
-            assert "secret" not in client.get("/v1/webhooks").json()["webhooks"][0]
-            pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
-            capture = client.post(
-                "/v1/captures/uploads", files={"file": (tmp_path / "capture.tar").read_bytes()}
-            ).json()
-            job = client.post("/v1/jobs", json={"capture_id": capture["id"]}).json()
-            await_state(client, job["id"], ("succeeded",))
-            deadline = time.monotonic() + 30
-            while len(received) < 2 and time.monotonic() < deadline:
-                time.sleep(0.1)
-    finally:
-        receiver.shutdown()
-        receiver.server_close()
-    assert len(received) == 2
-    (first, body), (second, again) = received
+    with (
+        hooked(fails_first=True) as receiver,
+        running_service(tmp_path / "data") as service,
+        client_of(service, None) as client,
+    ):
+        hook = client.post("/v1/webhooks", json={"url": receiver.url + "/hook"}).json()
+        assert "secret" not in client.get("/v1/webhooks").json()["webhooks"][0]
+        pack_folder(small_capture(tmp_path / "capture"), tmp_path / "capture.tar")
+        capture = client.post("/v1/captures/uploads", files={"file": (tmp_path / "capture.tar").read_bytes()}).json()
+        job = client.post("/v1/jobs", json={"capture_id": capture["id"]}).json()
+        await_state(client, job["id"], ("succeeded",))
+        await_true(lambda: len(receiver.received) == 2)
+    (first, body), (second, again) = receiver.received
     assert first["webhook-id"] == second["webhook-id"]
     assert body == again
     assert json.loads(body) == {"type": "job.succeeded", "data": {"job_id": job["id"]}}

@@ -2,14 +2,11 @@
 
 import csv
 import io
-import json
 import os
 import re
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +14,15 @@ import httpx
 import pyarrow.parquet
 import pytest
 
-from tests.support.services import RunningService, await_state, running_service, uploaded_capture, worker_pids
+from tests.support.loopback import hooked
+from tests.support.services import (
+    RunningService,
+    await_state,
+    await_true,
+    running_service,
+    uploaded_capture,
+    worker_pids,
+)
 
 URN = "urn:eigenhead:problem:"
 
@@ -264,36 +269,17 @@ def test_the_table_and_the_sheet_are_those_of_the_command_line(tmp_path: Path) -
 
 
 def test_webhooks_hear_once_of_each_end_of_a_batch(http: httpx.Client, captures: list[str]) -> None:
-    received: list[dict[str, Any]] = []
-
-    class Receiver(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            received.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
-            self.send_response(204)
-            self.end_headers()
-
-        def log_message(self, format: str, *args: Any) -> None:
-            pass
-
-    receiver = HTTPServer(("127.0.0.1", 0), Receiver)
-    threading.Thread(target=receiver.serve_forever, daemon=True).start()
-    hook = http.post("/v1/webhooks", json={"url": f"http://127.0.0.1:{receiver.server_port}/"}).json()["id"]
-    try:
+    with hooked() as receiver:
+        hook = http.post("/v1/webhooks", json={"url": receiver.url}).json()["id"]
         batch = begin(http, captures=captures[:1], settings={"front": "fail"})["id"]
         for times in (1, 2):
             awaited(http, batch, finished)
-            deadline = time.monotonic() + 30
-            while len(heard := [one for one in received if one["type"] == "batch.finished"]) < times:
-                assert time.monotonic() < deadline, received
-                time.sleep(0.05)
+            await_true(lambda: len(receiver.data_of("batch.finished")) >= times)  # noqa: B023
             time.sleep(0.5)
-            assert heard == times * [{"type": "batch.finished", "data": {"batch_id": batch}}]
+            assert receiver.data_of("batch.finished") == times * [{"batch_id": batch}]
             if times == 1:
                 http.post(f"/v1/batches/{batch}/retry")
-    finally:
         http.delete(f"/v1/webhooks/{hook}")
-        receiver.shutdown()
-        receiver.server_close()
 
 
 def test_an_operators_shot_goes_before_the_batch(http: httpx.Client, captures: list[str]) -> None:

@@ -139,7 +139,6 @@ SPOILT: dict[str, tuple[Callable[[Path], None], str]] = {
     "every camera at one place": (cameras(of_each("camera_from_world.translation", [0, 0, 1000])), "at one place"),
     "translations in metres": (cameras(in_metres), "look like metres"),
     "a lens of k1 = 50": (cameras(of_first("distortion.k1", 50)), "lens is absurd"),
-    "an image without a camera": (writes("images/foo.png", png_claiming(24, 24)), "images/foo.png has no camera"),
     "an image turned": (writes("images/cam00.png", png_claiming(24, 30)), "24 x 30"),
     "features in one view": (points('"pronasale": {"cam00": [1, 2]}'), "in one view only"),
     "features of a third eye": (points('"third_eye": {"cam00": [1, 2]}'), "is no landmark"),

@@ -4,7 +4,7 @@ import pytest
 
 from pipeline.head_model.model import load_model
 from pipeline.settings import settings_from_document
-from pipeline.texturing.head_texture import find_layout
+from pipeline.texturing.paint import find_layout
 from server.services.presets import PRESETS, Preset, settings_of
 
 

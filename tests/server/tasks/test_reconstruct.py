@@ -10,15 +10,17 @@ import pytest
 from scipy.spatial import KDTree
 
 from pipeline.head_model.model import load_model
+from pipeline.settings import Settings
 from pipeline.view_checks.usable_views import TooFewViews
 from rig.formats.captures.capture_folder import write_capture
 from rig.formats.meshes.mesh_file import read_mesh
+from rig.render.compute import ComputeDevice, is_software, open_device
 from rig.render.renderer import Renderer
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
 from rig.studio.sensor.preset import PRESET
 from server.tasks.child import WorkerContext
-from server.tasks.reconstruct import reconstruct_capture
+from server.tasks.reconstruct import MOST_THREADS, matching_device, reconstruct_capture
 from server.tasks.subjects import drawn_subject
 
 pytestmark = [pytest.mark.slow, pytest.mark.gl]
@@ -89,3 +91,42 @@ def test_an_empty_studio_is_refused_and_leaves_no_result(
             settings={},
         )
     assert not (tmp_path / "result").exists()
+
+
+GPU, LLVMPIPE = "NVIDIA H200/PCIe/SSE2, 4.3.0 NVIDIA 580.159.04", "llvmpipe (LLVM 15.0.6, 256 bits), 4.5 Mesa 22.3.6"
+
+
+@pytest.mark.parametrize(
+    ("renderer", "software"),
+    [
+        (GPU, False),
+        ("AMD Radeon RX 7900 (radeonsi, navi31), 4.6 Mesa 24.0.5", False),
+        (LLVMPIPE, True),
+        ("softpipe, 3.3 Mesa", True),
+        ("Google SwiftShader, OpenGL ES 3.0", True),
+    ],
+)
+def test_renderers_that_draw_with_the_processor_are_no_gpu(renderer: str, software: bool) -> None:
+    assert is_software(renderer) == software
+
+
+@pytest.mark.gl
+def test_auto_leaves_software_alone_and_gl_takes_it() -> None:
+    assert open_device("cpu", GPU) is None
+    assert open_device("auto", LLVMPIPE) is None
+    for device in (open_device("gl", LLVMPIPE), open_device("auto", GPU)):
+        assert isinstance(device, ComputeDevice)
+        device.close()
+
+
+@pytest.mark.gl
+def test_the_device_is_made_once_a_process_and_many_threads_need_none(
+    renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context, settings = WorkerContext(), replace(Settings(), device="gl")
+    first = matching_device(context, settings, renderer)
+    assert first is not None
+    assert matching_device(context, settings, renderer) is first
+    context.close()
+    monkeypatch.setenv("EIGENHEAD_THREADS", str(MOST_THREADS + 1))
+    assert matching_device(WorkerContext(), Settings(), renderer) is None

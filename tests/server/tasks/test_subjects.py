@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.formats.meshes.obj import obj_bytes
 from rig.studio.scene.subject import Subject
 from server.tasks.subjects import subject_of, turn_eyes
+from tests.support.glb import obj_bytes
 from tests.support.landmark_files import write_landmarks
 from tests.support.measured_heads import mannequin, marks, model
 

@@ -1,86 +1,61 @@
 """Captures that come from a server elsewhere: off by default, judged at each redirection, bounded in bytes and time;
 and a job's own webhook, name and log."""
 
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import httpx
 import pytest
 
+from tests.support.loopback import Hook, hooked
 from tests.support.services import RunningService, await_state, await_true, packed_capture, running_service
 
 
-class Store:
-    """A server elsewhere: /a.tar is a capture, other paths misbehave. Keeps what it was sent."""
+class Store(BaseHTTPRequestHandler):
+    """A server elsewhere: /a.tar is a capture, other paths misbehave."""
 
-    def __init__(self, archive: bytes) -> None:
-        store, self.received = self, list[tuple[dict[str, str], bytes]]()
+    archive = b""
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                where = self.path.strip("/")
-                if where.startswith("to/"):
-                    self.send_response(302)
-                    self.send_header("Location", where.removeprefix("to/"))
-                    self.end_headers()
-                elif where == "a.tar":
-                    self._give(archive)
-                elif where == "short":
-                    self._give(archive[:1000], length=len(archive))
-                elif where == "endless":
-                    self.send_response(200)
-                    self.end_headers()
-                    while not self.wfile.closed:
-                        self.wfile.write(bytes(1 << 16))
-                elif where == "slow":
-                    self.send_response(200)
-                    self.end_headers()
-                    time.sleep(6)
-                else:
-                    self.send_error(404)
+    def do_GET(self) -> None:
+        where = self.path.strip("/")
+        if where.startswith("to/"):
+            self.send_response(302)
+            self.send_header("Location", where.removeprefix("to/"))
+            self.end_headers()
+        elif where == "a.tar":
+            self._give(self.archive)
+        elif where == "short":
+            self._give(self.archive[:1000], length=len(self.archive))
+        elif where == "endless":
+            self.send_response(200)
+            self.end_headers()
+            while not self.wfile.closed:
+                self.wfile.write(bytes(1 << 16))
+        elif where == "slow":
+            self.send_response(200)
+            self.end_headers()
+            time.sleep(6)
+        else:
+            self.send_error(404)
 
-            def do_POST(self) -> None:
-                length = int(self.headers["content-length"])
-                store.received.append(({k.lower(): v for k, v in self.headers.items()}, self.rfile.read(length)))
-                self.send_response(204)
-                self.end_headers()
-
-            def handle(self) -> None:
-                with suppress(ConnectionError):  # it was told enough
-                    super().handle()
-
-            def _give(self, data: bytes, length: int | None = None) -> None:
-                self.send_response(200)
-                self.send_header("Content-Length", str(length or len(data)))
-                self.end_headers()
-                self.wfile.write(data)
-
-            def log_message(self, format: str, *args: object) -> None:
-                pass
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self._server.server_port}"
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+    def _give(self, data: bytes, length: int | None = None) -> None:
+        self.send_response(200)
+        self.send_header("Content-Length", str(length or len(data)))
+        self.end_headers()
+        self.wfile.write(data)
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
-    store = Store(packed_capture(tmp_path_factory.mktemp("archive")).read_bytes())
-    yield store
-    store.close()
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hook]:
+    Store.archive = packed_capture(tmp_path_factory.mktemp("archive")).read_bytes()
+    with hooked(base=Store) as store:
+        yield store
 
 
 @pytest.fixture(scope="module")
-def service(store: Store, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
+def service(store: Hook, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService]:
     origins = f'["{store.url}"]'
     with running_service(
         tmp_path_factory.mktemp("service") / "data",
@@ -97,7 +72,7 @@ def imported(service: RunningService, url: str) -> httpx.Response:
 
 
 @pytest.mark.parametrize("way", ["{0}/a.tar", "{0}/to//a.tar", "{0}/to/{0}/to/{0}/a.tar"])
-def test_an_archive_elsewhere_becomes_a_capture(way: str, service: RunningService, store: Store) -> None:
+def test_an_archive_elsewhere_becomes_a_capture(way: str, service: RunningService, store: Hook) -> None:
     made = imported(service, way.format(store.url))
     assert made.status_code == 201, made.text
     capture = httpx.get(service.url + made.headers["location"]).json()
@@ -121,7 +96,7 @@ def test_an_archive_elsewhere_becomes_a_capture(way: str, service: RunningServic
         ("{0}/endless", "upload-too-large", "4,194,304"),
     ],
 )
-def test_what_is_refused_leaves_nothing(way: str, kind: str, why: str, service: RunningService, store: Store) -> None:
+def test_what_is_refused_leaves_nothing(way: str, kind: str, why: str, service: RunningService, store: Hook) -> None:
     before = httpx.get(service.url + "/v1/captures").json()
     refused = imported(service, way.format(store.url))
     assert refused.status_code == (413 if kind == "upload-too-large" else 422), refused.text
@@ -131,7 +106,7 @@ def test_what_is_refused_leaves_nothing(way: str, kind: str, why: str, service: 
     assert list((service.data / "incoming").iterdir()) == []
 
 
-def test_a_jobs_own_webhook_name_and_log(service: RunningService, store: Store) -> None:
+def test_a_jobs_own_webhook_name_and_log(service: RunningService, store: Hook) -> None:
     capture = imported(service, store.url + "/a.tar").json()["id"]
     secret = "whsec_" + "A" * 32
     with httpx.Client(base_url=service.url, timeout=30) as client:
@@ -159,7 +134,7 @@ def test_a_jobs_own_webhook_name_and_log(service: RunningService, store: Store) 
         assert "Traceback" not in log
 
 
-def test_imports_and_webhooks_of_jobs_are_off_by_default(store: Store, tmp_path: Path) -> None:
+def test_imports_and_webhooks_of_jobs_are_off_by_default(store: Hook, tmp_path: Path) -> None:
     with running_service(tmp_path / "data", worker=False) as service:
         refused = imported(service, store.url + "/a.tar")
         assert (refused.status_code, refused.json()["type"].rpartition(":")[2]) == (403, "imports-off")

@@ -5,16 +5,15 @@ import hashlib
 import json
 import os
 import signal
-import threading
 import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
+from tests.support.loopback import Hook, hooked
 from tests.support.object_server import KEYS, Network, client_of, network_before
 from tests.support.services import (
     RunningService,
@@ -27,33 +26,6 @@ from tests.support.services import (
 )
 
 NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
-
-
-class Hook:
-    """A studio's program that is called when something ends; keeps what it is told."""
-
-    def __init__(self) -> None:
-        messages = self.messages = list[dict[str, Any]]()
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                messages.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
-                self.send_response(204)
-                self.end_headers()
-
-            def log_message(self, format: str, *args: object) -> None:
-                pass
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self._server.server_port}"
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-
-    def of(self, job: str, kind: str) -> list[dict[str, Any]]:
-        return [m["data"] for m in self.messages if (m["type"], m["data"].get("job_id")) == (kind, job)]
-
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +44,8 @@ def way(bucket: Any, object_server: str) -> Iterator[Network]:
 
 @pytest.fixture(scope="module")
 def hook() -> Iterator[Hook]:
-    hook = Hook()
-    yield hook
-    hook.close()
+    with hooked() as hook:
+        yield hook
 
 
 @pytest.fixture(scope="module")
@@ -137,9 +108,9 @@ def test_a_result_is_delivered_and_the_webhook_says_where(
     document = awaited(client, job, "delivered")
     place = f"s3://studio-out/heads/study 4/{job}/"
     assert document["delivery"] == {"to": place, "state": "delivered", "error": None}
-    await_true(lambda: hook.of(job, "job.delivered"))
-    assert hook.of(job, "job.delivered") == [{"job_id": job, "delivered_to": place}]
-    assert hook.of(job, "job.succeeded") == [{"job_id": job}]
+    await_true(lambda: hook.data_of("job.delivered", job))
+    assert hook.data_of("job.delivered", job) == [{"job_id": job, "delivered_to": place}]
+    assert hook.data_of("job.succeeded", job) == [{"job_id": job}]
     files = delivered(bucket, job, "heads/study 4/")
     manifest = json.loads(files.pop("delivery.json"))
     assert {*files} == NAMES
@@ -189,7 +160,7 @@ def test_a_killed_worker_leaves_a_delivery_that_another_ends(
     files = delivered(bucket, job)
     del files["delivery.json"]
     assert {name: len(data) for name, data in files.items()} == {n: f["bytes"] for n, f in document["files"].items()}
-    await_true(lambda: hook.of(job, "job.delivered"))
+    await_true(lambda: hook.data_of("job.delivered", job))
     assert len([path for method, path in way.seen if method == "PUT" and path.endswith(f"{job}/head.glb")]) == 1
 
 
@@ -201,7 +172,7 @@ def test_what_the_store_refuses_fails_and_is_delivered_elsewhere(
     assert document["state"] == "succeeded"
     assert document["delivery"]["error"]["type"] == "urn:eigenhead:problem:store-denied"
     assert "NoSuchBucket" in document["delivery"]["error"]["detail"]
-    await_true(lambda: hook.of(job, "job.undelivered"))
+    await_true(lambda: hook.data_of("job.undelivered", job))
     nas = service.data.parent / "nas"
     again = client.post(f"/v1/jobs/{job}/delivery", json={"to": f"file://{nas}/heads"})
     assert again.status_code == 202, again.text

@@ -8,15 +8,13 @@ coloured.
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
 from pipeline.applications.templates.template_file import Template
 from pipeline.applications.templates.write.texture import Tile, corner_tiles, skin_polygons, template_textures
-from pipeline.results.head_files import ENCODINGS
-from pipeline.results.metadata import ply_comments
-from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.head_files import ENCODINGS, encoded
+from pipeline.results.reconstruction import Reconstruction, ply_comments
 from rig.atomic_write import write_atomically
 from rig.formats.meshes.obj import MATERIAL
 from rig.formats.meshes.polygon_obj import PolygonMesh, polygon_obj_bytes
@@ -35,11 +33,11 @@ def write_template(folder: Path, result: Reconstruction, template: Template) -> 
         if result.texturing.atlas is None
         else template_textures(result.texturing.atlas, template.mesh, surface_binding)
     )
-    suffix, _, options = ENCODINGS["png" if result.settings.outputs.image == "png" else "jpeg"]
+    kind = "png" if result.settings.outputs.image == "png" else "jpeg"
+    suffix = ENCODINGS[kind][0]
     files = {tile: f"{name}{tile_suffix(tile)}{suffix}" for tile in textures}
     for tile, image in textures.items():
-        _, data = cv2.imencode(suffix, np.ascontiguousarray(image[:, :, ::-1]), list(options))
-        write_atomically(folder / files[tile], data.tobytes())
+        write_atomically(folder / files[tile], encoded(image, kind))
     mesh, library = template.mesh, None
     if textures:
         mesh, materials = template_materials(template, files)

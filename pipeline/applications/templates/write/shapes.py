@@ -1,6 +1,7 @@
-"""``head-NAME.glb`` and ``head-NAME-shapes.npz`` of a result: the template's mesh without expression, with shapes.
+"""``head-NAME.glb`` and ``head-NAME-shapes.npz`` of a result: the template's mesh without expression, with shapes; and
+``posed.glb``, the same of the model's own mesh, with its texture.
 
-Head frame; the GLB in metres, the archive in mm. Vertices keep the template's order; in the GLB, eyeballs are parts of
+Head frame; the GLBs in metres, the archive in mm. Vertices keep their order; in a GLB, eyeballs are parts of
 their own (``extras.rows`` of a node says which vertices it has). Eyeballs, teeth and a tongue that the mesh lacks are
 added, and have none. With the formats OBJ and USDZ, ``head-NAME-parts.obj`` and ``head-NAME-parts.usdz`` are the same
 without shapes: parts by name.
@@ -16,23 +17,25 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.applications.templates.animated import AnimatedMesh, animated_mesh
+from pipeline.applications.templates.animated import AnimatedMesh, animated_head, animated_mesh
+from pipeline.applications.templates.eye_picture import PhotographedEyes, darkest_direction, eyeball_uv, paint_eyeball
 from pipeline.applications.templates.eyeballs import AHEAD, turn_to
-from pipeline.applications.templates.inner_mouth import WITH_JAW
+from pipeline.applications.templates.inner_mouth import TONGUE_OUT, WITH_JAW
 from pipeline.applications.templates.template_file import Template
 from pipeline.applications.templates.write.mesh import template_colours
 from pipeline.evidence.expression import BlendshapeRig
 from pipeline.faces.irises import Iris, UnseenEye
+from pipeline.head_model.subdivision import opened_faces
 from pipeline.head_model.visemes import VISEMES
-from pipeline.results.metadata import asset_extras
-from pipeline.results.reconstruction import Reconstruction
+from pipeline.results.head_files import encoded, head_from_world, head_mesh, head_skin
+from pipeline.results.reconstruction import Reconstruction, asset_extras
 from rig.atomic_write import write_atomically
-from rig.formats.meshes.glb import glb_bytes
-from rig.formats.meshes.morph_glb import with_morphs
-from rig.formats.meshes.parts_files import PlacedPart, parts_obj_bytes, parts_usdz_bytes
-from rig.formats.meshes.pivot_glb import NECK, MovingPart, with_pivots
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.obj import scene_obj_bytes
+from rig.formats.meshes.scene import NECK, Part, Scene, Skin
+from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.geometry import RigidTransform
-from rig.mesh import Mesh, vertex_normals
+from rig.mesh import Mesh
 
 FORMAT = "eigenhead-shapes/1"
 JAW = "jaw"
@@ -44,82 +47,116 @@ def write_template_shapes(folder: Path, result: Reconstruction, template: Templa
     blendshape_rig = result.evidence.blendshape_rig
     if blendshape_rig is None or not result.settings.outputs.morphs:
         return
-    place, model = result.head.fit.world_from_head, result.head.model
-    head_from_world = RigidTransform(place.rotation, place.translation).inverse()
-    vertices = head_from_world.apply(blendshape_rig.neutral_world.vertices)
+    from_world = head_from_world(result)
     triangles, colours = template.mesh.triangles(), template_colours(result, template)
     animated = animated_mesh(
         template.surface_binding,
         triangles,
-        vertices,
+        from_world.apply(blendshape_rig.neutral_world.vertices),
         blendshape_rig.neutral_world.faces,
         blendshape_rig.morphs,
-        model.landmarks,
-        gazes=_gazes(result.faces.eyes, head_from_world),
+        result.head.model.landmarks,
+        gazes=_gazes(result.faces.eyes, from_world),
     )
     name = f"head-{template.name}"
     extras = asset_extras(result) | {"template": template.name, "template_sha256": template.source_sha256}
     extras |= {"inner_mouth": animated.inner.absence or "added"}
-    data = animated_glb(animated, triangles, colours, blendshape_rig.weights, extras)
-    write_atomically(folder / f"{name}.glb", data)
+    scene = animated_scene(animated, triangles, colours, blendshape_rig.weights)
+    write_atomically(folder / f"{name}.glb", scene_glb_bytes(scene, extras))
     write_atomically(folder / f"{name}-shapes.npz", _archive(animated, template, blendshape_rig))
-    formats = result.settings.outputs.formats
-    if "obj" in formats or "usdz" in formats:
-        parts = animated_parts(animated, triangles, colours)
-        if "obj" in formats:
-            write_atomically(folder / f"{name}-parts.obj", parts_obj_bytes(parts))
-        if "usdz" in formats:
-            write_atomically(folder / f"{name}-parts.usdz", parts_usdz_bytes(parts))
+    for suffix, encode in (("obj", scene_obj_bytes), ("usdz", scene_usdz_bytes)):
+        if suffix in result.settings.outputs.formats:
+            write_atomically(folder / f"{name}-parts.{suffix}", encode(scene))
 
 
-def _gazes(eyes: Mapping[str, Iris | UnseenEye], head_from_world: RigidTransform) -> dict[str, Float[np.ndarray, " 3"]]:
+def write_posed(folder: Path, result: Reconstruction) -> None:
+    """Writes posed.glb if the settings ask for morphs and the model has shapes: the head without expression, with its
+    texture, shapes, pivots, eyeballs, teeth and tongue, at the weights of the photographed head. Raises OSError."""
+    blendshape_rig = result.evidence.blendshape_rig
+    if blendshape_rig is None or not result.settings.outputs.morphs:
+        return
+    model, from_world, head = result.head.model, head_from_world(result), head_mesh(result)
+    opened = opened_faces({name: model.levels[name].faces for name in ("cage", "full")})
+    neutral, eyes = from_world.apply(blendshape_rig.neutral_world.vertices), result.faces.eyes
+    shapes = blendshape_rig.moving
+    animated = AnimatedMesh(neutral, shapes, {}, {})
+    if len(opened) < len(head.faces):
+        animated = animated_head(neutral, opened, shapes, model.landmarks, gazes=_gazes(eyes, from_world))
+    photographed = PhotographedEyes(head, np.arange(len(opened), len(head.faces)), result.texturing.atlas)
+    animated = replace(animated, gazes=_towards_irises(animated, eyes, from_world, photographed))
+    skin, colours = head_skin(result, head), result.texturing.vertices.colours
+    if skin is not None and skin.faces is not None:
+        skin = replace(skin, faces=skin.faces[: len(opened)])
+    scene = animated_scene(animated, opened, colours, blendshape_rig.weights, skin)
+    scene = replace(scene, parts=[_with_picture(part, animated, photographed) for part in scene.parts])
+    write_atomically(folder / "posed.glb", scene_glb_bytes(scene, asset_extras(result)))
+
+
+def _towards_irises(
+    animated: AnimatedMesh,
+    eyes: Mapping[str, Iris | UnseenEye],
+    from_world: RigidTransform,
+    photographed: PhotographedEyes,
+) -> dict[str, Float[np.ndarray, " 3"]]:
+    """Returns the directions from added eyeballs to the irises, so that these lie where they were photographed although
+    the ball lies where the lids let it. An iris that was not measured is what is dark between open lids."""
+    found = {}
+    for name, ball in animated.added.items():
+        eye = eyes.get(name.removeprefix("eye_"))
+        if isinstance(eye, Iris):
+            towards = from_world.apply(eye.centre[None])[0] - ball.centre
+            found[name] = towards / np.linalg.norm(towards)
+        elif eye is not None and eye.cause != "closed":
+            found[name] = darkest_direction(ball, photographed)
+    return {name: gaze for name, gaze in found.items() if gaze is not None}
+
+
+def _with_picture(part: Part, animated: AnimatedMesh, photographed: PhotographedEyes) -> Part:
+    """Returns an added eyeball whose iris was seen with its image; other parts as they are."""
+    if part.name not in animated.added or part.name not in animated.gazes:
+        return part
+    ball = replace(animated.added[part.name], gaze=animated.gazes[part.name])
+    image = paint_eyeball(ball, photographed)
+    if image is None:
+        return part
+    return replace(part, skin=Skin(eyeball_uv(ball, part.mesh), encoded(image, "jpeg")))
+
+
+def _gazes(eyes: Mapping[str, Iris | UnseenEye], from_world: RigidTransform) -> dict[str, Float[np.ndarray, " 3"]]:
     """Returns where eyes that are seen look, by pivot (head frame)."""
-    return {f"eye_{side}": head_from_world.rotation @ eye.gaze for side, eye in eyes.items() if isinstance(eye, Iris)}
+    return {f"eye_{side}": from_world.rotation @ eye.gaze for side, eye in eyes.items() if isinstance(eye, Iris)}
 
 
-def animated_parts(
-    animated: AnimatedMesh, triangles: Int[np.ndarray, "g 3"], colours: UInt8[np.ndarray, "t 3"]
-) -> dict[str, PlacedPart]:
-    """Returns the mesh without expression by named parts (head frame, mm): head, eyeballs about their pivots, turned as
-    the eyes look, teeth and tongue."""
-    turning = np.zeros(len(animated.neutral), bool)
-    eyes = {name: replace(eyeball, gaze=AHEAD).mesh() for name, eyeball in animated.added.items()}
-    for name, rows in animated.eyeballs.items():
-        turning[rows] = True
-        eyes[name] = _part(animated, triangles, colours, rows)
-    out = {"head": PlacedPart(_part(animated, triangles, colours, np.flatnonzero(~turning)), RigidTransform.identity())}
-    for name, mesh in eyes.items():
-        pivot = animated.pivots[name]
-        place = RigidTransform(turn_to(animated.gazes.get(name, AHEAD)), pivot)
-        out[name] = PlacedPart(Mesh(mesh.vertices - pivot, mesh.faces, mesh.colours), place)
-    return out | {name: PlacedPart(mesh, RigidTransform.identity()) for name, mesh in animated.inner.parts.items()}
-
-
-def animated_glb(
+def animated_scene(
     animated: AnimatedMesh,
     triangles: Int[np.ndarray, "g 3"],
     colours: UInt8[np.ndarray, "t 3"],
     weights: Mapping[str, float],
-    extras: Mapping[str, object],
-) -> bytes:
-    """Encodes an animated mesh: morph targets by name, nodes at its pivots, eyeballs as parts of their own."""
+    skin: Skin | None = None,
+) -> Scene:
+    """Returns an animated mesh by named parts: the head with its shapes and ``skin``, eyeballs that turn about their
+    pivots, teeth and tongue."""
     turning = np.zeros(len(animated.neutral), bool)
     for rows in animated.eyeballs.values():
         turning[rows] = True
     rows = np.flatnonzero(~turning)
-    head = _part(animated, triangles, colours, rows)
-    glb = glb_bytes(head, normals=vertex_normals(head.vertices, head.faces), colours=head.colours, extras=extras)
+    named = {"head": rows, **animated.eyeballs} if turning.any() else {"head": None}
     morphs = {name: shape[rows] for name, shape in animated.shapes.items()}
-    glb = with_morphs(glb, head.vertices, head.faces, morphs, weights)
-    parts = {name: _part(animated, triangles, colours, part) for name, part in animated.eyeballs.items()}
-    named = {"head": rows.tolist()} | {name: part.tolist() for name, part in animated.eyeballs.items()}
-    parts |= {name: replace(eyeball, gaze=AHEAD).mesh() for name, eyeball in animated.added.items()}
-    inner = {
-        name: MovingPart(JAW if name in WITH_JAW else NECK, part, animated.inner.moves[name], weights)
-        for name, part in animated.inner.parts.items()
-    }
-    turns = {name: turn_to(gaze) for name, gaze in animated.gazes.items() if name in parts}
-    return with_pivots(glb, animated.pivots, parts, named if turning.any() else {}, inner, turns)
+    parts = []
+    for name, of_mesh in named.items():
+        mesh = _part(animated, triangles, colours, rows if of_mesh is None else of_mesh)
+        listed = None if of_mesh is None else of_mesh.tolist()
+        if name == "head":
+            parts.append(Part(name, mesh, skin=skin, morphs=morphs, weights=weights, rows=listed))
+        else:
+            parts.append(Part(name, mesh, pivot=name, rows=listed))
+    for name, eyeball in animated.added.items():
+        parts.append(Part(name, replace(eyeball, gaze=AHEAD).mesh(), pivot=name))
+    for name, mesh in animated.inner.parts.items():
+        moves, pivot = animated.inner.moves[name], JAW if name in WITH_JAW else NECK
+        wanted = {shape: move for shape, move in moves.items() if shape in animated.shapes or shape == TONGUE_OUT}
+        parts.append(Part(name, mesh, morphs=wanted, weights=weights, pivot=pivot))
+    return Scene(parts, animated.pivots, {name: turn_to(gaze) for name, gaze in animated.gazes.items()})
 
 
 def _part(

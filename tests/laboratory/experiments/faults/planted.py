@@ -30,7 +30,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, surface_error
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 from tests.laboratory.experiments.surface.visible import seen_of
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
@@ -61,7 +61,7 @@ def planted(model: HeadModel, *, renderer: Renderer, bench: Bench, subjects: int
             picture = None if bench.folder is None else bench.folder / f"planted-{number}-{kind}.jpg"
             row = records.row(f"{number} {kind}", lambda s=spoilt, p=picture: planted_row(s, model, renderer, p))
             rows.append({"subject": number, "fault": kind, **row})
-    return {"figures": _figures(rows), "rows": rows}
+    return {"figures": means_by(rows, "fault"), "rows": rows}
 
 
 def planted_row(known: Known, model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
@@ -198,12 +198,3 @@ def _line(image: ImageRgb, path: Float[np.ndarray, "n 2"], thickness: int, colou
 def _with_image(known: Known, name: str, image: ImageRgb) -> Known:
     capture: Capture = replace(known.capture, images={**known.capture.images, name: image})
     return replace(known, capture=capture)
-
-
-def _figures(rows: list[Row]) -> dict[str, float]:
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        for key, value in row.items():
-            if isinstance(value, float):
-                values.setdefault(f"{row['fault']}_{key}", []).append(value)
-    return {key: float(np.mean(found)) for key, found in values.items()}

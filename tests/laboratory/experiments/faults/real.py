@@ -5,6 +5,7 @@ somebody drew them), and points on which two neighbouring views agree, those lef
 estimated from all photographs; the surface from the eleven alone.
 """
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
@@ -21,7 +23,6 @@ from pipeline.head_model.model import HeadModel
 from pipeline.imaging.masks import eroded
 from pipeline.imaging.silhouette import Silhouette, signed_distance
 from pipeline.multiview.scene_points import find_scene_points
-from pipeline.multiview.spread_views import spread_views
 from pipeline.reconstruct import reconstruct
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.segmentation.segment import segment
@@ -31,11 +32,11 @@ from rig.camera import Camera
 from rig.capture import Capture
 from rig.errors import InputError
 from rig.formats.captures.capture_folder import capture_root
-from rig.formats.captures.outlines_json import read_outlines
 from rig.mesh import Mesh
 from rig.progress import Progress
 from rig.render.renderer import Renderer
 from rig.rig import Rig
+from rig.spread_views import spread_views
 from server.tasks.photographs import read_or_calibrate
 from server.tasks.prepare import prepare_kernels
 from tests.laboratory.experiments.records import Bench, Outcome, Row
@@ -98,10 +99,18 @@ def read_real_capture(
     prepared = read_or_calibrate(folder, kept, front=front, report=report)
     default = capture_root(folder) / "outlines.json"
     path = outlines or (default if default.is_file() else None)
-    drawn = {} if path is None else read_outlines(path, prepared.rig)
+    outlined = {} if path is None else json.loads(path.read_text())["outlines"]
+    drawn = {name: _filled(outlined[name], prepared.rig[name]) for name in prepared.rig.names if name in outlined}
     # A mask that the folder has serves as reference too; an outline drawn by hand replaces it.
     drawn = {**prepared.capture.masks, **drawn}
     return RealCapture(folder.name, replace(prepared.capture, features={}), prepared.rig, drawn, front)
+
+
+def _filled(polygons: list, camera: Camera) -> Bool[np.ndarray, "h w"]:
+    """Returns the mask of polygons in pixels, of which a pixel inside an even number is background."""
+    mask = np.zeros((camera.intrinsics.height, camera.intrinsics.width), np.uint8)
+    sixteenths = [np.rint(np.array(one) * 16.0).astype(np.int32) for one in polygons]
+    return cv2.fillPoly(mask, sixteenths, 1, shift=4).view(bool)
 
 
 def judge(

@@ -272,9 +272,7 @@ def held_out_row(path: Path, camera: str, model: HeadModel, renderer: Renderer) 
     for level, fitted in every_level(_without(known.capture, camera), rest, model, ("span", "photo"), renderer).items():
         mesh, full = fitted.mesh(), model.levels["full"]
         seen = {name: silhouettes[name] for name in rest.names}
-        coloured = texture(
-            mesh, mesh.normals(), known.capture, seen, rest, depth_maps(rest, mesh), settings=settings.texture
-        )
+        coloured = texture(mesh, known.capture, seen, rest, depth_maps(rest, mesh), settings=settings.texture)
         ours = find_rim(make_topology(full.faces, full.face_region), mesh.vertices, views, whole_head=True)
         nearest = KDTree(ours.pixel).query(true.pixel)[1]
         across = ((true.pixel - ours.pixel[nearest]) * ours.normal[nearest]).sum(axis=1)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.model_building.correspondence.surface_fit import SurfaceFit, fit_surface
+from pipeline.applications.model_building.sources.imports import SurfaceFit, fit_surface
 from pipeline.applications.model_building.training.model_metrics import of_draws
 from pipeline.head_model.landmarks import SEVEN_POINTS
 from pipeline.head_model.model import HeadModel

@@ -30,7 +30,7 @@ from rig.studio.sensor.preset import PRESET
 from rig.studio.sensor.realism import REALISM, made_real
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
-from tests.laboratory.experiments.surface.eyeballs import OPEN_TRIANGLES
+from tests.laboratory.experiments.surface.shapes import OPEN_TRIANGLES
 
 SEED, SPREAD = 387, 0.8
 HEADS = 6  # of each model

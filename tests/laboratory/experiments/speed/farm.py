@@ -31,8 +31,7 @@ class Farm:
         job_s: seconds of a default job on two cores (``eigenhead reconstruct``), and the spread of the jobs (share).
         capture_bytes, result_bytes, result_files: of shared/data/captures/scan-a and its default head.
         job_statements, running_statements, idle_statements: statements of a job, of each second that it runs, and of
-            each second of a worker that looks for jobs (the benchmark database_costs), at a poll_s of
-            ``measured_poll_s``.
+            each second of a worker that looks for jobs at a poll_s of ``measured_poll_s``.
         poll_s: EIGENHEAD_POLL_S of the farm.
         statements_per_s: what the database carries out (pgbench, the same command, two cores).
         store_bytes_per_s: what the store and the way to it carry (10 Gbit/s).
@@ -61,7 +60,7 @@ class Farm:
 class Prices:
     """Holds list prices in US dollars, without tax and discounts: those of Amazon in Virginia, to be replaced by one's
     own. A worker and the service have two virtual cores and 4 GB (c5.large), the database two and 8 GB (RDS,
-    db.m6g.large). docs/scale.md says who states each, and when."""
+    db.m6g.large). docs/service.md says who states each, and when."""
 
     worker_hour: float = 0.085
     database_hour: float = 0.159

@@ -18,26 +18,17 @@ from pipeline.applications.templates.pivots import pivots
 from pipeline.evidence.expression import build_blendshape_rig
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.head_model.model import HeadModel
-from pipeline.results.clay import clay
+from pipeline.head_model.subdivision import opened_faces
 from rig.geometry import Similarity
 from rig.mesh import Mesh
-from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
 
 SEED, SPREAD = 38, 0.8
 HEADS = 5
-OPEN_TRIANGLES = 22288  # of ICT-FaceKit's face and head; what follows in the model closes eyes and mouth
 ABOUT_MM = 22.0  # of an eyeball's centre, in which lids are looked at
-FACE = (np.array([-75.0, -20.0, 40.0]), np.array([75.0, 70.0, 110.0]))  # head frame, mm
 TURNED_DEG = 15.0
-ASIDE: Mapping[str, tuple[float, float]] = {
-    "left": (1.0, 0.0),
-    "right": (-1.0, 0.0),
-    "up": (0.0, 1.0),
-    "down": (0.0, -1.0),
-}
+ASIDE: Mapping[str, tuple[float, float]] = {"left": (1, 0), "right": (-1, 0), "up": (0, 1), "down": (0, -1)}
 CROSSING = ("crossing_rest", "crossing_before", "crossing_after", "crossing_turned")
-SHOWN = ("eyeBlinkRight", "eyeBlinkLeft")
 
 
 def eyeballs(facekit: HeadModel, *, bench: Bench) -> Outcome:
@@ -49,8 +40,7 @@ def eyeballs(facekit: HeadModel, *, bench: Bench) -> Outcome:
         rows.append({"head": number} | records.row(f"head-{number}", lambda number=number: _row(facekit, number)))
     figures = {name: float(sum(float(row[name]) for row in rows)) for name in CROSSING}
     figures["lift_worst_mm"] = max(float(row["lift_mm"]) for row in rows)
-    pictures = {} if bench.folder is None else {"eyes": _picture(facekit)}
-    return {"figures": figures, "rows": rows, "markdown": _table(rows), "pictures": pictures}
+    return {"figures": figures, "rows": rows}
 
 
 def _row(model: HeadModel, number: int) -> Row:
@@ -91,7 +81,7 @@ def open_head(model: HeadModel, number: int) -> OpenHead:
     landmarks = {name: vertices[row] for name, row in model.landmarks.items()}
     found = pivots(landmarks, vertices, moves, [])
     centres = {name: found[name] for name in ("eye_right", "eye_left")}
-    return OpenHead(vertices, whole[:OPEN_TRIANGLES], moves, landmarks, centres)
+    return OpenHead(vertices, opened_faces({"cage": whole, "full": whole}), moves, landmarks, centres)
 
 
 def turned_gaze(direction: str) -> Float[np.ndarray, " 3"]:
@@ -131,29 +121,3 @@ def _crossing(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"],
     about = faces[(np.linalg.norm(vertices - eyeball.centre, axis=1) < ABOUT_MM)[faces].any(axis=1)]
     joined = np.concatenate([about, ball.faces + len(vertices)])
     return int(crossing_faces(np.concatenate([vertices, ball.vertices]), joined)[len(about) :].sum())
-
-
-def _picture(model: HeadModel) -> np.ndarray:
-    """Draws the eyes of each head as clay: at rest, half and fully closed."""
-    rows = []
-    for number in range(HEADS):
-        head = open_head(model, number)
-        eyes = place(head)
-        blink = sum(lifted(head.vertices, head.faces, head.moves[name], eyes) for name in SHOWN)
-        rows.append(np.hstack([_drawn(head.vertices + w * blink, head.faces, eyes) for w in (0.0, 0.5, 1.0)]))
-    return np.vstack(rows)
-
-
-def _drawn(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], eyes: Mapping[str, Eyeball]
-) -> np.ndarray:
-    for ball in (eyeball.mesh() for eyeball in eyes.values()):
-        faces = np.concatenate([faces, ball.faces + len(vertices)])
-        vertices = np.concatenate([vertices, ball.vertices])
-    return clay(Mesh(vertices, faces), azimuth_deg=25.0, box=FACE)
-
-
-def _table(rows: list[Row]) -> str:
-    names = ("head", "eyeballs", "shapes", *CROSSING)
-    cells = [[*(row[name] for name in names), f"{row['lift_mm']:.2f}"] for row in rows]
-    return markdown.table((*names, "largest lift, mm"), cells)

@@ -25,8 +25,8 @@ from pipeline.geometry.raster_kernels import interpolate, rasterise
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
+from pipeline.results.head_files import write_skin_maps
 from pipeline.results.reconstruction import Reconstruction
-from pipeline.results.skin_files import write_skin_maps
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
 from pipeline.stages.texturing import Texturing, texture_head

@@ -9,7 +9,7 @@ pixels with the steepest gradients: eyes, brows, lips.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -28,9 +28,8 @@ from pipeline.results.head_files import encoded
 from pipeline.results.reconstruction import Reconstruction
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
-from pipeline.texturing.head_texture import paint_head
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.uv_unwrap import Layout
+from pipeline.texturing.layout.uv_unwrap import Layout, model_layout
+from pipeline.texturing.paint import paint_head
 from pipeline.texturing.vertex_colours import texture as colour
 from rig.camera import Camera
 from rig.capture import Capture
@@ -42,7 +41,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD, Known, photographed, read_known
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 from tests.laboratory.experiments.surface.paper_blend import paper_texture
 
 SUBJECTS = 10
@@ -79,7 +78,7 @@ def texture(
         picture = None if bench.folder is None else bench.folder / f"texture-{name}.png"
         compute = partial(row_of, read, model, renderer, settings, number, picture)
         rows.append({"name": name, "group": group, **records.row(name, compute)})
-    return {"figures": _figures(rows), "rows": rows}
+    return {"figures": means_by(rows, "group"), "rows": rows}
 
 
 def row_of(
@@ -133,23 +132,15 @@ def seconds(found: Reconstruction, model: HeadModel, capture: Capture, rig: Rig,
     """Returns wall-clock and processor seconds of vertex colours alone, and of what the texture adds, its JPEG
     included."""
     mesh, layout = found.mesh_world, model_layout(model)
-    coloured_by = partial(
-        colour,
-        mesh,
-        found.texturing.normals,
-        capture,
-        found.views.silhouettes,
-        rig,
-        depth_maps(rig, mesh),
-        settings=settings.texture,
-    )
+    views, depths = found.views.silhouettes, depth_maps(rig, mesh)
+    coloured_by = partial(colour, mesh, capture, views, rig, depths, settings=settings.texture)
     times = [(time.perf_counter(), time.process_time())]
     coloured_by()
     times.append((time.perf_counter(), time.process_time()))
     coloured = coloured_by(around=layout.around)
     atlas = paint_head(layout, mesh, coloured, model.levels["full"].face_region, settings)
     if atlas is not None:
-        encoded(atlas, "jpeg")
+        encoded(atlas.image, "jpeg")
     times.append((time.perf_counter(), time.process_time()))
     (wall, cpu), (more_wall, more_cpu) = ((b[0] - a[0], b[1] - a[1]) for a, b in pairwise(times))
     return {"vertices_s": wall, "texture_adds_s": more_wall - wall, "texture_adds_cpu_s": more_cpu - cpu}
@@ -243,12 +234,3 @@ def _side_by_side(photograph: Image, drawn: Mapping[str, np.ndarray], face: np.n
             for text, image in panels.items()
         ]
     )
-
-
-def _figures(rows: Sequence[Row]) -> dict[str, float]:
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        for key, value in row.items():
-            if isinstance(value, float):
-                values.setdefault(f"{row['group']}_{key}", []).append(value)
-    return {key: float(np.mean(found)) for key, found in values.items()}

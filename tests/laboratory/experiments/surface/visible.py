@@ -9,7 +9,7 @@ reaches 1. ``precision_seen`` is of what the file itself calls seen.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -45,7 +45,7 @@ from tests.laboratory.experiments.paper.detail import (
 )
 from tests.laboratory.experiments.paper.span import weighted_quantile
 from tests.laboratory.experiments.pictures import labelled
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 from tests.laboratory.experiments.surface.face_skin import (
     crater_map,
     face_places,
@@ -53,6 +53,7 @@ from tests.laboratory.experiments.surface.face_skin import (
     normal_figures,
     shining_places,
 )
+from tests.laboratory.experiments.surface.skin_colours import wrong_colours
 from tests.laboratory.experiments.surface.visible_surface import score_visible
 
 STYLES = (
@@ -102,7 +103,7 @@ def visible(
         picture = None if bench.folder is None else bench.folder / f"visible-{name}.png"
         compute = partial(known_row, read, model, renderer, picture)
         rows.append({"name": name, "group": group, **records.row(name, compute)})
-    return {"figures": figures(rows), "rows": rows}
+    return {"figures": means_by(rows, "group"), "rows": rows}
 
 
 def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, picture: Path | None) -> Row:
@@ -113,8 +114,8 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
     if found.bust is None:
         raise EigenheadError(f"{subject.name}: no bust ({'; '.join(str(warning) for warning in found.warnings)})")
     bust = found.bust.surface
+    in_head = found.head.fit.world_from_head.inverse()
     if picture is not None:
-        in_head = found.head.fit.world_from_head.inverse()
         meshes = {"truth": splats(subject.visible), "bust.ply": bust.mesh_world, "head.ply": found.mesh_world}
         write_image(
             picture, _row(subject.name, {k: Mesh(in_head.apply(m.vertices), m.faces) for k, m in meshes.items()})
@@ -123,7 +124,6 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
     shining = shining_places(places, subject.capture.images, subject.rig, subject.mesh)
     craters = find_craters(places, bust.mesh_world, shining)
     if picture is not None:
-        in_head = found.head.fit.world_from_head.inverse()
         true_local = Mesh(in_head.apply(subject.mesh.vertices), subject.mesh.faces)
         drawn = crater_map(craters, in_head.apply(places.points), true_local)
         write_image(picture.with_name(f"{picture.stem}-craters.png"), drawn)
@@ -136,6 +136,7 @@ def known_row(known: Callable[[], Known], model: HeadModel, renderer: Renderer, 
         **{f"{k}_face_{key}": v for k, mesh in faces.items() for key, v in surface_error(subject, mesh).items()},
         **{f"{k}_{key}": v for k, mesh in faces.items() for key, v in normal_figures(places, mesh).items()},
         **craters.figures(),
+        **wrong_colours(subject, found, model),
         **region_errors(subject, found.mesh_world, head_regions(model)),
         "head_to_bust_median_mm": float(np.median(head_to_bust(found.mesh_world, bust))),
         "cpu_s": seconds,
@@ -197,13 +198,3 @@ def _row(name: str, in_head: Mapping[str, Mesh]) -> np.ndarray:
             for title, mesh in in_head.items()
         ]
     )
-
-
-def figures(rows: Sequence[Row]) -> dict[str, float]:
-    """Returns means over the subjects of each group, of the figures that they have."""
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        for key, value in row.items():
-            if isinstance(value, float):
-                values.setdefault(f"{row['group']}_{key}", []).append(value)
-    return {key: float(np.mean(found)) for key, found in values.items()}

@@ -94,6 +94,13 @@ def test_a_deviation_of_all_skin_together_is_the_tapes_by_its_turn() -> None:
     assert 0.1 * 2.0 * np.pi < unsure < 2.0 * np.pi
 
 
+def test_lengths_have_the_deviation_of_the_cameras_scale_and_angles_have_not() -> None:
+    known, assumed = (fitting_measures(replace(visit(), scale_sigma=sigma)) for sigma in (0.0, 0.06))
+    girth = assumed["head_circumference"]
+    assert girth.std == pytest.approx(np.hypot(known["head_circumference"].std, 0.06 * girth.value))
+    assert assumed["frame_angle"] == known["frame_angle"]
+
+
 def test_a_head_without_a_back_has_no_circumference() -> None:
     face_only = visit()
     mesh = face_only.measured.mesh_world

@@ -9,10 +9,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
-from pipeline.applications.clinic.registration import register
-from pipeline.applications.clinic.registration_files import write_registration
+from pipeline.applications.clinic.patient_files import write_registration
+from pipeline.applications.clinic.registration import read_surface_landmarks, register
 from pipeline.applications.clinic.surface import PatientSurface, read_surface
-from pipeline.applications.clinic.surface_landmarks import read_surface_landmarks
 from pipeline.applications.verification.reference import Reference
 from rig.errors import InputError
 from rig.formats.meshes.markups import Axes, MarkupPoint, markups_document

@@ -9,12 +9,15 @@ from trimesh.util import wrap_as_stream
 
 from pipeline.applications.templates.animated import AnimatedMesh
 from pipeline.applications.templates.eyeballs import Eyeball, lifted, placed_eyeballs, turn_to
-from pipeline.applications.templates.write.shapes import animated_glb, animated_parts
+from pipeline.applications.templates.write.shapes import animated_scene
 from pipeline.fusion.crossings import crossing_faces
-from rig.formats.meshes.glb_document import opened_glb
-from rig.formats.meshes.parts_files import PlacedPart, parts_obj_bytes, parts_usdz_bytes
-from rig.geometry import RigidTransform, rotation_from_vector
-from rig.mesh import boundary_edges, vertex_normals
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.obj import scene_obj_bytes
+from rig.formats.meshes.scene import Part, Scene
+from rig.formats.meshes.usdz import scene_usdz_bytes
+from rig.geometry import rotation_from_vector
+from rig.mesh import Mesh, boundary_edges, vertex_normals
+from tests.support.glb import opened_glb
 
 AHEAD = np.array([0.0, 0.0, 1.0])
 CENTRES = {"eye_left": np.array([30.0, 10.0, 60.0]), "eye_right": np.array([-30.0, 10.0, 60.0])}
@@ -94,22 +97,7 @@ def test_a_lid_closes_over_the_ball_without_crossing_it(gaze: tuple[float, float
     np.testing.assert_array_equal(lifted(vertices, faces, np.zeros_like(down), eyes), 0.0)
 
 
-def test_added_eyeballs_are_named_parts_that_turn_about_their_centres() -> None:
-    vertices, faces, down, marks = lids(slit=True)
-    eyes = placed_eyeballs(vertices, faces, marks, CENTRES)
-    points = {name: eyeball.centre for name, eyeball in eyes.items()} | {"neck": np.zeros(3)}
-    animated = AnimatedMesh(vertices, {"eyeBlinkLeft": down}, points, {}, eyes)
-    colours = np.full(vertices.shape, 200, np.uint8)
-    document, _ = opened_glb(animated_glb(animated, faces.astype(np.int32), colours, {"eyeBlinkLeft": 0.0}, {}))
-    assert [mesh["name"] for mesh in document["meshes"]] == ["head", "eye_left"]
-    node = next(node for node in document["nodes"] if node["name"] == "eye_left")
-    np.testing.assert_allclose(node["translation"], eyes["eye_left"].centre / 1000.0, atol=1e-9)
-    assert "extras" not in node
-    position = document["accessors"][document["meshes"][1]["primitives"][0]["attributes"]["POSITION"]]
-    np.testing.assert_allclose(position["max"][2], 0.01315, atol=1e-5)  # relative to the node
-
-
-def test_an_added_eyeball_turns_to_where_the_eye_looks() -> None:
+def test_an_added_eyeball_is_a_part_that_turns_about_its_centre_to_where_the_eye_looks() -> None:
     vertices, faces, down, marks = lids(slit=True)
     gaze = np.array([0.25, -0.1, 0.96]) / np.linalg.norm([0.25, -0.1, 0.96])
     eyes = placed_eyeballs(vertices, faces, marks, CENTRES, {"eye_left": gaze})
@@ -117,20 +105,21 @@ def test_an_added_eyeball_turns_to_where_the_eye_looks() -> None:
     points = {name: eyeball.centre for name, eyeball in eyes.items()} | {"neck": np.zeros(3)}
     animated = AnimatedMesh(vertices, {"eyeBlinkLeft": down}, points, {}, eyes, gazes={"eye_left": gaze})
     colours, triangles = np.full(vertices.shape, 200, np.uint8), faces.astype(np.int32)
-    glb = animated_glb(animated, triangles, colours, {"eyeBlinkLeft": 0.0}, {})
+    parts = animated_scene(animated, triangles, colours, {"eyeBlinkLeft": 0.0})
+    glb = scene_glb_bytes(parts)
     scene = trimesh.load_scene(wrap_as_stream(glb), file_type="glb")
     place, geometry = scene.graph["eye_left"]
     there = 1000.0 * trimesh.transform_points(scene.geometry[geometry].vertices, place) - eyes["eye_left"].centre
     np.testing.assert_allclose(there[np.linalg.norm(there, axis=1).argmax()], 13.15 * gaze, atol=0.02)
     document, _ = opened_glb(glb)
     turned = next(node for node in document["nodes"] if node["name"] == "eye_left")
+    np.testing.assert_allclose(turned["translation"], eyes["eye_left"].centre / 1000.0, atol=1e-9)
+    assert "extras" not in turned
     _, _, z, w = turned["rotation"]
     assert 2.0 * np.arccos(w) == pytest.approx(np.arccos(gaze[2]), abs=1e-6)
     assert z == pytest.approx(0.0, abs=1e-9)  # no roll
     # The same by name in OBJ and USD.
-    parts = animated_parts(animated, triangles, colours)
-    assert list(parts) == ["head", "eye_left"]
-    text = parts_obj_bytes(parts).decode().splitlines()
+    text = scene_obj_bytes(parts).decode().splitlines()
     assert [line for line in text if line.startswith("o ")] == ["o head", "o eye_left"]
     points_mm = np.array([line.split()[1:4] for line in text if line.startswith("v ")], float)
     ball = points_mm[len(vertices) :] - eyes["eye_left"].centre
@@ -145,10 +134,12 @@ def test_parts_of_a_usdz_have_names_and_turn(tmp_path: Path) -> None:
     geom = pytest.importorskip("pxr.UsdGeom")
     eyeball = Eyeball(np.zeros(3), AHEAD)
     gaze = np.array([0.6, 0.0, 0.8])
-    part = PlacedPart(eyeball.mesh(), RigidTransform(turn_to(gaze), CENTRES["eye_left"]))
+    ball = eyeball.mesh()
+    part = Part("eye_left", Mesh(ball.vertices + CENTRES["eye_left"], ball.faces, ball.colours), pivot="eye_left")
+    scene = Scene([part], CENTRES, {"eye_left": turn_to(gaze)})
     path = tmp_path / "head-parts.usdz"
-    path.write_bytes(parts_usdz_bytes({"eye_left": part}))
-    assert path.read_bytes() == parts_usdz_bytes({"eye_left": part})
+    path.write_bytes(scene_usdz_bytes(scene))
+    assert path.read_bytes() == scene_usdz_bytes(scene)
     stage = usd.Stage.Open(str(path))
     prim = stage.GetPrimAtPath("/person/eye_left")
     points = np.array(geom.Mesh(prim).GetPointsAttr().Get(), float)

@@ -7,22 +7,18 @@ from pipeline.applications.templates.animated import AnimatedMesh
 from pipeline.applications.templates.inner_mouth import (
     InnerMouth,
     kept_off_teeth,
+    load_inner_mouth,
     meeting_triangles,
     placed_inner_mouth,
 )
 from pipeline.applications.templates.pivots import hinge, jaw_motions
-from pipeline.applications.templates.write.shapes import animated_glb
+from pipeline.applications.templates.write.shapes import animated_scene
 from pipeline.fusion.crossings import crossing_faces
-from pipeline.head_model.inner_mouth_file import load_inner_mouth
-from pipeline.head_model.model import HeadModel, load_model
-from rig.formats.meshes.glb_document import opened_glb
+from pipeline.head_model.model import HeadModel
+from rig.formats.meshes.glb import scene_glb_bytes
 from rig.mesh import boundary_edges
+from tests.support.glb import opened_glb
 from tests.support.ready_templates import parted_faces
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +153,8 @@ def test_the_parts_are_nodes_under_what_they_move_with(
     points = {"jaw": hinge(landmarks), "neck": np.array([0.0, -26.0, -11.0])}
     animated = AnimatedMesh(skin, shapes, points, {}, {}, inner)
     colours = np.full(skin.shape, 200, np.uint8)
-    document, _ = opened_glb(animated_glb(animated, parted_faces(model), colours, {"jawOpen": 0.25}, {}))
+    scene = animated_scene(animated, parted_faces(model), colours, {"jawOpen": 0.25})
+    document, _ = opened_glb(scene_glb_bytes(scene))
     nodes = {node["name"]: node for node in document["nodes"]}
     below = {name: {document["nodes"][k]["name"] for k in nodes[name]["children"]} for name in ("neck", "jaw")}
     assert below == {"neck": {"head", "jaw", "teeth_upper"}, "jaw": {"teeth_lower", "tongue"}}
@@ -166,7 +163,8 @@ def test_the_parts_are_nodes_under_what_they_move_with(
     targets = meshes["tongue"]["extras"]["targetNames"]
     assert {"jawOpen", "tongueOut"} <= set(targets)
     assert meshes["tongue"]["weights"][targets.index("jawOpen")] == 0.25
-    for name, pivot in (("teeth_upper", "neck"), ("teeth_lower", "jaw")):
+    np.testing.assert_allclose(nodes["teeth_upper"]["translation"], -points["neck"] / 1000.0)
+    for name, pivot in (("teeth_upper", np.zeros(3)), ("teeth_lower", points["jaw"])):
         position = document["accessors"][meshes[name]["primitives"][0]["attributes"]["POSITION"]]
-        highest = (inner.parts[name].vertices - points[pivot]).max(axis=0) / 1000.0
+        highest = (inner.parts[name].vertices - pivot).max(axis=0) / 1000.0
         np.testing.assert_allclose(position["max"], highest, atol=1e-6)

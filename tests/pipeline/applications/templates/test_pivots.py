@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.applications.templates.pivots import EYE_RADIUS_MM, hinge, in_mouth, jaw_motions, pivots
-from pipeline.head_model.model import HeadModel, load_model
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
+from pipeline.head_model.model import HeadModel
 
 
 @pytest.fixture(scope="module")

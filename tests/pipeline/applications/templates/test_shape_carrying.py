@@ -8,15 +8,10 @@ import trimesh
 
 from pipeline.applications.templates.carrying import SurfaceBinding, bind_vertices, surface_binding
 from pipeline.applications.templates.shape_carrying import Neutral, carried_shapes
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.mesh import vertex_normals
 
 NAMES = ("jawOpen", "eyeBlinkLeft", "mouthUpperUpLeft", "mouthFunnel")
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

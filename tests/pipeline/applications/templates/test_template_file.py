@@ -8,25 +8,20 @@ import numpy as np
 import pytest
 
 from pipeline.applications.templates.carrying import bind_vertices, surface_binding
-from pipeline.applications.templates.header import BadTemplate, OtherModel
-from pipeline.applications.templates.load import load_template
+from pipeline.applications.templates.header import BadTemplate, OtherModel, check_template, read_header
 from pipeline.applications.templates.names import UnknownTemplate, WrongName, list_templates, new_path, remove_template
-from pipeline.applications.templates.template_file import Template, read_template, save_template
+from pipeline.applications.templates.template_file import Template, load_template, read_template, save_template
 from pipeline.applications.templates.write.mesh import write_template
 from pipeline.head_model.data_folder import DATA
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
+from pipeline.head_model.model_names import UnknownModel, model_path
 from pipeline.settings import Settings, settings_from_document
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.uv_unwrap import Atlas
+from pipeline.texturing.layout.uv_unwrap import Atlas, model_layout
 from rig.errors import InputError
 from rig.formats.meshes.polygon_obj import PolygonMesh, read_polygons
 from rig.mesh import Mesh
 from tests.support.made_up_results import PLACE, textured_result
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
+from tests.support.template_headers import FIGURES, header_file
 
 
 @pytest.fixture
@@ -146,3 +141,38 @@ def test_without_a_texture_vertices_have_their_colours(template: Template, model
     assert [path.name for path in tmp_path.iterdir()] == ["head-low.obj"]
     first = next(line for line in (tmp_path / "head-low.obj").read_text().splitlines() if line.startswith("v "))
     np.testing.assert_allclose([float(word) for word in first.split()[4:]], 120 / 255, atol=1e-4)
+
+
+def test_a_header_is_read_without_the_mesh_and_damage_is_told(tmp_path: Path) -> None:
+    path = header_file(tmp_path, "flame")
+    header = read_header(path)
+    assert (header.name, header.source, header.source_sha256) == ("flame", "flame.obj", "cd" * 32)
+    assert header.figures == FIGURES
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(BadTemplate, match="damaged or incomplete"):
+        read_header(path)
+    np.savez(path, other=np.zeros(3))
+    with pytest.raises(BadTemplate, match="does not carry"):
+        read_header(path)
+    with pytest.raises(BadTemplate, match="format 'eigenhead-template/9'"):
+        read_header(header_file(tmp_path, "flame", format="eigenhead-template/9"))
+    with pytest.raises(BadTemplate, match="No such file"):
+        read_header(tmp_path / "none.npz")
+
+
+def test_a_job_may_use_a_template_of_its_model_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DATA, str(tmp_path))
+    header_file(tmp_path, "flame")
+    model_file = tmp_path / "own.npz"
+    model_file.write_bytes(model_path("default").read_bytes())
+    check_template(None, "default")
+    for model in ("default", "makehuman-138", str(model_file)):
+        check_template("flame", model)  # told by its content
+    model_file.write_bytes(model_file.read_bytes() + b"\n")
+    with pytest.raises(OtherModel, match="registered to the model 'makehuman-138'"):
+        check_template("flame", str(model_file))
+    with pytest.raises(UnknownTemplate, match="known are flame"):
+        check_template("ict", "default")
+    for name in (None, "flame"):
+        with pytest.raises(UnknownModel, match="'nobody'"):
+            check_template(name, "nobody")

@@ -8,9 +8,9 @@ import pytest
 
 from pipeline.applications.verification.reference import Reference, read_reference
 from rig.errors import InputError
-from rig.formats.meshes.obj import obj_bytes
 from rig.formats.meshes.ply import ply_bytes
 from rig.mesh import Mesh
+from tests.support.glb import obj_bytes
 from tests.support.landmark_files import write_landmarks
 from tests.support.measured_heads import mannequin, marks
 

@@ -8,21 +8,16 @@ import pytest
 from pipeline.applications.templates.likeness import SurfaceMarks
 from pipeline.applications.templates.template_file import Template
 from pipeline.applications.wrapping.fitting import drawn_onto, surface_of
-from pipeline.applications.wrapping.placing import PlacedScan, place_scan
 from pipeline.applications.wrapping.scan import raw_scan
 from pipeline.applications.wrapping.sighting import nearest_axis, unit_of
+from pipeline.applications.wrapping.wrap import PlacedScan, place_scan
 from pipeline.geometry.surface_index import SurfaceIndex
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.errors import InputError
 from rig.formats.meshes.mesh_file import TexturedMesh
 from rig.geometry import rotation_from_vector
 from rig.mesh import Mesh
 from tests.support.ready_templates import EYE_CENTRE, ready_template
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 @pytest.fixture(scope="module")

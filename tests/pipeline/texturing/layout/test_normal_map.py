@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.texturing.layout.normal_map import normal_mapped, png, vertex_tangents
-from pipeline.texturing.layout.reduced_layout import ReducedLayout, reduce
+from pipeline.texturing.layout.normal_map import ReducedLayout, normal_mapped, png, reduce, vertex_tangents
 from pipeline.texturing.layout.uv_unwrap import Layout, unwrap
-from rig.formats.meshes.glb import Skin, glb_bytes
+from rig.formats.meshes.scene import Skin
 from rig.mesh import Mesh
+from tests.support.glb import glb_bytes
 
 RADIUS_MM, BUMP_MM, WAVES = 90.0, 0.5, 24.0
 
@@ -77,7 +77,7 @@ def opened(glb: bytes) -> tuple[dict[str, np.ndarray], np.ndarray]:
 def written(ball: Ball, size: int = 1024) -> bytes:
     mapped = normal_mapped(ball.mesh.vertices, true_normals(ball.unit), ball.layout, ball.reduced, size)
     blank = cv2.imencode(".png", np.full((8, 8, 3), 200, np.uint8))[1].tobytes()
-    skin = Skin(mapped.uv, blank, "image/png", png(mapped.image), mapped.tangents)
+    skin = Skin(mapped.uv, blank, "image/png", normal_map=png(mapped.image), tangents=mapped.tangents)
     return glb_bytes(mapped.mesh, normals=mapped.normals, skin=skin)
 
 

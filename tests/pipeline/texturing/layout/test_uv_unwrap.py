@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.head_model.model import load_model
-from pipeline.texturing.layout import model_layout as kept
-from pipeline.texturing.layout.model_layout import model_layout
-from pipeline.texturing.layout.uv_unwrap import Layout, NoLayout, unwrap
+from pipeline.texturing.layout import uv_unwrap as kept
+from pipeline.texturing.layout.uv_unwrap import Layout, NoLayout, model_layout, unwrap
 from rig.mesh import Mesh
 from tests.support.scenes import ellipsoid
 

@@ -8,8 +8,7 @@ from pipeline.texturing.decision import window_table
 from pipeline.texturing.layout.uv_unwrap import Layout
 from pipeline.texturing.paint_kernels import Pictures
 from pipeline.texturing.pores.close_views import plain_choice
-from pipeline.texturing.pores.relief import HalfPictures, Patches, SkinDetail, estimate_detail, without_slow
-from pipeline.texturing.pores.strips import Strips
+from pipeline.texturing.pores.relief import HalfPictures, Patches, SkinDetail, Strips, estimate_detail, without_slow
 from pipeline.texturing.pores.texel_frames import COARSE, TexelFrames
 from rig.colour_space import linear_from_srgb, srgb_from_linear
 

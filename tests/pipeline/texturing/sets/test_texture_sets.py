@@ -11,10 +11,8 @@ from pipeline.geometry.raster import depth_maps
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.settings import TextureSettings
 from pipeline.texturing.decision import Decision
-from pipeline.texturing.inpaint import neighbours
-from pipeline.texturing.layout.model_layout import ModelLayout
-from pipeline.texturing.layout.uv_unwrap import Atlas, unwrap
-from pipeline.texturing.neighbourhood import Neighbourhood
+from pipeline.texturing.layout.uv_unwrap import Atlas, ModelLayout, unwrap
+from pipeline.texturing.neighbourhood import Neighbourhood, neighbours
 from pipeline.texturing.paint import paint_texture
 from pipeline.texturing.sets.specular import exposure_ratios
 from pipeline.texturing.sets.texture_sets import SetTextures, colour_by_sets
@@ -82,13 +80,13 @@ class Coloured:
 def shiny(renderer) -> Coloured:
     mesh, rig = without_neck(ellipsoid(4)), fan(azimuths_deg=(-60, -30, 0, 30, 60))
     taken = simulate(Subject(mesh), rig, SHINY, np.random.default_rng(3), renderer=renderer, look=LOOK)
-    mesh, normals = Mesh(taken.scene.head.vertices, mesh.faces), Mesh(taken.scene.head.vertices, mesh.faces).normals()
+    mesh = Mesh(taken.scene.head.vertices, mesh.faces)
     silhouettes = {name: silhouette_from_mask(mask) for name, mask in taken.masks.items()}
     layout = ModelLayout(
         unwrap(mesh.vertices, mesh.faces), Neighbourhood.of(*neighbours(mesh.faces, len(mesh.vertices)))
     )
     found = texture(
-        mesh, normals, taken.capture, silhouettes, rig, depth_maps(rig, mesh), settings=SETTINGS, around=layout.around
+        mesh, taken.capture, silhouettes, rig, depth_maps(rig, mesh), settings=SETTINGS, around=layout.around
     )
     assert found.decision is not None
     assert taken.scene.head.colours is not None

@@ -41,26 +41,18 @@ def corrupted(kind: str, folder: Path) -> Path:
             path.write_bytes(data)
         case "binary: no images file":
             images.unlink()
-        case "text: NaN translation":
-            images.write_text(
-                images.read_text().replace("1 cam00", "1 cam00").replace(" 1 cam00.png", " 1 cam00.png", 1)
-            )
-            first, *rest = images.read_text().splitlines()[2:]
+        case "text: NaN translation" | "text: zero quaternion":
+            first, *rest = (line for line in images.read_text().splitlines() if not line.startswith("#"))
             words = first.split()
-            words[5] = "nan"
-            images.write_text("\n".join([" ".join(words), *rest]))
-        case "text: zero quaternion":
-            first, *rest = images.read_text().splitlines()[2:]
-            words = first.split()
-            words[1:5] = ["0"] * 4
+            words[1:6] = [*words[1:5], "nan"] if "NaN" in kind else ["0", "0", "0", "0", words[5]]
             images.write_text("\n".join([" ".join(words), *rest]))
         case "text: unknown camera":
             images.write_text(images.read_text().replace("3 cam02.png", "77 cam02.png"))
         case "text: a parameter is missing":
-            path.write_text(path.read_text().replace(" 0.0 0.0 0.0\n", " 0.0 0.0\n", 1))
+            path.write_text(path.read_text().replace(" 0 0 0\n", " 0 0\n", 1))
         case "text: too many images":
-            line = images.read_text().splitlines()[2]
-            images.write_text("\n\n".join([line] * 100))
+            line = images.read_text().splitlines()[4]
+            images.write_text("\n\n".join([line] * 1100))
         case "toml: broken":
             path.write_text("[cam_0\n")
         case "toml: NaN rotation and a missing matrix":

@@ -1,7 +1,6 @@
 """Files of other programs as their manuals lay them out: each projects by its own formula, each fault is named."""
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,7 +52,6 @@ def test_a_metashape_export_projects_by_its_manual(tmp_path: Path) -> None:
     ("change", "fault"),
     [
         (("<k4>0.0004", "<k4>5"), "a.k4 bends the picture by"),
-        (("<b2>0.001", "<b2>2"), "a.b2 skews the picture by"),
         (("<f>1500", "<f>long"), "a.f is missing or not 1 number"),
         (('type="frame"><res', 'type="spherical"><res'), "'spherical'"),
         (('sensor_id="0" label="b', 'sensor_id="7" label="b'), "b: its sensor '7' is missing"),
@@ -147,13 +145,8 @@ def test_blender_sees_what_the_camera_sees(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.stack([across, down], 1) - 0.5, camera.project(POINTS), atol=1e-6)
 
 
-def test_a_rotation_vector_of_opencv_yaml_will_do(tmp_path: Path) -> None:
+def test_a_damaged_part_of_an_opencv_yaml_is_named(tmp_path: Path) -> None:
     write_rig_file(fan(), tmp_path, "opencv-yaml")
-    text = (tmp_path / "extri.yml").read_text()
-    (tmp_path / "extri.yml").write_text(re.sub(r"Rot_\w+: !!opencv-matrix.*?\]", "", text, flags=re.S))
-    assert "Rot_" not in (tmp_path / "extri.yml").read_text()
-    back = read_rig_file(tmp_path / "intri.yml")
-    np.testing.assert_allclose(back["cam02"].project(POINTS), fan()["cam02"].project(POINTS), atol=1e-6)
     (tmp_path / "extri.yml").write_text("%YAML:1.0\n---\nnames: [")
     with pytest.raises(InputError, match=r"extri\.yml"):
         read_rig_file(tmp_path / "intri.yml")

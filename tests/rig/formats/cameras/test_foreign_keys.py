@@ -116,4 +116,4 @@ def test_values_that_say_something(value: object) -> None:
 def test_the_page_names_the_files_of_cameras_that_are_not_read() -> None:
     page = PAGE.read_text(encoding="utf-8").split("## Not read")[1]
     assert [pattern for pattern, _ in PATTERNS if f"`{pattern}`" not in page] == []
-    assert [key for key in OPENCV_KEYS if key.decode().strip("\n:").lower() not in page.lower()] == []
+    assert [key for key in OPENCV_KEYS if key.strip("\n:").lower() not in page.lower()] == []

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.errors import InputError
-from rig.formats.captures.archive import ArchiveLimits, extract_archive, is_archive, pack_folder
+from rig.formats.captures.archive import ArchiveLimits, extract_archive, is_archive
 
 
 def zip_of(*members: tuple[str | zipfile.ZipInfo, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:
@@ -93,6 +93,7 @@ def wrong_crc_zip() -> bytes:
     return data.replace(b"some pixels", b"same pixels", 1)
 
 
+KINDS = "; only files and folders are unpacked"
 HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "nothing": (lambda: b"", "no .zip"),
     "noise": (lambda: bytes(range(256)) * 40, "no .zip"),
@@ -100,19 +101,21 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "empty zip": (lambda: zip_of(), "no files"),
     "empty tar": (lambda: tar_of(), "no .zip"),
     "zip traversal": (lambda: zip_of(("../../etc/passwd", b"x")), "leads out"),
-    "tar traversal": (lambda: tar_of(("images/../../../x", b"x")), "leads out"),
+    "tar traversal": (lambda: tar_of(("images/../../../x", b"x")), "leads out of the archive ('..')"),
     "zip absolute": (lambda: zip_of(("/etc/passwd", b"x")), "absolute"),
-    "tar absolute": (lambda: tar_of(("/etc/passwd", b"x")), "absolute"),
+    "tar absolute": (lambda: tar_of(("/etc/passwd", b"x")), "'/etc/passwd' is an absolute path"),
     "backslash": (lambda: zip_of(("images\\..\\..\\x", b"x")), "backslash"),
-    "drive": (lambda: zip_of(("C:/x", b"x")), "drive letter"),
-    "device name": (lambda: zip_of(("images/CON.png", b"x")), "Windows reserves"),
-    "tar symlink": (lambda: tar_of((tar_entry("images", tarfile.SYMTYPE, "/etc"), b"")), "symbolic link"),
+    "drive": (lambda: zip_of(("C:/x", b"x")), "has a backslash or a drive letter in its name: rename it"),
+    "device name": (lambda: zip_of(("images/CON.png", b"x")), "has a name that Windows reserves for a device"),
+    "tar symlink": (lambda: tar_of((tar_entry("images", tarfile.SYMTYPE, "/etc"), b"")), f"symbolic link{KINDS}"),
     "tar symlink in use": (
         lambda: tar_of((tar_entry("images", tarfile.SYMTYPE, "/etc"), b""), ("images/passwd", b"x")),
         "symbolic link",
     ),
-    "tar hard link": (lambda: tar_of((tar_entry("a.png", tarfile.LNKTYPE, "/etc/passwd"), b"")), "hard link"),
-    "tar character device": (lambda: tar_of((tar_entry("a.png", tarfile.CHRTYPE), b"")), "device or pipe"),
+    "tar hard link": (lambda: tar_of((tar_entry("a.png", tarfile.LNKTYPE, "/x"), b"")), f"is a hard link{KINDS}"),
+    "tar sparse": (lambda: tar_of((tar_entry("a.png", tarfile.GNUTYPE_SPARSE), b"")), f"is a sparse file{KINDS}"),
+    "tar kind": (lambda: tar_of((tar_entry("a.png", b"Q"), b"")), "'a.png' is of a kind (b'Q') that is not unpacked"),
+    "tar character device": (lambda: tar_of((tar_entry("a.png", tarfile.CHRTYPE), b"")), f"a device or pipe{KINDS}"),
     "tar block device": (lambda: tar_of((tar_entry("a.png", tarfile.BLKTYPE), b"")), "device or pipe"),
     "tar pipe": (lambda: tar_of((tar_entry("a.png", tarfile.FIFOTYPE), b"")), "device or pipe"),
     "zip symlink": (lambda: zip_of((zip_entry("a.png", stat.S_IFLNK | 0o777), b"/etc/passwd")), "symbolic link"),
@@ -120,10 +123,13 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "zip twice": (lambda: zip_of_twice("a.png"), "occurs twice"),
     "tar twice": (lambda: tar_of(("a.png", b"1"), ("a.png", b"2")), "occurs twice"),
     "tar twice with a dot": (lambda: tar_of(("a.png", b"1"), ("./a.png", b"2")), "occurs twice"),
-    "letter case": (lambda: tar_of(("images/A.png", b"1"), ("images/a.png", b"2")), "other letters"),
+    "letter case": (lambda: tar_of(("A.png", b"1"), ("a.png", b"2")), "is the same name as 'A.png' in other letters"),
     "composed and decomposed": (lambda: tar_of(("\u00e9.png", b"1"), ("e\u0301.png", b"2")), "other letters"),
     "full width": (lambda: tar_of(("a.png", b"1"), ("\uff41.png", b"2")), "other letters"),
-    "cyrillic a": (lambda: tar_of(("images/c\u0430m00.png", b"1")), "several alphabets"),
+    "cyrillic a": (
+        lambda: tar_of(("images/c\u0430m00.png", b"1")),
+        "mixes letters of several alphabets in its name: rename it",
+    ),
     "right to left": (lambda: tar_of(("images/cam\u202egnp.exe", b"1")), "invisible"),
     "zero width": (lambda: tar_of(("images/cam\u200b00.png", b"1")), "invisible"),
     "newline": (lambda: tar_of(("images/cam\n00.png", b"1")), "invisible or control"),
@@ -134,12 +140,12 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "zip bomb": (lambda: zip_of(("a.png", bytes(40 << 20))), "unpacks to more"),
     "tar.gz bomb": (lambda: tar_of(("a.png", bytes(40 << 20)), mode="w:gz"), "unpacks to more"),
     "many small bombs": (lambda: zip_of(*((f"{i}.png", bytes(4 << 20)) for i in range(12))), "unpacks to more"),
-    "overlapping zip": (overlapping_zip, "overlaps"),
+    "overlapping zip": (overlapping_zip, "'a.png' overlaps the next member: a zip bomb"),
     "zip says less": (lambda: lying_zip(10), "damaged"),
     "zip says more": (lambda: lying_zip(9000), "does not hold"),
     "tar says a terabyte": (huge_tar_claim, "at most"),
     "tar long header": (long_header_tar, "has a header of"),
-    "encrypted": (encrypted_zip, "encrypted"),
+    "encrypted": (encrypted_zip, "is encrypted: pack the folder without a password"),
     "unknown method": (lambda: patched(zip_of(("a.png", b"x" * 99)), b"PK\x01\x02", 10, b"\x63\x00"), "method 99"),
     "wrong checksum": (wrong_crc_zip, "damaged"),
     "zip cut off": (lambda: zip_of(("a.png", bytes(range(256)) * 99))[:-40], "damaged"),
@@ -166,23 +172,6 @@ def test_a_hostile_archive_is_refused_by_name_and_leaves_nothing(case: str, tmp_
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "upload"]
 
 
-def test_every_fault_is_named(tmp_path: Path) -> None:
-    (tmp_path / "upload").write_bytes(tar_of(("../a", b"1"), ("ok.png", b"2"), ("/b", b"3"), ("c\\d", b"4")))
-    with pytest.raises(InputError) as caught:
-        extract_archive(tmp_path / "upload", tmp_path / "out")
-    assert len(caught.value.faults) == 3
-    assert not list((tmp_path / "out").iterdir())
-
-
-def test_a_folder_that_is_not_empty_is_not_touched(tmp_path: Path) -> None:
-    (tmp_path / "upload").write_bytes(tar_of(("a.png", b"1")))
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mine").write_text("kept")
-    with pytest.raises(InputError, match="not empty"):
-        extract_archive(tmp_path / "upload", tmp_path / "out")
-    assert (tmp_path / "out" / "mine").read_text() == "kept"
-
-
 @pytest.mark.parametrize("kind", ["zip", "stored zip", "tar", "tar.gz"])
 def test_an_honest_archive_comes_out_whole(kind: str, tmp_path: Path) -> None:
     files = {
@@ -207,13 +196,6 @@ def test_an_honest_archive_comes_out_whole(kind: str, tmp_path: Path) -> None:
     assert set(extract_archive(tmp_path / "upload", tmp_path / "out")) == set(files)
     assert {name: (tmp_path / "out" / name).read_bytes() for name in files} == files
     assert len([path for path in (tmp_path / "out").rglob("*") if path.is_file()]) == len(files)
-
-
-def test_what_is_packed_is_unpacked(tmp_path: Path) -> None:
-    (tmp_path / "in" / "images").mkdir(parents=True)
-    (tmp_path / "in" / "images" / "a.png").write_bytes(b"pixels")
-    pack_folder(tmp_path / "in", tmp_path / "packed.tar")
-    assert extract_archive(tmp_path / "packed.tar", tmp_path / "out") == ("images/a.png",)
 
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), min_size=1, max_size=30)

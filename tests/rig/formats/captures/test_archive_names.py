@@ -88,12 +88,6 @@ def test_the_folder_around_a_capture_may_have_any_name(folder: str, kind: str, t
     assert all((tmp_path / "out" / name).is_file() for name in names)
 
 
-@pytest.mark.parametrize("kind", ["zip of macOS", "gnu"])
-def test_two_folders_around_a_capture_are_nobody_s_either(kind: str, tmp_path: Path) -> None:
-    names = [f"Скан/C\u043a\u0430н 2/{member}" for member in MEMBERS]
-    assert unpacked(packed(kind, names), tmp_path) == tuple(names)
-
-
 @pytest.mark.parametrize("kind", ["zip of macOS", "pax"])
 def test_names_that_are_kept_are_judged(kind: str, tmp_path: Path) -> None:
     names = ["頭/cameras.json", "頭/images/c\u0430m00.png"]

@@ -12,7 +12,7 @@ from rig.errors import InputError
 from rig.formats.captures import archive as rules
 from rig.formats.captures.archive import ArchiveLimits, extract_archive
 from rig.messages.message import texts_of
-from tests.rig.formats.captures.test_archive import encrypted_zip, overlapping_zip, tar_entry, tar_of, zip_entry, zip_of
+from tests.rig.formats.captures.test_archive import tar_entry, tar_of, zip_entry, zip_of
 
 LIMITS = ArchiveLimits()
 
@@ -28,39 +28,6 @@ def refused(data: bytes, folder: Path, limits: ArchiveLimits = LIMITS) -> tuple[
 def unpacked(data: bytes, folder: Path, limits: ArchiveLimits = LIMITS) -> tuple[str, ...]:
     (folder / "upload").write_bytes(data)
     return extract_archive(folder / "upload", folder / "out", limits)
-
-
-def sparse_tar() -> bytes:
-    info = tar_entry("a.png", tarfile.GNUTYPE_SPARSE)
-    return tar_of((info, b""))
-
-
-KINDS = "only files and folders are unpacked"
-WORDS = {
-    "zip link": (zip_of((zip_entry("a.png", stat.S_IFLNK | 0o777), b"/x")), f"'a.png' is a symbolic link; {KINDS}"),
-    "zip pipe": (zip_of((zip_entry("a.png", stat.S_IFIFO | 0o644), b"")), f"'a.png' is a device or pipe; {KINDS}"),
-    "tar link": (tar_of((tar_entry("a.png", tarfile.SYMTYPE, "/x"), b"")), f"'a.png' is a symbolic link; {KINDS}"),
-    "hard link": (tar_of((tar_entry("a.png", tarfile.LNKTYPE, "b"), b"")), f"'a.png' is a hard link; {KINDS}"),
-    "device": (tar_of((tar_entry("a.png", tarfile.CHRTYPE), b"")), f"'a.png' is a device or pipe; {KINDS}"),
-    "sparse": (sparse_tar(), f"'a.png' is a sparse file; {KINDS}"),
-    "kind": (tar_of((tar_entry("a.png", b"Q"), b"")), "'a.png' is of a kind (b'Q') that is not unpacked"),
-    "absolute": (tar_of(("/a", b"1")), "'/a' is an absolute path"),
-    "up": (tar_of(("../a", b"1")), "'../a' leads out of the archive ('..')"),
-    "drive": (tar_of(("c:a", b"1")), "'c:a' has a backslash or a drive letter in its name: rename it"),
-    "device name": (tar_of(("x/NUL", b"1")), "'x/NUL' has a name that Windows reserves for a device"),
-    "alphabets": (tar_of(("\u0430b", b"1")), "'\u0430b' mixes letters of several alphabets in its name: rename it"),
-    "letters": (tar_of(("x/A", b"1"), ("x/a", b"2")), "'x/a' is the same name as 'x/A' in other letters"),
-    "twice": (tar_of(("a", b"1"), ("a", b"2")), "'a' occurs twice"),
-    "encrypted": (encrypted_zip(), "'cameras.json' is encrypted: pack the folder without a password"),
-    "overlap": (overlapping_zip(), "'a.png' overlaps the next member: a zip bomb"),
-    "nothing": (zip_of(("folder/", b"")), "holds no files"),
-}
-
-
-@pytest.mark.parametrize("case", WORDS)
-def test_a_fault_is_said_in_these_words(case: str, tmp_path: Path) -> None:
-    data, words = WORDS[case]
-    assert refused(data, tmp_path) == (words,)
 
 
 @pytest.mark.parametrize("character", ["\ue000", "\u0378", "\u2028", "\u2029", "\u200b", "\x7f"])
@@ -148,11 +115,6 @@ def test_it_unpacks_into_a_folder_that_is_there_or_is_not_yet(tmp_path: Path) ->
         extract_archive(tmp_path / "upload", tmp_path / "one" / "two")
     assert caught.value.subject == "two"
     assert texts_of(caught.value.faults) == ["is not empty; an archive is unpacked into a folder of its own"]
-
-
-def test_what_was_written_before_a_fault_is_removed_with_its_folders(tmp_path: Path) -> None:
-    refused(tar_of(("a/b/c/d", b"1"), ("a/e", b"2"), ("/f", b"3")), tmp_path)
-    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_a_list_of_members_has_a_limit_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

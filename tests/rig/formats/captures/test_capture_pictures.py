@@ -17,24 +17,6 @@ from rig.rig import Rig
 from tests.support.small_captures import HEIGHT, WIDTH, picture, small_capture, small_rig
 
 
-def test_images_are_rgb(tmp_path: Path) -> None:
-    red = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    red[..., 0] = 255
-    write_image(tmp_path / "red.png", red)
-    np.testing.assert_array_equal(read_image(tmp_path / "red.png"), red)
-    stored = np.asarray(cv2.imread(str(tmp_path / "red.png")))
-    assert stored[0, 0].tolist() == [0, 0, 255]  # OpenCV's order is the other one
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".tif", ".webp"])
-def test_other_formats_are_read(folder: Path, suffix: str) -> None:
-    grey = np.full((HEIGHT, WIDTH, 3), 117, np.uint8)
-    (folder / "images" / "a.png").unlink()
-    cv2.imwrite(str(folder / "images" / f"a{suffix}"), grey)
-    capture, _ = read_capture(folder)
-    assert np.abs(capture.images["a"].astype(int) - 117).max() <= 2
-
-
 def test_an_exif_turn_is_not_obeyed(folder: Path) -> None:
     """The calibration holds for the sensor's rows and columns."""
     from PIL import Image

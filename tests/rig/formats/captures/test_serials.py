@@ -29,7 +29,7 @@ def photograph(path: Path, serial: str | None, tag: int = BODY_SERIAL) -> Path:
     whole = Image.Exif()
     whole.load(exif.tobytes())  # Pillow writes an inner directory into a TIFF only where it was read from bytes
     path.parent.mkdir(parents=True, exist_ok=True)
-    noise = np.random.default_rng(len(str(path))).integers(0, 256, (24, 24, 3), dtype=np.uint8)
+    noise = np.random.default_rng([*str(path).encode()]).integers(0, 256, (24, 24, 3), dtype=np.uint8)
     Image.fromarray(noise).save(path, exif=whole)
     return path
 

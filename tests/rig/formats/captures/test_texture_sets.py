@@ -9,10 +9,10 @@ import pytest
 
 from rig.capture import reassign_images
 from rig.errors import InputError
-from rig.formats.captures.capture_folder import read_capture, write_capture
+from rig.formats.captures.capture_folder import read_capture
 from rig.formats.pictures.images import write_image
 from rig.messages.message import texts_of
-from tests.support.small_captures import HEIGHT, WIDTH, picture, small_capture, small_rig
+from tests.support.small_captures import HEIGHT, WIDTH, picture, small_rig
 
 
 @pytest.fixture
@@ -40,22 +40,11 @@ def test_sets_are_reduced_with_the_photographs(polarised: Path) -> None:
     assert capture.texture_sets["cross"]["b"].shape == (HEIGHT // 2, WIDTH // 2, 3)
 
 
-def test_written_sets_are_read_back(polarised: Path, tmp_path: Path) -> None:
-    capture, rig = read_capture(polarised)
-    write_capture(tmp_path / "again", capture, rig)
-    again, _ = read_capture(tmp_path / "again")
-    np.testing.assert_array_equal(again.texture_sets["parallel"]["c"], capture.texture_sets["parallel"]["c"])
-
-
 def test_pictures_of_exchanged_cameras_are_exchanged_in_every_set(polarised: Path) -> None:
     capture, _ = read_capture(polarised)
     turned = reassign_images(capture, pictures={"a": "b", "b": "a"})
     np.testing.assert_array_equal(turned.texture_sets["cross"]["a"], capture.texture_sets["cross"]["b"])
     assert turned.digests["texture_sets/cross/a.png"] == capture.digests["texture_sets/cross/b.png"]
-
-
-def test_without_sets_nothing_is_read() -> None:
-    assert small_capture().texture_sets == {}
 
 
 def _many(folder: Path) -> None:

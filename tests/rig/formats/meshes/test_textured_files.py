@@ -1,8 +1,6 @@
 """Textured and printable meshes: other programs read what we write, and the same input is the same bytes."""
 
 import io
-import json
-import struct
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -13,12 +11,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from rig.formats.meshes.glb import Skin, glb_bytes
-from rig.formats.meshes.obj import mtl_bytes, textured_obj_bytes
+from rig.formats.meshes.glb import scene_glb_bytes
+from rig.formats.meshes.obj import mtl_bytes, scene_obj_bytes
 from rig.formats.meshes.ply import ply_bytes, read_head_ply
 from rig.formats.meshes.printing import stl_bytes, threemf_bytes
-from rig.formats.meshes.usdz import usdz_bytes
+from rig.formats.meshes.scene import Part, Scene, Skin
+from rig.formats.meshes.usdz import scene_usdz_bytes
 from rig.mesh import Mesh
+from tests.support.glb import glb_bytes, opened_glb
+from tests.support.scenes import ellipsoid
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=90.0)
 MESH = Mesh(np.asarray(BALL.vertices, dtype=float), np.asarray(BALL.faces, dtype=np.int32))
@@ -32,11 +33,6 @@ def image(suffix: str) -> bytes:
     return cv2.imencode(suffix, PICTURE)[1].tobytes()
 
 
-def document(data: bytes) -> dict:
-    size = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + size])
-
-
 @pytest.mark.parametrize(("suffix", "mime"), [(".jpg", "image/jpeg"), (".png", "image/png"), (".webp", "image/webp")])
 def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
     extras = {"version": "1", "unit": "m"}
@@ -46,7 +42,7 @@ def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
     visual: Any = loaded.visual
     np.testing.assert_allclose(loaded.vertices * 1000, MESH.vertices, atol=1e-4)
     np.testing.assert_allclose(visual.uv, UV * (1, -1) + (0, 1), atol=1e-6)  # trimesh's v is upwards
-    header = document(data)
+    header, _ = opened_glb(data)
     assert header["asset"]["extras"] == extras
     assert header["images"][0]["mimeType"] == mime
     assert ("EXT_texture_webp" in header.get("extensionsRequired", [])) == (suffix == ".webp")
@@ -55,7 +51,7 @@ def test_trimesh_reads_a_textured_glb(suffix: str, mime: str) -> None:
 
 
 def test_trimesh_reads_a_textured_obj_with_its_material(tmp_path: Path) -> None:
-    data = textured_obj_bytes(MESH, normals=NORMALS, uv=UV, faces_uv=MESH.faces, library="head.mtl")
+    data = scene_obj_bytes(Scene([Part("head", MESH, NORMALS, Skin(UV, b"", "image/png"))]), "head.mtl")
     (tmp_path / "head.obj").write_bytes(data)
     (tmp_path / "head.mtl").write_bytes(mtl_bytes("head.png"))
     (tmp_path / "head.png").write_bytes(image(".png"))
@@ -110,9 +106,9 @@ def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
     UsdGeom: Any = pytest.importorskip("pxr.UsdGeom")
     UsdShade: Any = pytest.importorskip("pxr.UsdShade")
 
-    parts = {"normals": NORMALS, "uv": UV, "faces_uv": MESH.faces, "image": image(".jpg"), "suffix": ".jpg"}
-    data = usdz_bytes(MESH, **parts)
-    assert data == usdz_bytes(MESH, **parts)
+    scene = Scene([Part("head", MESH, NORMALS, Skin(UV, image(".jpg")))])
+    data = scene_usdz_bytes(scene)
+    assert data == scene_usdz_bytes(scene)
     path = tmp_path / "head.usdz"
     path.write_bytes(data)
     with zipfile.ZipFile(path) as archive:
@@ -121,13 +117,68 @@ def test_openusd_reads_the_usdz(tmp_path: Path) -> None:
             assert (entry.compress_type, start % 64) == (zipfile.ZIP_STORED, 0)
     stage = pxr.Stage.Open(str(path))
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
-    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/head/mesh"))
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/person/head"))
     np.testing.assert_allclose(np.array(shape.GetPointsAttr().Get()) * 1000, MESH.vertices, atol=1e-4)
     coordinates = UsdGeom.PrimvarsAPI(shape).GetPrimvar("st")
     np.testing.assert_allclose(
         np.array(coordinates.ComputeFlattened()), (UV * (1, -1) + (0, 1))[MESH.faces].reshape(-1, 2), atol=1e-6
     )
     material, _ = UsdShade.MaterialBindingAPI(shape.GetPrim()).ComputeBoundMaterial()
-    assert material.GetPath() == "/head/skin"
-    picture = UsdShade.Shader(stage.GetPrimAtPath("/head/skin/texture"))
-    assert picture.GetInput("file").Get().resolvedPath.endswith("[texture.jpg]")
+    assert material.GetPath() == "/person/head_skin"
+    picture = UsdShade.Shader(stage.GetPrimAtPath("/person/head_skin/texture"))
+    assert picture.GetInput("file").Get().resolvedPath.endswith("[head.jpg]")
+
+
+@pytest.fixture(scope="module")
+def head() -> Mesh:
+    return ellipsoid(3)
+
+
+def morphed(head: Mesh, skin: Skin | None = None) -> bytes:
+    bump = np.zeros_like(head.vertices)
+    bump[:40] = [1.0, 2.0, -3.0]
+    morphs = {"jawOpen": bump, "tongueOut": 0 * bump}
+    return scene_glb_bytes(Scene([Part("head", head, skin=skin, morphs=morphs, weights={"jawOpen": 0.25})]))
+
+
+def accessor(document: dict[str, Any], payload: bytes, number: int) -> np.ndarray:
+    one = document["accessors"][number]
+    out = np.zeros((one["count"], 3))
+    if "sparse" in one:
+        sparse = one["sparse"]
+        places = [document["bufferViews"][sparse[part]["bufferView"]]["byteOffset"] for part in ("indices", "values")]
+        rows = np.frombuffer(payload, "<u4", sparse["count"], places[0])
+        assert (np.diff(rows.astype(int)) > 0).all()  # as the specification wants
+        out[rows] = np.frombuffer(payload, "<f4", 3 * sparse["count"], places[1]).reshape(-1, 3)
+    return out
+
+
+def test_a_morph_moves_what_it_says(head: Mesh) -> None:
+    document, payload = opened_glb(morphed(head))
+    mesh = document["meshes"][0]
+    assert mesh["extras"]["targetNames"] == ["jawOpen", "tongueOut"]
+    assert mesh["weights"] == [0.25, 0.0]
+    jaw, tongue = (accessor(document, payload, target["POSITION"]) for target in mesh["primitives"][0]["targets"])
+    np.testing.assert_allclose(jaw[:40], np.tile([0.001, 0.002, -0.003], (40, 1)), atol=1e-8)
+    assert not jaw[40:].any()
+    assert not tongue.any()
+    bounds = document["accessors"][mesh["primitives"][0]["targets"][0]["POSITION"]]
+    np.testing.assert_allclose([bounds["min"], bounds["max"]], [[0, 0, -0.003], [0.001, 0.002, 0]], atol=1e-8)
+    turned = head.normals() + accessor(document, payload, mesh["primitives"][0]["targets"][0]["NORMAL"])
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1.0, atol=2e-3)
+    assert document["buffers"][0]["byteLength"] == len(payload)
+
+
+def test_a_vertex_on_a_seam_moves_as_its_twin(head: Mesh) -> None:
+    count = len(head.vertices)
+    source = np.append(np.arange(count), 3)
+    faces = head.faces.copy()
+    row, corner = np.argwhere(faces == 3)[0]
+    faces[row, corner] = count
+    skin = Skin(np.zeros((count + 1, 2)), b"\x89PNG\r\n", "image/png", source, faces)
+    document, payload = opened_glb(morphed(head, skin))
+    target = document["meshes"][0]["primitives"][0]["targets"][0]
+    for kind in ("POSITION", "NORMAL"):
+        moved = accessor(document, payload, target[kind])
+        np.testing.assert_array_equal(moved[count], moved[3])
+    assert "TEXCOORD_0" in document["meshes"][0]["primitives"][0]["attributes"]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.applications.model_building.correspondence.cylinder import CylinderIndex, coordinates, points_at
 from pipeline.applications.model_building.correspondence.scans import find_scans, plain_name, read_landmarks
-from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
+from pipeline.applications.model_building.training.figures import Scanner, scan_head
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.geometry.warp import landmark_warp
 from pipeline.head_model.landmarks import NAMES

@@ -19,18 +19,13 @@ from pipeline.applications.model_building.correspondence.correspondence import (
 )
 from pipeline.applications.model_building.correspondence.parallel import FEW, workers
 from pipeline.applications.model_building.correspondence.scans import Scan
-from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
+from pipeline.applications.model_building.training.figures import Scanner, scan_head
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.landmarks import NAMES, mirrored, stacked
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel
 from rig.geometry import RigidTransform
 
 SUBJECTS = (4, 40, 100)
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 def truth(model: HeadModel, subject: int) -> np.ndarray:

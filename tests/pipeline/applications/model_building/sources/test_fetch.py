@@ -9,8 +9,7 @@ import pytest
 
 from pipeline.applications.model_building.sources.fetch import REMOTES, CannotFetch, fetch_model
 from pipeline.applications.model_building.sources.imports import CannotImport
-from pipeline.head_model.info import model_info
-from pipeline.head_model.model import load_model
+from pipeline.head_model.model import load_model, model_info
 from rig.errors import Cancelled
 from tests.support.shared_data import shared
 

@@ -24,21 +24,16 @@ from pipeline.head_model.model_file import save_model
 from tests.support.shared_data import shared
 
 
-@pytest.fixture(scope="module")
-def default() -> HeadModel:
-    return load_model()
-
-
 @pytest.fixture
-def small(default: HeadModel) -> dict[str, np.ndarray]:
+def small(model: HeadModel) -> dict[str, np.ndarray]:
     """A foreign model of 540 vertices whose 6 modes are far from orthogonal, in head axes and mm."""
     mixing = np.random.default_rng(3).standard_normal((6, 6)) + np.eye(6)
-    modes = np.tensordot(mixing, default.basis("p99", 6), 1)
-    place = default.levels["p99"].landmarks
+    modes = np.tensordot(mixing, model.basis("p99", 6), 1)
+    place = model.levels["p99"].landmarks
     return {
-        "mean": default.vertices(np.zeros(0), "p99"),
+        "mean": model.vertices(np.zeros(0), "p99"),
         "modes": modes,
-        "faces": default.levels["p99"].faces,
+        "faces": model.levels["p99"].faces,
         "landmark_names": np.array(list(place)),
         "landmark_vertices": np.array(list(place.values())),
         "subjects": np.array([7, 4, 3]),
@@ -169,10 +164,10 @@ def test_what_cannot_be_a_head_is_refused(tmp_path: Path, small: dict[str, np.nd
         import_model(tmp_path)
 
 
-def test_openings_are_closed_but_the_neck(default: HeadModel) -> None:
+def test_openings_are_closed_but_the_neck(model: HeadModel) -> None:
     """Cut an eye-sized hole into the head: adopting the model closes it again, without a new vertex."""
-    level = default.levels["p99"]
-    mean = default.vertices(np.zeros(0), "p99")
+    level = model.levels["p99"]
+    mean = model.vertices(np.zeros(0), "p99")
     hole = level.landmarks["endocanthion_left"]
     foreign = Foreign(
         name="holed",
@@ -180,7 +175,7 @@ def test_openings_are_closed_but_the_neck(default: HeadModel) -> None:
         source="test",
         notice="",
         mean=mean,
-        modes=default.basis("p99", 3),
+        modes=model.basis("p99", 3),
         faces=level.faces[~(level.faces == hole).any(1)],
         landmarks={n: v for n, v in level.landmarks.items() if n != "endocanthion_left"} | {"endocanthion_left": 0},
         subjects={"total": 0, "male": 0, "female": 0},

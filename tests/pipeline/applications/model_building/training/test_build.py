@@ -11,23 +11,18 @@ from scipy.spatial import KDTree
 
 from pipeline.applications.model_building.correspondence.scan_checks import BadScan, check, outward_share
 from pipeline.applications.model_building.correspondence.scans import Scan, read_scan
-from pipeline.applications.model_building.correspondence.synthetic_scanner import Scanner, scan_head
 from pipeline.applications.model_building.training.build import build_model
+from pipeline.applications.model_building.training.figures import Scanner, scan_head
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.landmarks import NAMES, mirrored
 from pipeline.head_model.model import HeadModel, load_model
 from rig.errors import InputError
-from rig.formats.meshes.obj import obj_bytes
 from rig.geometry import rigid_fit
 from rig.mesh import Mesh
+from tests.support.glb import obj_bytes
 from tests.support.landmark_files import write_landmarks
 
 SUBJECTS = (4, 40, 100, 120)
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
 
 
 def scanned(model: HeadModel, subject: int, spacing_mm: float) -> Scan:

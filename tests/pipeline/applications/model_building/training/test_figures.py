@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.applications.model_building.training.figures import LINES, PANEL, chart, modes_figure, shaded, show_model
-from pipeline.head_model.model import HeadModel, load_model, with_modes
-
-
-@pytest.fixture(scope="module")
-def model() -> HeadModel:
-    return load_model()
+from pipeline.head_model.model import HeadModel, with_modes
 
 
 def height(image: np.ndarray) -> int:

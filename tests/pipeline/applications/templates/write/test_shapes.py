@@ -18,9 +18,9 @@ from pipeline.results.write import write_result
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.faces import Faces
 from rig.capture import Capture
-from rig.formats.meshes.glb_document import opened_glb
 from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
+from tests.support.glb import opened_glb
 from tests.support.made_up_results import made_up_result
 from tests.support.ready_templates import EYE_CENTRE, ready_template
 
