@@ -47,6 +47,17 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+def test_every_promise_of_security_names_tests_that_are_there() -> None:
+    rows = [line for line in (ROOT / "SECURITY.md").read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
+    for row in rows[1:]:
+        _, promise, tests, _ = row.split("|")
+        path = ""
+        for file, name in re.findall(r"([\w/.]*)::(\w+)", tests):
+            path = file or path
+            assert f"\ndef {name}(" in (ROOT / path).read_text(encoding="utf-8"), f"{promise}: {path}::{name}"
+        assert path, promise
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_every_link_leads_to_a_file_and_a_heading(page: Path) -> None:
     for link in LINK.findall(prose(page)):

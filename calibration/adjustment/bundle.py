@@ -1,6 +1,6 @@
 """Adjusts everything at once, robustly: intrinsics with distortion, camera poses, board poses.
 
-It uses the project's Levenberg-Marquardt on blocks of the normal equations (``corner_term``). Eleven cameras and thirty
+It uses the project's Levenberg-Marquardt on blocks of the normal equations (``CornerTerm``). Eleven cameras and thirty
 shots have 339 unknowns, which a dense Cholesky factor solves in ten milliseconds, so sparse methods would bring nothing
 (tests/laboratory/notes/calibration.md compares the times with scipy's and Ceres's).
 

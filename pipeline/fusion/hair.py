@@ -34,7 +34,7 @@ from pipeline.geometry.raster import depth_map
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap
-from pipeline.part_labels.votes import PartVotes, part_shares, shown_parts
+from pipeline.part_labels.votes import PartVotes, part_shares, parts_shown
 from pipeline.stereo.depth_map import DepthMap, placing, points_world
 from rig.camera import Camera
 from rig.mesh import Mesh, face_normals
@@ -136,7 +136,7 @@ def only_where(kept: Bool[np.ndarray, "h w"], depth_map: DepthMap) -> DepthMap:
     )
 
 
-def crop_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float[np.ndarray, "r c 3"]:
+def shown_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float[np.ndarray, "r c 3"]:
     """Returns the probabilities of skin, hair and clothes at every ``PIXEL_EVERY``-th pixel of a crop, in either
     direction; 0 where there is no part map."""
     (fx, fy, cx, cy), turn, shift = placing(depth_map.camera)
@@ -145,7 +145,7 @@ def crop_parts(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> F
     if depth_map.camera.name not in parts:
         return np.zeros((*row.shape, 3))
     rays = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(row.shape)], axis=-1).reshape(-1, 3)
-    shown = shown_parts(FAR_MM * rays @ turn.T + shift, parts[depth_map.camera.name], rig[depth_map.camera.name])
+    shown = parts_shown(FAR_MM * rays @ turn.T + shift, parts[depth_map.camera.name], rig[depth_map.camera.name])
     return shown.reshape(*row.shape, 3)
 
 
@@ -153,7 +153,7 @@ def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], ri
     """Returns the share of the pixels of hair whose depth is known; 1 where there is hardly any hair."""
 
     def count(depth_map: DepthMap) -> Float[np.ndarray, " 3"]:
-        skin, hair, _ = np.moveaxis(crop_parts(depth_map, parts, rig) > LIKELY, 2, 0)
+        skin, hair, _ = np.moveaxis(shown_parts(depth_map, parts, rig) > LIKELY, 2, 0)
         known = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY]
         return np.array([(hair & known).sum(), hair.sum(), (hair | skin).sum()], float)
 
@@ -165,14 +165,14 @@ def known_share(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], ri
 def loosened(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig, scatter: float) -> DepthMap:
     """Returns the depth map with larger deviations of hair, as far as its depth is noise (``scatter``)."""
     height, width = depth_map.depth_mm.shape
-    hair = np.asarray(cv2.resize(crop_parts(depth_map, parts, rig)[..., Part.HAIR.channel], (width, height)))
+    hair = np.asarray(cv2.resize(shown_parts(depth_map, parts, rig)[..., Part.HAIR.channel], (width, height)))
     looser = 1.0 + (LOOSER - 1.0) * scatter * hair
     return replace(depth_map, deviation_mm=(depth_map.deviation_mm * looser).astype(np.float32))
 
 
 def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> Float32[np.ndarray, "h w"]:
     """Returns, for each pixel of a crop, the share of the subject's pixels about it whose depth is known."""
-    body = (crop_parts(depth_map, parts, rig).sum(axis=2) > LIKELY).astype(np.float32)
+    body = (shown_parts(depth_map, parts, rig).sum(axis=2) > LIKELY).astype(np.float32)
     known = depth_map.known[::PIXEL_EVERY, ::PIXEL_EVERY] * body
     distance_mm = float(np.median(depth_map.depth_mm[depth_map.known])) if depth_map.known.any() else FAR_MM
     side = max(3, round(WINDOW_MM * depth_map.camera.intrinsics.fx / (PIXEL_EVERY * distance_mm)))

@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -15,10 +13,10 @@ from jaxtyping import Bool, Float, Float32, Int
 from pipeline.head_model.expressions import Expressions, no_expressions, packed, unpacked
 from rig.atomic_write import write_atomically
 from rig.errors import EigenheadError
+from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 
 FORMAT = "eigenhead-model/2"  # 2: with expressions
 READABLE = ("eigenhead-model/1", FORMAT)
-DAMAGE = (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 class BadModel(EigenheadError):
@@ -104,14 +102,14 @@ def read_parts(path: Path) -> tuple[ModelParts, str]:
     except OSError as fault:
         raise BadModel(path, fault.strerror or "cannot be read") from None
     try:
-        with np.load(BytesIO(raw), allow_pickle=False) as file:
+        with open_npz(BytesIO(raw)) as file:
             if "meta" not in file:
                 raise BadModel(path, "it does not carry this project's model format")
             meta = json.loads(file["meta"].tobytes())
             if meta.get("format") not in READABLE:
                 raise BadModel(path, f"format {meta.get('format')!r}, wanted {FORMAT!r}")
             parts = _parts(meta, file)
-    except DAMAGE as fault:
+    except (OSError, *DAMAGE) as fault:
         raise Damaged(path, fault) from None
     return parts, hashlib.sha256(raw).hexdigest()
 
@@ -119,9 +117,9 @@ def read_parts(path: Path) -> tuple[ModelParts, str]:
 def expression_names(path: Path) -> tuple[str, ...]:
     """Returns the names of the expressions in a model file without reading their shapes. Raises BadModel."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_npz(path) as file:
             return tuple(json.loads(file["meta"].tobytes()).get("expressions", ()))
-    except DAMAGE as fault:
+    except (OSError, *DAMAGE) as fault:
         raise Damaged(path, fault) from None
 
 

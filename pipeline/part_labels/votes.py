@@ -55,7 +55,7 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
 
     def cloud(k: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         points = points_world(voting[k])
-        return points, shown_parts(points, parts[voting[k].camera.name], rig[voting[k].camera.name])
+        return points, parts_shown(points, parts[voting[k].camera.name], rig[voting[k].camera.name])
 
     points, shown = (np.concatenate(part) for part in zip(*map_in_threads(cloud, len(voting)), strict=True))
     corner = points.min(axis=0)
@@ -73,7 +73,7 @@ def vote_parts(depth_maps: Sequence[DepthMap], parts: Mapping[str, PartMap], rig
     return PartVotes(corner, size, keys, mean(points), mean(shown))
 
 
-def shown_parts(points: Float[np.ndarray, "n 3"], part: PartMap, camera: Camera) -> Float[np.ndarray, "n 3"]:
+def parts_shown(points: Float[np.ndarray, "n 3"], part: PartMap, camera: Camera) -> Float[np.ndarray, "n 3"]:
     """Returns the probabilities of skin, hair and clothes at the pixel of each point (world, mm); 0 beside the
     picture."""
     height, width = part.of_255.shape[:2]

@@ -12,7 +12,7 @@ from pipeline.head_model.model_basis import model_basis
 from pipeline.part_labels.cap import Cap, find_cap
 from pipeline.part_labels.codes import Part
 from pipeline.part_labels.labelling import PartMap, classify_parts
-from pipeline.part_labels.votes import shown_parts
+from pipeline.part_labels.votes import parts_shown
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
@@ -48,7 +48,7 @@ class PartLabels:
         without a part map."""
         if camera.name not in self.maps:
             return np.ones(len(points))
-        shown = shown_parts(points, self.maps[camera.name], camera)
+        shown = parts_shown(points, self.maps[camera.name], camera)
         of_head = shown[:, Part.SKIN.channel] + ~hairless * shown[:, Part.HAIR.channel]
         return of_head + face * (1.0 - shown.sum(axis=1))
 

@@ -12,6 +12,7 @@ from fastapi.middleware.cors import CORSMiddleware
 from fastapi.routing import APIRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from server.http.auth import FairShares
 from server.http.json_bodies import JsonBodies
 from server.http.linger import DrainRequestBody
 from server.http.openapi import describe, operation_name
@@ -87,6 +88,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
             allow_headers=["*"],
             expose_headers=EXPOSED,
         )
+    app.add_middleware(FairShares)
     app.add_middleware(Watch, metrics=metrics)
     app.add_middleware(DrainRequestBody)  # outside Watch, so that Watch does not time a slow client
     describe(app)

@@ -88,7 +88,8 @@ def ingest_archive(
     if warnings is not None:
         described = _with_calibration(described, root, warnings)
     else:
-        described = replace(described, warnings=_outline_findings(root, len(described.cameras), networks, report))
+        findings = _outline_findings(root, len(described.cameras), networks, report)
+        described = replace(described, warnings=findings, face=_beside(described.face, findings))
     filed = _filed_names(root)
     for name in described.inputs:
         path = target / filed.get(name, name)
@@ -97,6 +98,12 @@ def ingest_archive(
     shutil.rmtree(unpacked)
     inputs = {filed.get(name, name): digest for name, digest in described.inputs.items()}
     return replace(described, inputs=dict(sorted(inputs.items())))
+
+
+def _beside(face: FaceSighting | None, findings: tuple[ReportWarning, ...]) -> FaceSighting | None:
+    """Leaves out of what small pictures told of the face what the whole check tells, too."""
+    said = {finding.code for finding in findings}
+    return face and replace(face, remarks=tuple(remark for remark in face.remarks if remark.code not in said))
 
 
 def _outline_findings(

@@ -19,6 +19,7 @@ from server.tasks.child import Report, WorkerContext
 if TYPE_CHECKING:
     from pipeline.settings import Settings
     from pipeline.stages.context import Segment
+    from pipeline.warnings import ReportWarning
     from rig.render.compute import ComputeDevice
     from rig.render.renderer import Renderer
     from server.tasks.photographs import Prepared
@@ -120,11 +121,7 @@ def run_job(
         )
     )
     report("write", 0.0)
-    warnings = (*prepared.warnings, *done.warnings)
-    if done.scale_sigma > SURE_SCALE and all(warning.code != "scale-assumed" for warning in warnings):
-        estimated = compose("scale-estimated", share=done.scale_sigma)
-        warnings = (compose("scale-assumed", scale=estimated), *warnings)
-    done = replace(done, warnings=warnings)
+    done = replace(done, warnings=_with_scale((*prepared.warnings, *done.warnings), done.scale_sigma))
     with span("stage", "write"):
         write_result(out, done, prepared.capture, writers)
 
@@ -148,3 +145,10 @@ def matching_device(context: WorkerContext, chosen: "Settings", renderer: "Rende
         f"device {chosen.device}", lambda: open_device(chosen.device, description)
     )
     return device
+
+
+def _with_scale(warnings: "tuple[ReportWarning, ...]", scale_sigma: float) -> "tuple[ReportWarning, ...]":
+    """Adds a warning of a scale that is an estimate, unless the calibration has warned of it."""
+    if scale_sigma <= SURE_SCALE or any(warning.code == "scale-assumed" for warning in warnings):
+        return warnings
+    return (compose("scale-assumed", scale=compose("scale-estimated", share=scale_sigma)), *warnings)

@@ -57,10 +57,27 @@ def take_over(engine: sa.Engine, dead: Collection[str]) -> list[str]:
         holders = {*connection.scalars(sa.select(job.c.executor_id).where(job.c.status == RUNNING).distinct())}
         known = {*connection.scalars(sa.select(workers.c.id))}  # asked second: a worker that begins now is no stray
     gone = {*dead, *holders - known} & holders
-    if not gone:
-        return []
+    return _put_back(engine, job, job.c.executor_id.in_(gone)) if gone else []
+
+
+def take_back(engine: sa.Engine, executor_id: str, lost: Collection[str]) -> list[str]:
+    """Puts workflows of a living worker, in which nothing runs any more, back into their queues, as ``take_over``."""
+    job = engine_jobs(engine)
+    which = sa.and_(job.c.executor_id == executor_id, job.c.workflow_uuid.in_(lost))
+    return _put_back(engine, job, which) if lost else []
+
+
+def held_by(engine: sa.Engine, executor_id: str, names: Collection[str]) -> list[str]:
+    """Lists the ids of the running workflows of these names that a worker holds."""
+    job = engine_jobs(engine).c
+    query = sa.select(job.workflow_uuid).where(job.status == RUNNING, job.executor_id == executor_id)
+    with engine.connect() as connection:
+        return [*connection.scalars(query.where(job.name.in_(names)))]
+
+
+def _put_back(engine: sa.Engine, job: sa.TableClause, which: sa.ColumnElement[bool]) -> list[str]:
     back = {"status": "ENQUEUED", "owner_xid": None, "started_at_epoch_ms": None}
-    change = sa.update(job).where(job.c.status == RUNNING, job.c.executor_id.in_(gone))
+    change = sa.update(job).where(job.c.status == RUNNING, which)
     with engine.begin() as connection:
         changed = change.values(**back, updated_at=sa.cast(now_sql(connection) * 1000, sa.BigInteger))
         return [*connection.scalars(changed.returning(job.c.workflow_uuid))]

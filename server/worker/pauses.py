@@ -15,8 +15,8 @@ log = structlog.get_logger()
 
 
 class WorkerStopped(BaseException):
-    """Ends a step whose worker stops. It is no Exception: the engine would record one as the failure of the job, which
-    another worker is to go on with."""
+    """Ends a step whose worker stops, or for which the engine could not write to the database. It is no Exception: the
+    engine would record one as the failure of the job, which another worker, or this one later, is to go on with."""
 
 
 def pause(stop: threading.Event, seconds: float) -> None:

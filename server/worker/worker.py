@@ -19,8 +19,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -47,7 +47,7 @@ from server.services.results import Results
 from server.services.webhooks import WEBHOOKS_QUEUE, Webhooks
 from server.settings import ServiceSettings
 from server.storage.capture_blobs import open_capture_blobs
-from server.storage.database import now_sql, open_database, workers
+from server.storage.database import AWAY, now_sql, open_database, workers
 from server.storage.events import EventLog
 from server.storage.folders import move_durably
 from server.storage.records import CalibrationOutcome, FileEntry, JobRequest, WebhookMessage
@@ -59,11 +59,12 @@ from server.tasks.reconstruct import reconstruct_capture
 from server.tasks.stage_durations import StageDurations
 from server.worker.capture_source import CaptureSource
 from server.worker.delivery import DELIVERIES_AT_ONCE, Deliverer
-from server.worker.engine import dead_workers, engine_config, take_over
+from server.worker.engine import dead_workers, engine_config, held_by, take_back, take_over
 from server.worker.outcome import Outcomes
-from server.worker.pauses import insist, pause
+from server.worker.pauses import WorkerStopped, insist, pause
 from server.worker.result_files import add_warning, described
 
+LOST_S = 10.0  # between the end of a workflow and its row, which takes milliseconds
 FORGET_S = 3600.0  # rows of dead workers are kept so long, for the operator to see
 
 log = structlog.get_logger()
@@ -82,6 +83,8 @@ class Worker:
         self._children = ChildProcessPool(settings.concurrency, niceness=5)  # a busy machine still answers requests
         self._work: Callable[Concatenate[WorkerContext, Progress, ...], object] = function_at(settings.work)
         self._stop = threading.Event()
+        self._here: set[str] = set()  # workflows that run in this process
+        self._idle: dict[str, float] = {}  # those that it holds and that do not, and since when
         self._webhooks = Webhooks(self.engine, settings.webhook_origins)
         self._durations = StageDurations()
         self._states = _StateWatch(settings.poll_s)
@@ -144,6 +147,7 @@ class Worker:
             return insist(worker._stop, lambda: worker.publish(job_id, attempt))
 
         @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=self.settings.attempts)
+        @self._noted()
         def reconstruct_job(request: JobRequest) -> dict[str, FileEntry]:
             job_id = DBOS.workflow_id
             assert job_id is not None
@@ -157,6 +161,9 @@ class Worker:
                     log.warning("job failed", kind=failed.kind, detail=failed.detail.text)
                     worker.outcomes.publish(job_id, "failed", request.get("webhook"), failure=failed.kind)
                     raise failed from error
+                except AWAY as error:  # of the engine's own writes, on a disk that is full
+                    log.warning("job interrupted", reason=str(error)[:200])
+                    raise WorkerStopped from error
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
                     worker.results.discard(job_id)
                     raise
@@ -172,6 +179,7 @@ class Worker:
             return worker._webhooks.post(message)
 
         @DBOS.workflow(name=DELIVERY)
+        @self._noted()
         def deliver(message: WebhookMessage) -> int:
             return post(message)
 
@@ -180,10 +188,21 @@ class Worker:
             return worker.calibrate(identity)
 
         @DBOS.workflow(name=calibrations.WORKFLOW, max_recovery_attempts=self.settings.attempts)
+        @self._noted()
         def calibrate_rig(identity: str) -> CalibrationOutcome:
             return calibrate(identity)
 
         del reconstruct_job, deliver, calibrate_rig  # known to the engine by name
+
+    @contextmanager
+    def _noted(self) -> Iterator[None]:
+        """Notes the id of a workflow while it runs here."""
+        identity = DBOS.workflow_id or ""
+        self._here.add(identity)
+        try:
+            yield
+        finally:
+            self._here.discard(identity)
 
     def ingest(self, job_id: str, request: JobRequest) -> None:
         """Checks that a job's capture exists and that the disk has space, and makes the job's folder. Raises JobFailed
@@ -352,14 +371,22 @@ class Worker:
                 connection.execute(sa.insert(workers).values(**row, **seen))
 
     def _take_over(self) -> None:
-        """Puts the jobs of dead workers back. Idempotent, and safe for any number of workers at once."""
+        """Puts the jobs of dead workers, and lost ones of this one, back. Idempotent, and safe for any number of
+        workers at once."""
         dead = dead_workers(self.engine, self.settings.silent_s, except_id=self.id)
-        for job_id in take_over(self.engine, dead):
+        for job_id in [*take_over(self.engine, dead), *take_back(self.engine, self.id, self._find_lost())]:
             log.warning("job taken over", job=job_id)
             self.events.append(job_id, {"state": "queued", "stage": "queued", "progress": 0.0, "eta_s": None})
         with self.engine.begin() as connection:
             old = sa.and_(workers.c.id.in_(dead), workers.c.seen < now_sql(connection) - FORGET_S)
             connection.execute(sa.delete(workers).where(old))
+
+    def _find_lost(self) -> list[str]:
+        """Lists the workflows that the engine gave to this worker and in which nothing runs for ``LOST_S`` seconds: how
+        they ended could not be written, as on a disk that was full."""
+        now, held = time.monotonic(), held_by(self.engine, self.id, (WORKFLOW, DELIVERY, calibrations.WORKFLOW))
+        self._idle = {job: self._idle.get(job, now) for job in held if job not in self._here}
+        return [job for job, since in self._idle.items() if now - since >= LOST_S]
 
 
 class _StateWatch:

@@ -1,8 +1,11 @@
 """Attacks on a running service, each bounded and on loopback, and a witness who measures what others feel of them."""
 
+import json
 import resource
 import socket
 import statistics
+import subprocess
+import sys
 import threading
 import time
 import zlib
@@ -47,6 +50,16 @@ def flood_header(service: RunningService, megabytes: int, begin: bytes = REQUEST
         return sent, _answer(sock)
 
 
+ASKING = """
+import json, sys
+from concurrent.futures import ThreadPoolExecutor
+import httpx
+url, key, count = sys.argv[1:]
+with httpx.Client(headers={"Authorization": f"Bearer {key}"}, timeout=120) as http, ThreadPoolExecutor(100) as pool:
+    print(json.dumps(list(pool.map(lambda _: http.get(url).status_code, range(int(count))))))
+"""
+
+
 @contextmanager
 def silent_connections(service: RunningService, count: int, begin: bytes = b"") -> Iterator[list[socket.socket]]:
     """Connections that send ``begin`` and then nothing."""
@@ -65,6 +78,12 @@ def half_body(path: str, key: str | None = None) -> bytes:
     access = "" if key is None else f"Authorization: Bearer {key}\r\n"
     head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\n{access}Content-Type: application/json\r\n"
     return (head + 'Content-Length: 400\r\n\r\n{"capture_id": ').encode()
+
+
+def ask_often(service: RunningService, key: str, path: str, count: int = 2000) -> set[int]:
+    """Sends small requests, 100 at once, from a process of its own: the witness has this one. Returns the statuses."""
+    command = [sys.executable, "-c", ASKING, service.url + path, key, str(count)]
+    return set(json.loads(subprocess.run(command, capture_output=True, check=True, timeout=300).stdout))
 
 
 def seconds_to_end(sock: socket.socket, timeout_s: float) -> float:

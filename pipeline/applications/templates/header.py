@@ -2,8 +2,6 @@
 model: the command line, the service and the console call it before any work begins."""
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,11 +12,11 @@ import numpy as np
 from pipeline.applications.templates.names import template_path
 from pipeline.head_model.model_names import model_path, model_sha256
 from rig.errors import EigenheadError
+from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 from rig.messages.message import Message, compose
 
 FORMAT = "eigenhead-template/1"
 WORDS = ("name", "source", "source_sha256", "model_name", "model_sha256")
-DAMAGE = (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 class BadTemplate(EigenheadError):
@@ -68,7 +66,7 @@ def read_header(path: Path) -> TemplateHeader:
     """Returns the header of a template file. Raises BadTemplate if the file cannot be read, is damaged or of another
     kind."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_npz(path) as file:
             meta = read_meta(path, file)
         return TemplateHeader(**header_words(meta), figures=meta["figures"])
     except OSError as error:

@@ -1,6 +1,6 @@
 """Teeth and a tongue for a mesh that has none: behind its lips, moved with its jaw, and lips that keep off them.
 
-The shipped parts (``read_inner_mouth``) are brought to the person by the similarity of the mouth's landmarks, then
+The shipped parts (``load_inner_mouth``) are brought to the person by the similarity of the mouth's landmarks, then
 moved back until no lip meets them, shut or open. Upper teeth stay with the skull; lower teeth and tongue move with the
 jaw as parts of a mesh do (``pivots.jaw_motions``). A shape that presses lips through the teeth is lifted there, with
 what moves about it, as lids are off eyeballs (``eyeballs.lifted``).

@@ -8,14 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.applications.templates.flame_model import JOINTS, FlameModel
-from pipeline.applications.templates.header import DAMAGE
 from pipeline.applications.templates.registration import Registration, register
 from pipeline.applications.templates.template_file import Template
 from pipeline.head_model.model import HeadModel
 from pipeline.results.clay import SKIN, clay
 from pipeline.results.overlays import contact_sheet
 from rig.errors import InputError
-from rig.formats.meshes.pickled_arrays import read_pickled_arrays
+from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz, read_pickled_arrays
 from rig.formats.meshes.polygon_obj import PolygonMesh, read_polygons
 from rig.image import ImageRgb
 from rig.mesh import Mesh
@@ -89,7 +88,7 @@ def read_flame(path: Path) -> FlameModel:
 
 def _archive(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_npz(path) as file:
             return {name: file[name] for name in NAMES if name in file}
     except (OSError, *DAMAGE) as fault:
         raise InputError(path.name, [compose("file-incomplete", reason=str(fault))]) from None

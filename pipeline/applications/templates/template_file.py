@@ -11,18 +11,11 @@ import numpy as np
 
 from pipeline.applications.templates.carrying import Attachment, SurfaceBinding
 from pipeline.applications.templates.flame_model import FlameModel
-from pipeline.applications.templates.header import (
-    DAMAGE,
-    FORMAT,
-    WORDS,
-    BadTemplate,
-    TemplateHeader,
-    header_words,
-    read_meta,
-)
+from pipeline.applications.templates.header import FORMAT, WORDS, BadTemplate, TemplateHeader, header_words, read_meta
 from pipeline.applications.templates.names import template_path
 from pipeline.head_model.model import HeadModel
 from rig.atomic_write import write_atomically
+from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 from rig.formats.meshes.polygon_obj import PolygonMesh
 from rig.messages.message import compose
 
@@ -83,7 +76,7 @@ def _stored(kind: str) -> type:
 def read_template(path: Path) -> Template:
     """Returns a template from its file. Raises BadTemplate."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_npz(path) as file:
             meta = read_meta(path, file)
             kinds = MESH | ATTACHMENT | CARRIER
             arrays = {name: np.asarray(file[name], int if kinds[name] == "i" else float) for name in kinds}

@@ -6,8 +6,6 @@ lengths in metres, rotation vectors in radians, and moments along the first axis
 """
 
 import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from rig.errors import InputError
+from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 from rig.messages.message import compose
 
 FILE = "flame_param.npz"
@@ -56,9 +55,9 @@ def encoded(parameters: FlameParam) -> bytes:
 def read_flame_param(path: Path) -> FlameParam:
     """Returns the arrays of a file of one moment. Raises InputError if it is damaged or holds other arrays."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_npz(path) as file:
             arrays = {name: file[name].astype(np.float32) for name in file}
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as fault:
+    except (OSError, *DAMAGE) as fault:
         raise InputError(str(path), [compose("file-incomplete", reason=str(fault))]) from None
     wanted = POSES | {"translation": 3}
     faults = [

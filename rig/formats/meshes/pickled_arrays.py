@@ -1,11 +1,17 @@
-"""Reads the arrays of a pickle without running anything that it names.
+"""Reads the arrays of files from elsewhere: of an npz within a bound, of a pickle without running anything it names.
 
 A pickle is a program: the names in it are imported and called. Here no name is. NumPy's arrays and types, SciPy's
 sparse matrices and chumpy's arrays become inert stand-ins of this module, which decode plain numbers by themselves;
 any other name is refused. Pickles of Python 2 are read, too.
 """
 
+import io
 import pickle
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +21,7 @@ from rig.errors import InputError
 from rig.messages.message import compose
 
 MAX_BYTES = 512 << 20  # FLAME's models have 50 MB, SMPL-X's 550 before compression
+MAX_UNPACKED = 2 << 30  # of an npz: four times that
 KINDS = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1")
 DAMAGE = (
     ArithmeticError,
@@ -22,10 +29,24 @@ DAMAGE = (
     EOFError,
     LookupError,
     MemoryError,
+    RuntimeError,
     TypeError,
     ValueError,
     pickle.PickleError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
 )
+
+
+@contextmanager
+def open_npz(source: Path | io.BytesIO) -> Iterator[Any]:
+    """Opens an archive of arrays, each of which is read when it is asked for. Raises OSError or one of ``DAMAGE``
+    for another kind of file, and for an archive or an array that is larger than ``MAX_UNPACKED`` or than it says."""
+    with np.load(source, allow_pickle=False) as file:
+        if sum(entry.file_size for entry in file.zip.infolist()) > MAX_UNPACKED:
+            raise ValueError(f"more than {MAX_UNPACKED >> 20} MB of arrays")
+        yield file
 
 
 def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:

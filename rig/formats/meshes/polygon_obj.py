@@ -18,6 +18,8 @@ from rig.messages.message import Message, compose
 
 MOST_VERTICES = 200_000  # 8 times a film's head; registering it takes 4 minutes and 2 GB. Larger files are scans
 MOST_CORNERS = 8 * MOST_VERTICES
+MOST_SIDES = 4096  # of a polygon: ten times what closes a neck; a fan of all corners takes minutes to follow
+MOST_LINES = 4 * MOST_CORNERS
 MOST_BYTES = 256 << 20
 FAULTS_TOLD = 12
 KEPT_STATEMENTS = ("o", "g", "s", "usemtl")
@@ -72,7 +74,7 @@ def _whole_lines(file: Iterable[str]) -> Iterable[tuple[int, str]]:
     begun = ""
     for number, raw in enumerate(file, start=1):
         line = raw.rstrip()
-        if line.endswith("\\"):
+        if line.endswith("\\") and number <= MOST_LINES:
             begun += line[:-1] + " "
             continue
         yield number, begun + line
@@ -92,15 +94,24 @@ class _Reading:
     corner_uv: list[int] = field(default_factory=list)
     statements: list[tuple[int, str]] = field(default_factory=list)
     faults: list[Message] = field(default_factory=list)
+    untold: int = 0  # faults beyond those
+    number: int = 0  # of the line that was read
+
+    def fault(self, code: str, number: int, **parameters: str | int) -> None:
+        if len(self.faults) < FAULTS_TOLD:
+            self.faults.append(compose(code, line=number, **parameters))
+        else:
+            self.untold += 1
 
     def take(self, number: int, line: str) -> None:
+        self.number = number
         word, _, rest = line.strip().partition(" ")
         if word == "v":
             self.vertices.append(self._numbers(number, line, rest.split(), 3))
         elif word == "vt":
             self.uv.append(self._numbers(number, line, [*rest.split(), "0"], 2))  # v may be left out
         elif word == "f":
-            self._face(number, line, rest.split())
+            self._face(number, line, rest.split(None, MOST_SIDES))
         elif word in KEPT_STATEMENTS:
             self.statements.append((len(self.sizes), f"{word} {rest.strip()}"))
 
@@ -111,16 +122,19 @@ class _Reading:
             found = ()
         if len(found) == count and all(map(math.isfinite, found)):
             return found
-        self.faults.append(compose("line-no-numbers", line=number, text=f"{line.strip()!r:.60}", wanted=count))
+        self.fault("line-no-numbers", number, text=f"{line.strip()!r:.60}", wanted=count)
         return (0.0,) * count
 
     def _face(self, number: int, line: str, words: list[str]) -> None:
+        if len(words) > MOST_SIDES:
+            self.fault("line-many-corners", number, most=MOST_SIDES)
+            return
         try:
             named = [[int(part) if part else None for part in word.split("/")[:2]] for word in words]
         except ValueError:
             named = []
         if len(named) < 3:
-            self.faults.append(compose("line-no-polygon", line=number, text=f"{line.strip()!r:.60}"))
+            self.fault("line-no-polygon", number, text=f"{line.strip()!r:.60}")
             return
         for corner in named:
             self.corners.append(self._row(number, corner[0], len(self.vertices)))
@@ -133,18 +147,19 @@ class _Reading:
         is checked at the end of the file."""
         row = -1 if index is None else index - 1 if index > 0 else count + index
         if not index or row < 0:
-            self.faults.append(compose("line-strange-row", line=number, row=f"{index}"))
+            self.fault("line-strange-row", number, row=f"{index}")
             return 0
         return row
 
     def too_large(self) -> bool:
-        return len(self.vertices) > MOST_VERTICES or len(self.corners) > MOST_CORNERS or len(self.uv) > MOST_CORNERS
+        counts = (len(self.vertices), MOST_VERTICES), (len(self.corners), MOST_CORNERS), (len(self.uv), MOST_CORNERS)
+        return any(count > most for count, most in (*counts, (self.number, MOST_LINES)))
 
     def finished(self, name: str) -> PolygonMesh:
         """Returns the arrays. Raises InputError."""
-        faults = self.faults[:FAULTS_TOLD]
-        if len(self.faults) > FAULTS_TOLD:
-            faults.append(compose("lines-more", more=len(self.faults) - FAULTS_TOLD))
+        faults = self.faults
+        if self.untold:
+            faults.append(compose("lines-more", more=self.untold))
         if self.too_large():
             large = compose("mesh-large", vertices=MOST_VERTICES, corners=MOST_CORNERS)
             raise InputError(name, [*faults, large])

@@ -195,6 +195,7 @@ TEMPLATES = {
     "flame-not-finite": "its array {name} holds values that are not finite, or indices beyond the vertices",
     "mesh-file-large": "is {size_mb} MB large, {most_mb} are the most: decimate it",
     "line-no-numbers": "line {line}: {text} is not {wanted} finite numbers",
+    "line-many-corners": "line {line}: a polygon of more than {most} corners",
     "line-no-polygon": "line {line}: {text} is no polygon of 3 or more corners",
     "line-strange-row": "line {line}: a corner names {row}, which is no row of the file",
     "lines-more": "and {more} lines more",

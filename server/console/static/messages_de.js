@@ -1015,6 +1015,7 @@ export default {
   "flame-not-finite": "sein Feld {name} enthält Werte, die nicht endlich sind, oder Nummern jenseits der Punkte",
   "mesh-file-large": "ist {size_mb} MB groß, höchstens {most_mb} gehen: das Netz vereinfachen",
   "line-no-numbers": "Zeile {line}: {text} sind nicht {wanted} endliche Zahlen",
+  "line-many-corners": "Zeile {line}: ein Vieleck mit mehr als {most} Ecken",
   "line-no-polygon": "Zeile {line}: {text} ist kein Vieleck mit mindestens 3 Ecken",
   "line-strange-row": "Zeile {line}: Eine Ecke nennt {row}, was keine Zeile der Datei ist",
   "lines-more": "und {more} weitere Zeilen",

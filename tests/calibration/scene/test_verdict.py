@@ -16,7 +16,7 @@ def test_a_calibration_from_a_scene_is_judged_by_what_it_does_not_know() -> None
     sound = replace(found, uncertainty=replace(found.uncertainty, pose_sigma_px=sharp))
     assert judge_scene(sound).word == "good"
     guessed = judge_scene(
-        replace(sound, scale=replace(found.scale, source=ASSUMED, provenance=verbatim("an ASSUMPTION")))
+        replace(sound, scale=replace(found.scale, source=ASSUMED[0], provenance=verbatim("an ASSUMPTION")))
     )
     assert (guessed.word, texts_of(guessed.missing)) == ("usable", ["the scale is an ASSUMPTION"])
     apart = judge_scene(replace(sound, left_out={"dark": verbatim("only 3 distinct points in it")}))

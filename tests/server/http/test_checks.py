@@ -11,7 +11,16 @@ import httpx
 import numpy as np
 import pytest
 
-from tests.support.attacks import add_keys, jpeg_with_metadata, png_of_chunks, spoiled_capture
+from tests.support.attacks import (
+    Witness,
+    add_keys,
+    ask_often,
+    half_body,
+    jpeg_with_metadata,
+    png_of_chunks,
+    silent_connections,
+    spoiled_capture,
+)
 from tests.support.services import RunningService, await_true, packed, running_service, small_capture, upload
 
 CHUNKS = 4_000_000  # of a PNG: half a minute and more of one process
@@ -26,7 +35,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningService
 
 @pytest.fixture(scope="module")
 def keys(service: RunningService) -> list[str]:
-    return add_keys(service, "capture", "capture")
+    return add_keys(service, "read,capture", "read,capture")
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +94,24 @@ def test_a_slow_check_keeps_no_other_key_waiting_and_ends(
         assert time.monotonic() - began < CHECK_S
         answer = upload(attacker, slow)
     assert (answer.status_code, answer.json()["detail_message"]["code"]) == (422, "check-too-long")
+
+
+def test_thousands_of_small_requests_of_a_key_leave_others_their_time(service: RunningService, keys: list[str]) -> None:
+    with Witness(service, keys[1]).watching() as calm:
+        time.sleep(2.0)
+    with Witness(service, keys[1]).watching() as witness:
+        assert ask_often(service, keys[0], "/v1/captures", 1000) == {200}
+    assert not witness.failures
+    assert witness.others_median_s < 3.0 * calm.others_median_s
+
+
+def test_requests_that_wait_leave_their_key_its_time(service: RunningService, keys: list[str]) -> None:
+    half = half_body("/v1/captures", keys[0])
+    with silent_connections(service, 5, half), client(service, keys[0]) as http:
+        time.sleep(0.3)
+        began = time.monotonic()
+        assert [http.get("/v1/captures").status_code for _ in range(5)] == [200] * 5
+        assert time.monotonic() - began < 2.0
 
 
 def test_a_client_who_goes_in_the_midst_of_a_body_is_no_fault_of_the_service(

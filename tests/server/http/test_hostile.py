@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import struct
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -208,6 +209,33 @@ def fill(disk: Path, leave: int) -> Path:
             continue
         return path
     raise AssertionError("the disk never stood still")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("moments", [2, pytest.param(10, marks=pytest.mark.nightly)])
+def test_a_disk_that_fills_at_any_moment_of_a_job_changes_no_byte(tmp_path: Path, moments: int) -> None:
+    data = packed(small_capture(tmp_path / "capture"))
+    with (
+        small_disk(tmp_path / "disk", 48) as disk,
+        served_client(disk / "data", free_bytes="0", tiny_s="1.5", tiny_bytes=str(1 << 20)) as (_, client),
+    ):
+        capture = client.post("/v1/captures/uploads", files={"file": data}).json()["id"]
+        first = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+        undisturbed = await_state(client, first, ("succeeded",))["files"]
+        for moment in range(moments):
+            job = client.post("/v1/jobs", json={"capture_id": capture}).json()["id"]
+            time.sleep(2.5 * moment / moments)
+            ballast = fill(disk, leave=0)
+            time.sleep(1.5)
+            ballast.unlink()
+            ended = await_state(client, job, ("succeeded", "failed"), 60)
+            if ended["state"] == "failed":
+                assert ended["error"]["type"].endswith("disk-full")
+                job = client.post(f"/v1/jobs/{job}/restart", json={}).json()["id"]
+                ended = await_state(client, job, ("succeeded", "failed"), 60)
+            assert (ended["state"], ended["files"]) == ("succeeded", undisturbed), moment
+            assert client.delete(f"/v1/jobs/{job}").status_code == 204
 
 
 @pytest.mark.slow

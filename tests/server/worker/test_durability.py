@@ -5,8 +5,10 @@ import os
 import random
 import signal
 import sqlite3
+import struct
 import subprocess
 import sys
+import tarfile
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
@@ -253,6 +255,57 @@ def test_the_job_of_a_worker_that_never_returns_is_taken_over_within_30_s(kind: 
             assert client.get(f"/v1/jobs/{job}").json()["state"] == "succeeded"
             again = submit(service, capture, 1)
             assert await_state(client, again, ("succeeded",))["files"] == client.get(f"/v1/jobs/{job}").json()["files"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_jobs_end_by_any_clock(tmp_path: Path) -> None:
+    """Of three jobs one waits over a restart with a clock of 60 days ahead, one ends by it, and the clock goes back by
+    120 days while one runs. The monotonic clock is the system's."""
+    clock, library = tmp_path / "clock", tmp_path / "clock.so"
+    source = ROOT / "tests" / "support" / "shifted_clock.c"
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", str(library), str(source)], check=True)
+    days = struct.Struct("=q").pack
+    settings = {"keep_captures_days": "30", "keep_results_days": "30", "tiny_s": "1.5"}
+    with served_client(tmp_path / "data", sweep_s="1", **settings) as (service, client):
+        capture = uploaded_capture(service, tmp_path)
+        undisturbed = await_state(client, submit(service, capture, 0), ("succeeded",))["files"]
+        jobs = [submit(service, capture, 1)]
+        service.stop()
+        service.environment |= {"LD_PRELOAD": str(library), "CLOCK_SHIFT": str(clock)}
+        service.forked = False
+        clock.write_bytes(days(60 * 86400))
+        service.start()
+        assert "clock" in client.get("/readyz").json()["checks"]["retention"]["detail"]
+        jobs.append(submit(service, capture, 2))
+        await_state(client, jobs[1], ("succeeded", "failed"), 60)
+        jobs.append(submit(service, capture, 3))
+        await_state(client, jobs[2], ("running",), 60)
+        with clock.open("r+b") as file:  # never empty: the service has it mapped
+            file.write(days(-60 * 86400))
+        ended = [await_state(client, job, ("succeeded", "failed"), 60) for job in jobs]
+        assert [(job["state"], job["files"]) for job in ended] == [("succeeded", undisturbed)] * 3
+        time.sleep(2.0)  # two sweeps
+        assert client.get(f"/v1/captures/{capture}").status_code == 200
+        assert client.get("/v1/jobs").json()["total"] == 4
+
+
+def test_data_of_an_earlier_version_are_opened_and_its_jobs_end(tmp_path: Path) -> None:
+    """The data folder of a service of commit 3ee27d5, killed while one job was done, one ran and one waited; its rows
+    are pickled."""
+    with tarfile.open(Path(__file__).with_name("data_of_version_3ee27d5.tar.xz")) as archive:
+        archive.extractall(tmp_path / "data", filter="data")
+    with served_client(tmp_path / "data") as (service, client):
+        listed = client.get("/v1/jobs", params={"sort": "created"}).json()["jobs"]
+        ended = [await_state(client, job["id"], ("succeeded", "failed"), 60) for job in listed]
+        assert [job["state"] for job in ended] == ["succeeded"] * 3
+        assert ended[0] == listed[0]
+        for job in ended:
+            assert job["files"] == ended[0]["files"]
+            for name, file in job["files"].items():
+                body = client.get(f"/v1/jobs/{job['id']}/result/{name}").content
+                assert hashlib.sha256(body).hexdigest() == file["sha256"]
+        assert submit(service, ended[0]["capture_id"], 0) not in {job["id"] for job in listed}
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ from pipeline.head_model.model_file import ModelParts, read_parts, rounded
 from pipeline.head_model.pca import Components, orthogonalised
 from pipeline.head_model.subdivision import boundary_loops, close_loop, vertex_areas
 from rig.errors import EigenheadError, how_to_install
+from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import vertex_normals
 from rig.progress import Progress
@@ -114,20 +115,26 @@ def import_model(path: Path, *, name: str | None = None, report: Progress | None
     elif path.suffix.lower() in (".h5", ".hdf5"):
         foreign = read_statismo(path)
     elif path.suffix.lower() == ".npz":
-        with np.load(path, allow_pickle=False) as file:
-            kind = "ours" if "meta" in file else "ict" if "landmarks68" in file else "plain"
-        if kind == "ours":
-            parts, _ = read_parts(path)
-            return replace(parts, name=name) if name else parts
-        foreign = read_ict_compact(path) if kind == "ict" else read_plain(path)
+        try:
+            with open_npz(path) as file:
+                read = _read_ours if "meta" in file else read_ict_compact if "landmarks68" in file else read_plain
+            foreign = read(path)
+        except (OSError, *DAMAGE) as fault:
+            raise CannotImport(path, f"damaged or incomplete ({fault})") from None
+        if isinstance(foreign, ModelParts):
+            return replace(foreign, name=name) if name else foreign
     else:
         raise CannotImport(path, "it is neither a folder nor .npz, .h5 or .hdf5" if path.exists() else "no such file")
     return adopt(replace(foreign, name=name) if name else foreign, report=report)
 
 
+def _read_ours(path: Path) -> ModelParts:
+    return read_parts(path)[0]
+
+
 def read_ict_compact(path: Path) -> Foreign:
     """Returns the one-file copy of ICT-FaceKit Light: mean, modes, faces, landmarks68, in mm. Raises CannotImport."""
-    with np.load(path, allow_pickle=False) as file:
+    with open_npz(path) as file:
         mean, modes, faces = (file[key] for key in ("mean", "modes", "faces"))
         points = file["landmarks68"]
     return replace(_ict(mean.astype(float), modes, faces, points), expressions=_compact_expressions(path, mean))
@@ -138,7 +145,7 @@ def _compact_expressions(path: Path, mean: np.ndarray) -> Expressions | None:
     beside = path.with_name(path.stem.removesuffix("_light") + ICT_EXPRESSIONS)
     if not beside.is_file():
         return None
-    with np.load(beside, allow_pickle=False) as file:
+    with open_npz(beside) as file:
         names, shapes = tuple(str(name) for name in file["names"]), file["shapes"].astype(np.float32)
     if shapes.shape != (len(names), *mean.shape) or not np.isfinite(shapes).all():
         raise CannotImport(beside, f"{len(names)} names, shapes {shapes.shape} and a mean {mean.shape} do not fit")
@@ -248,7 +255,7 @@ def read_plain(path: Path) -> Foreign:
     Optional: sigma (M,), standard deviations of unit modes; landmark_names, landmark_vertices; name, licence, source,
     notice; subjects (total, male, female).
     """
-    with np.load(path, allow_pickle=False) as file:
+    with open_npz(path) as file:
         missing = [key for key in ("mean", "modes", "faces") if key not in file]
         if missing:
             raise CannotImport(path, f"it lacks {', '.join(missing)}")

@@ -175,8 +175,8 @@ def judge(shot: Shot, subject: Subject, run: Callable[[Capture, Rig], Reconstruc
     except EigenheadError as refusal:
         codes = codes_of(refusal.message)
         return row | {"refused": True, "codes": sorted(codes), "told": f"refused: {refusal}"[:120]}
-    told = sorted({warning.code for warning in done.warnings} - QUIET)
-    row |= {"seconds": time.perf_counter() - began, "told": ", ".join(told) or "-"}
+    codes = sorted({warning.code for warning in done.warnings} - QUIET)
+    row |= {"seconds": time.perf_counter() - began, "told": ", ".join(codes) or "-"}
     row |= {"codes": sorted({code for warning in done.warnings for code in codes_of(warning)} - QUIET)}
     others = [camera for camera in subject.rig if camera.name not in rig.names]
     surface, images = surface_of(done), subject.capture.images
@@ -191,8 +191,8 @@ def judge_halves(subject: Subject, run: Callable[[Capture, Rig], Reconstruction]
     for of_half in ((0, 3), (1, 2)):
         names = tuple(subject.rig.names[row] for place, row in enumerate(around) if place % 4 in of_half)
         halves.append(run(*read_views(subject.folder, names, "masks")))
-    told = sorted({warning.code for half in halves for warning in half.warnings} - QUIET)
-    row = {"name": f"{subject.folder.name} halves", "planted": None, "codes": told, "told": ", ".join(told) or "-"}
+    codes = sorted({warning.code for half in halves for warning in half.warnings} - QUIET)
+    row = {"name": f"{subject.folder.name} halves", "planted": None, "codes": codes, "told": ", ".join(codes) or "-"}
     return row | distances(halves[0], halves[1])
 
 

@@ -1,7 +1,10 @@
-"""Pickles give their arrays back and run nothing; damaged and foreign ones are refused in a sentence."""
+"""Archives and pickles give their arrays back and run nothing; damaged and foreign ones are refused in a sentence."""
 
+import io
 import os
 import pickle
+import random
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +13,8 @@ import pytest
 import scipy.sparse as sparse
 
 from rig.errors import InputError
-from rig.formats.meshes.pickled_arrays import read_pickled_arrays
+from rig.formats.meshes import pickled_arrays
+from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz, read_pickled_arrays
 
 
 class Runs:
@@ -82,3 +86,34 @@ def test_a_torn_pickle_is_refused_wherever_it_is_torn(tmp_path: Path) -> None:
         path.write_bytes(data[:end])
         with pytest.raises(InputError):
             read_pickled_arrays(path)
+
+
+def test_an_archive_that_lies_about_its_arrays_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An array of 8 TB of which no byte is there, and more zeros than are wanted in a small file."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    path = tmp_path / "lie.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("mean.npy", header.getvalue() + bytes(64))
+    with pytest.raises(DAMAGE), open_npz(path) as file:
+        file["mean"]
+    np.savez_compressed(tmp_path / "zeros.npz", mean=np.zeros(200_000))
+    monkeypatch.setattr(pickled_arrays, "MAX_UNPACKED", 1 << 20)
+    with pytest.raises(ValueError, match="more than 1 MB"), open_npz(tmp_path / "zeros.npz"):
+        pass
+
+
+def test_a_damaged_archive_raises_what_its_readers_expect(tmp_path: Path) -> None:
+    path, rng = tmp_path / "arrays.npz", random.Random(7)
+    np.savez_compressed(path, mean=np.arange(12.0), names=np.array(["a", "b"]))
+    whole = path.read_bytes()
+    for _ in range(500):
+        data = bytearray(whole)
+        for _ in range(rng.randint(1, 4)):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        path.write_bytes(data[: rng.choice([len(data), rng.randrange(len(data))])])
+        try:
+            with open_npz(path) as file:
+                assert all(isinstance(file[name], np.ndarray) for name in file)
+        except (OSError, *DAMAGE):
+            continue

@@ -1,5 +1,6 @@
 """OBJ files with their polygons: what is read is what is written, and every fault is named."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -64,17 +65,7 @@ def test_every_fault_of_a_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError) as refused:
         read(tmp_path, broken)
     message = str(refused.value)
-    for word in (
-        "line 1:",
-        "line 2:",
-        "line 3:",
-        "line 5:",
-        "line 6:",
-        "line 7:",
-        "line 10:",
-        "vertex 99",
-        "texture 5",
-    ):
+    for word in (*(f"line {line}:" for line in (1, 2, 3, 5, 6, 7, 10)), "vertex 99", "texture 5"):
         assert word in message, word
     for text, word in (("", "no vertices"), ("v 0 0 0\n", "no faces"), ("f 1/1 2/1 3/1\nv 0 0 0\n", "are none")):
         with pytest.raises(InputError, match=word):
@@ -83,11 +74,23 @@ def test_every_fault_of_a_file_is_named(tmp_path: Path) -> None:
         read(tmp_path, "v x y z\n" * 50)
 
 
+@pytest.mark.parametrize("corners", ["1 2 3", "0 0 0", "-9 x /"], ids=["right", "strange", "wrong"])
+def test_a_face_of_six_million_corners_is_one_sentence(tmp_path: Path, corners: str) -> None:
+    began = time.monotonic()
+    with pytest.raises(InputError, match="line 3: a polygon of more than 4096 corners") as refused:
+        read(tmp_path, "v 0 0 0\nv 1 0 0\nf " + f"{corners} " * 2_000_000 + "\nf 1 2 1\n")
+    assert "more" not in str(refused.value).replace("more than 4096", "")
+    assert time.monotonic() - began < 3.0
+
+
 def test_what_is_too_large_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polygon_obj, "MOST_VERTICES", 10)
     with pytest.raises(InputError, match="decimate") as refused:
         read(tmp_path, "v 0 0 0\n" * 11 + "v what comes after is not looked at\n")
     assert "line 12" not in str(refused.value)
+    monkeypatch.setattr(polygon_obj, "MOST_LINES", 20)
+    with pytest.raises(InputError, match="decimate"):
+        read(tmp_path, "#\n" * 22)
     monkeypatch.setattr(polygon_obj, "MOST_BYTES", 20)
     with pytest.raises(InputError, match="MB large"):
         read(tmp_path, "v 0 0 0\n" * 11)
