@@ -105,7 +105,8 @@ def _checkerboard(grey: np.ndarray, board: Board) -> Corners | None:
         grid = in_board_order(grey, corners.astype(float), board)
         numbers, pixels = np.arange(board.corner_count), grid.reshape(-1, 2)
         if is_flat_grid(board, numbers, pixels):
-            return None if _mirrored(grey, grid, board) or pattern_continues(grey, grid) else (numbers, pixels)
+            mirrored = board.is_chiral and _contrast(grey, grid) < 0  # or printed in inverted colours
+            return None if mirrored or pattern_continues(grey, grid) else (numbers, pixels)
     return None
 
 
@@ -122,11 +123,6 @@ def in_board_order(grey: np.ndarray, corners: np.ndarray, board: Board) -> Float
         # sides; elsewhere neither does harm.
         grid = np.rot90(grid) if columns == rows else grid[::-1, ::-1]
     return np.ascontiguousarray(grid)
-
-
-def _mirrored(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"], board: Board) -> bool:
-    """Whether colours show what no turn of the board can: that it is mirrored, or printed in inverted colours."""
-    return board.is_chiral and _contrast(grey, grid) < 0
 
 
 def _contrast(grey: np.ndarray, grid: Float[np.ndarray, "rows columns 2"]) -> float:

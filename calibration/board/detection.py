@@ -130,7 +130,7 @@ def detect_folder(
     detections = _detect_pictures(folder, pictures, board, cache, workers, report)
     if board.kind == "charuco":
         detections = _with_measured_pattern(folder, pictures, detections, cache, workers, report)
-    elif len(_sharp(detections.views)) < FEW_FOUND * sum(map(len, pictures.values())):
+    elif sum(view.found.rise_px < SHARP_PX for view in detections.views) < FEW_FOUND * sum(map(len, pictures.values())):
         _refuse_markers(pictures)
     if detections.notes and not detections.views:
         raise WrongBoard(reasons_of(detections.notes))
@@ -172,10 +172,6 @@ def _with_measured_pattern(
     keys += [f"first_marker = {measured.first_marker}"] if measured.first_marker != board.first_marker else []
     remark = compose("board-found-with", keys=keys)
     return replace(again, remarks=(remark,))
-
-
-def _sharp(views: Sequence[View]) -> list[View]:
-    return [view for view in views if view.found.rise_px < SHARP_PX]
 
 
 def _refuse_markers(pictures: dict[str, dict[str, Path]]) -> None:

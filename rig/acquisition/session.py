@@ -320,7 +320,9 @@ class RigSession:
             frames,
             timings,
             trigger_s=release.time_s if release.fired else None,
-            trigger_utc=_utc(release.time_s),
+            trigger_utc=datetime.fromtimestamp(time.time() + release.time_s - time.monotonic(), UTC).isoformat(
+                timespec="milliseconds"
+            ),
             uncertainty_s=release.uncertainty_s,
             skew_most_s=self.config.shot.skew_most_ms / 1000,
         )
@@ -394,7 +396,3 @@ def _without_consequences(faults: list[Fault]) -> tuple[Fault, ...]:
     """Leaves out faults that follow from others: a dark picture is not also unsharp or displaced."""
     dark = {fault.camera for fault in faults if fault.code == "dark"}
     return tuple(fault for fault in faults if not (fault.camera in dark and fault.code in ("blurred", "view")))
-
-
-def _utc(monotonic_s: float) -> str:
-    return datetime.fromtimestamp(time.time() + monotonic_s - time.monotonic(), UTC).isoformat(timespec="milliseconds")

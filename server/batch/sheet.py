@@ -114,7 +114,8 @@ def sheet_lines(title: str, cards: Sequence[Card]) -> Iterator[str]:
     yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
     yield f"<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>"
     yield f"<h1>{html.escape(title)}</h1><p>{html.escape(summary(cards))}</p><main>"
-    yield from (_article(card) for card in ranked_cards(cards))
+    for card in ranked_cards(cards):
+        yield "\n".join([f'<article class="{card_class(card)}">', *_content(card), "</article>"])
     yield "</main></body></html>\n"
 
 
@@ -148,10 +149,6 @@ def figures_of(row: Mapping[str, object]) -> str:
     names = {"head_breadth_mm": "breadth", "head_length_mm": "length", "quality_median_mm": "deviation"}
     cells = [(word, row.get(name)) for name, word in names.items()]
     return ", ".join(f"{word} {value:.1f} mm" for word, value in cells if isinstance(value, float))
-
-
-def _article(card: Card) -> str:
-    return "\n".join([f'<article class="{card_class(card)}">', *_content(card), "</article>"])
 
 
 def _content(card: Card) -> Iterator[str]:

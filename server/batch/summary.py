@@ -92,9 +92,5 @@ def _why(failure: FailureRecord | None) -> tuple[MessageDocument, ...]:
 def expressions_of(models: Iterable[str | None]) -> list[str]:
     """Returns the names of all expressions that the models have, each name once. ``models`` are names or files; None
     stands for the default model. Raises UnknownModel."""
-    names = [name for model in dict.fromkeys(models) for name in _of_model(model)]
+    names = [name for model in dict.fromkeys(models) for name in expression_names(model_path(model or "default"))]
     return list(dict.fromkeys(names))
-
-
-def _of_model(model: str | None) -> tuple[str, ...]:
-    return expression_names(model_path(model or "default"))

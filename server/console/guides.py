@@ -89,7 +89,8 @@ class Guides:
         targets = self._rig.names if views is None else [name for name in self._rig.names if name in views]
         located = {name: self._of(name, views) for name, views in points.items()}
         places = {name: landmark.position for name, landmark in located.items() if landmark.position is not None}
-        self._curves = {key: curve for key, curve in self._curves.items() if key[:2] in _picks(points, shown)}
+        picks = {(camera, tuple(pixel)) for name in shown for camera, pixel in points.get(name, {}).items()}
+        self._curves = {key: curve for key, curve in self._curves.items() if key[:2] in picks}
         return {
             "guides": {name: self._guides(points[name], targets) for name in shown if name in points},
             "reprojected": {name: landmark.reprojected for name, landmark in located.items() if landmark.reprojected},
@@ -147,10 +148,6 @@ def locate(rig: Rig, name: str, views: Mapping[str, Float[np.ndarray, " 2"]]) ->
 def helps(rig: Rig, points: Pixels, landmarks: Landmarks) -> Helps:
     """Computes the aids for picking feature points, for all points in all views, without results of an earlier call."""
     return Guides(rig).helps(points, landmarks, list(points))
-
-
-def _picks(points: Pixels, shown: Collection[str]) -> set[tuple[str, tuple[float, ...]]]:
-    return {(camera, tuple(pixel)) for name in shown for camera, pixel in points.get(name, {}).items()}
 
 
 def predicted(

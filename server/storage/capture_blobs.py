@@ -117,7 +117,8 @@ class CaptureBlobs:
     def restore(self, capture: str, folder: Path, inputs: Mapping[str, str] | None, admit: Admission) -> None:
         """Fetches the files of a capture that ``folder`` lacks. ``inputs``: SHA-256 by name, None: as the database
         says. Raises Conflict ("capture-missing") for files that are nowhere, and what ``admit`` raises."""
-        known = {} if inputs is not None and _all_there(folder, inputs) else self.files(capture)
+        there = inputs is not None and all(_is_there(folder / name, sha256) for name, sha256 in inputs.items())
+        known = {} if there else self.files(capture)
         wanted = {name: blob.sha256 for name, blob in known.items()} if inputs is None else inputs
         if inputs is None and not known:
             raise Conflict("capture-missing", compose("capture-missing"))
@@ -247,10 +248,6 @@ def open_capture_blobs(settings: ServiceSettings, engine: sa.Engine) -> CaptureB
     """Opens the store of captures that the settings name; None without one."""
     place = settings.captures_store
     return None if place is None else CaptureBlobs(WatchedObjects(open_objects(place, settings)), engine)
-
-
-def _all_there(folder: Path, inputs: Mapping[str, str]) -> bool:
-    return all(_is_there(folder / name, sha256) for name, sha256 in inputs.items())
 
 
 def _is_there(path: Path, sha256: str) -> bool:

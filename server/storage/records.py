@@ -19,10 +19,6 @@ JsonObject = dict[str, Any]  # what HTTP takes and gives without a shape of its 
 T = TypeVar("T")
 
 
-def _read_stored_message(value: object) -> Message:
-    return value if isinstance(value, Message) else read_message(value)
-
-
 def _read_fault(value: object) -> Fault:
     """Reads a fault; the detail of earlier versions is a text."""
     if isinstance(value, Fault):
@@ -38,7 +34,9 @@ def _write_fault(fault: Fault) -> dict[str, object]:
 
 
 StoredMessage = Annotated[
-    Message, PlainValidator(_read_stored_message), PlainSerializer(Message.document, return_type=dict[str, Any])
+    Message,
+    PlainValidator(lambda value: value if isinstance(value, Message) else read_message(value)),
+    PlainSerializer(Message.document, return_type=dict[str, Any]),
 ]
 StoredFault = Annotated[Fault, PlainValidator(_read_fault), PlainSerializer(_write_fault, return_type=dict[str, Any])]
 

@@ -73,6 +73,10 @@ def silent_connections(service: RunningService, count: int, begin: bytes = b"") 
         yield opened
 
 
+def client(service: RunningService, key: str, timeout_s: float = 60.0) -> httpx.Client:
+    return httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {key}"}, timeout=timeout_s)
+
+
 def half_body(path: str, key: str | None = None) -> bytes:
     """The header of a JSON request and the first bytes of its body."""
     access = "" if key is None else f"Authorization: Bearer {key}\r\n"

@@ -231,18 +231,14 @@ def _is_covered(
         return True
     posed = inner.posed("jawOpen", 1.0)
     upper, lower = posed["teeth_upper"], posed["teeth_lower"]
-    middle = np.array([upper[:, 0].mean(), 0.5 * (upper[:, 1].min() + _front_edge(lower))])
+    front_edge = lower[lower[:, 2] > lower[:, 2].max() - 4.0, 1].max()  # how high the lower front teeth reach, mm
+    middle = np.array([upper[:, 0].mean(), 0.5 * (upper[:, 1].min() + front_edge)])
     corners = (mesh + shapes["jawOpen"])[triangles]
     ahead = corners[corners[:, :, 2].min(axis=1) > min(upper[:, 2].max(), lower[:, 2].max()) - DEEP_MM]
     to = ahead[:, :, :2] - middle
     after = np.roll(to, -1, axis=1)
     turned = to[..., 0] * after[..., 1] - to[..., 1] * after[..., 0]
     return bool(((turned >= 0.0).all(axis=1) | (turned <= 0.0).all(axis=1)).any())
-
-
-def _front_edge(lower: Float[np.ndarray, "n 3"]) -> float:
-    """Returns how high the lower front teeth reach, mm."""
-    return float(lower[lower[:, 2] > lower[:, 2].max() - 4.0, 1].max())
 
 
 def kept_off_teeth(

@@ -69,7 +69,7 @@ def drawn_onto(
     the skin (``SurfaceBinding.with_skin``)."""
     binding, target = template.surface_binding, MetSurface(scan)
     welded, joined = weld(surface_of(binding.rest, template.mesh.triangles()))
-    first = _first_rows(joined)
+    first = np.unique(joined, return_index=True)[1]  # a row of the file for every joined vertex
     is_skin = np.zeros(len(welded.vertices), bool)
     is_skin[joined[binding.skin]] = True
     parts = components(welded)
@@ -106,11 +106,6 @@ def drawn_onto(
 def surface_of(vertices: Float[np.ndarray, "t 3"], faces: Int[np.ndarray, "f 3"]) -> Surface:
     """Returns a surface with its normals."""
     return Surface(vertices, faces, vertex_normals(vertices, faces))
-
-
-def _first_rows(joined: Int[np.ndarray, " t"]) -> Int[np.ndarray, " w"]:
-    """Returns a row of the file for every joined vertex."""
-    return np.unique(joined, return_index=True)[1]
 
 
 def _near_face(points: Float[np.ndarray, "n 3"], model: HeadModel) -> Bool[np.ndarray, " n"]:

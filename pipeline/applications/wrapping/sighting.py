@@ -181,13 +181,9 @@ def _lifted(
         off = np.linalg.norm(placed.apply(shape) - points, axis=1) / placed.scale
         weights = (1.0 + (off / NEAR_MM) ** 2) ** -2
         placed = procrustes(shape, points, weights)
-    outside = float(placed.rotation[:, 2] @ camera.axis_world) < 0.0 and _bulges(shape, away[hit])
+    bulges = np.corrcoef(shape[:, 2], away[hit])[0, 1] < 0.0  # what stands out of the face is nearer
+    outside = float(placed.rotation[:, 2] @ camera.axis_world) < 0.0 and bool(bulges)
     return _Glance(face, small_from_scan.inverse() @ placed, outside)
-
-
-def _bulges(shape: Float[np.ndarray, "n 3"], away: Float[np.ndarray, " n"]) -> bool:
-    """Tells whether the points that stand out of a face are nearer to the camera than the others."""
-    return bool(np.corrcoef(shape[:, 2], away)[0, 1] < 0.0)
 
 
 def _looks_inwards(mesh: Mesh, scan_from_face: Similarity) -> bool:

@@ -82,14 +82,9 @@ def _write_obj(folder: Path, wrapped: Wrapped) -> None:
         colours=vertex_colours(wrapped) if wrapped.placed.scan.is_coloured and not textures else None,
         comments=[f"{wrapped.placed.scan.name} in the vertex order of {template.name} sha256 {template.source_sha256}"],
         library=library,
-        decimals=_decimals(wrapped.placed.mm_per_unit),
+        decimals=4 + max(0, int(np.ceil(np.log10(wrapped.placed.mm_per_unit)))),  # a tenth of a micrometre
     )
     write_atomically(folder / "wrapped.obj", data)
-
-
-def _decimals(mm_per_unit: float) -> int:
-    """Returns the decimals that hold a tenth of a micrometre in the scan's unit."""
-    return 4 + max(0, int(np.ceil(np.log10(mm_per_unit))))
 
 
 def _write_residuals(folder: Path, wrapped: Wrapped) -> None:

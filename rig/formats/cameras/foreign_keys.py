@@ -31,7 +31,7 @@ Table = Mapping[str, ForeignKey]
 
 def says_nothing(value: object, rule: ForeignKey) -> bool:
     """Tells whether ``value`` is missing or one of those at which the key has no effect."""
-    return all(_is_one_of(part, rule.silent) for part in _parts(value))
+    return all(any(_plain(part) == _plain(one) for one in rule.silent) for part in _parts(value))
 
 
 def _parts(value: object) -> Iterator[object]:
@@ -45,10 +45,6 @@ def _parts(value: object) -> Iterator[object]:
         yield from value.split()
     elif value is not None:
         yield value
-
-
-def _is_one_of(part: object, silent: tuple[str | float | bool, ...]) -> bool:
-    return any(_plain(part) == _plain(other) for other in silent)
 
 
 def _plain(value: object) -> str | float:

@@ -170,7 +170,7 @@ class _Reading:
         ):
             if rows.size and rows.max() >= count and count:
                 faults.append(compose(code, row=rows.max() + 1, held=count))
-        if _has_texture_coordinates(corner_uv) and not self.uv:
+        if corner_uv.size and corner_uv.max() >= 0 and not self.uv:
             faults.append(compose("faces-without-texture"))
         if faults:
             raise InputError(name, faults)
@@ -178,11 +178,6 @@ class _Reading:
         return PolygonMesh(
             np.array(self.vertices), np.array(self.sizes, np.int32), corners, uv, corner_uv, tuple(self.statements)
         )
-
-
-def _has_texture_coordinates(corner_uv: Int[np.ndarray, " c"]) -> bool:
-    """Tells whether any corner has a texture coordinate."""
-    return bool(corner_uv.size and corner_uv.max() >= 0)
 
 
 def polygon_obj_bytes(

@@ -117,7 +117,8 @@ def _read(plane: Plane, common: tuple[float, float]) -> MaskReading:
     smaller = min(np.count_nonzero(white), np.count_nonzero(~white))
     if between > BETWEEN_MOST * max(smaller, 1):
         return MaskReading(_nothing(plane), fault=compose("mask-spread"))
-    return MaskReading(share, soft=bool(between > SOFT_PER_PX * max(_outline_px(white), 1)))
+    beside = white & (cv2.erode(white.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)  # a pixel of background
+    return MaskReading(share, soft=bool(between > SOFT_PER_PX * max(np.count_nonzero(beside), 1)))
 
 
 def _nothing(plane: Plane) -> Share:
@@ -180,7 +181,8 @@ def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
     black, white = share < 64, share > 191
     away_black, away_white = (_distance_to(area) for area in (black, white))
     width = float(np.minimum(away_black, away_white)[~black & ~white].max(initial=0.0))
-    if width > BAND_MOST_PX or not _separates(black, white):
+    touching = cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & black
+    if width > BAND_MOST_PX or touching.mean() > 1e-4:
         return MaskReading(_nothing(plane), fault=labels)
     middle = away_black / np.maximum(away_black + away_white, np.float32(1e-3))
     remark = compose("mask-band", width_px=2 * width)
@@ -189,13 +191,3 @@ def _read_trimap(plane: Plane, levels: list[float]) -> MaskReading:
 
 def _distance_to(area: np.ndarray) -> Float32[np.ndarray, "h w"]:
     return np.asarray(cv2.distanceTransform((~area).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
-
-
-def _separates(black: np.ndarray, white: np.ndarray) -> bool:
-    """Tells whether white nowhere touches black."""
-    return not (cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)).view(bool) & black).mean() > 1e-4
-
-
-def _outline_px(inside: np.ndarray) -> int:
-    """Counts the pixels of the subject that lie beside a background pixel."""
-    return int(np.count_nonzero(inside & (cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)))

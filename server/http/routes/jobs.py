@@ -49,9 +49,10 @@ def submit_job(
     service: ServiceOf, caller: Submitter, wanted: NewJob, response: Response, idempotency_key: Idempotency = None
 ) -> JobOut:
     """Queues a reconstruction. The same Idempotency-Key with the same request returns the first job."""
+    hook: JobWebhook | None = wanted.webhook and {"url": wanted.webhook.url, "secret": wanted.webhook.secret}
     job = service.jobs.submit(
         wanted.capture_id,
-        ReconstructionRequest(wanted.model, wanted.settings, wanted.name, _webhook(wanted), wanted.deliver_to),
+        ReconstructionRequest(wanted.model, wanted.settings, wanted.name, hook, wanted.deliver_to),
         key=caller.key,
         idempotency_key=idempotency_key,
         queue=wanted.queue,
@@ -229,10 +230,6 @@ def get_result(
     if redirect and (address := service.result_address(job_id, name)) is not None:
         return RedirectResponse(address, 307, {"Cache-Control": "no-store"})
     return send_file(request, service.jobs.result_file(job_id, name))
-
-
-def _webhook(wanted: NewJob) -> JobWebhook | None:
-    return None if wanted.webhook is None else {"url": wanted.webhook.url, "secret": wanted.webhook.secret}
 
 
 def _accepted(job: Job, response: Response) -> JobOut:

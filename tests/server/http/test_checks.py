@@ -15,6 +15,7 @@ from tests.support.attacks import (
     Witness,
     add_keys,
     ask_often,
+    client,
     half_body,
     jpeg_with_metadata,
     png_of_chunks,
@@ -50,10 +51,6 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> bytes:
         picture.write_bytes(png_of_chunks(picture.read_bytes(), CHUNKS))
 
     return spoiled_capture(tmp_path_factory.mktemp("slow") / "capture", change)
-
-
-def client(service: RunningService, key: str, timeout_s: float = 60.0) -> httpx.Client:
-    return httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {key}"}, timeout=timeout_s)
 
 
 @pytest.mark.parametrize("segment", [65_533, 20])

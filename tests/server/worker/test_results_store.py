@@ -13,7 +13,7 @@ import pytest
 
 from server.storage.capture_blobs import SMALL_BYTES
 from server.storage.store import new_id
-from tests.support.object_server import KEYS, Network, client_of, network_before
+from tests.support.object_server import KEYS, Network, client_of
 from tests.support.services import (
     RunningService,
     await_state,
@@ -22,7 +22,6 @@ from tests.support.services import (
     running_service,
     small_capture,
     upload,
-    uploaded_capture,
 )
 
 NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
@@ -35,12 +34,6 @@ def bucket(object_server: str) -> Any:
     client.put_bucket_versioning(Bucket="results", VersioningConfiguration={"Status": "Enabled"})
     client.put_object(Bucket="results", Key="first", Body=b"makes the server take up its disk")
     return client
-
-
-@pytest.fixture(scope="module")
-def way(bucket: Any, object_server: str) -> Iterator[Network]:
-    with network_before(object_server) as network:
-        yield network
 
 
 @pytest.fixture(scope="module")
@@ -61,18 +54,6 @@ def service(way: Network, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     ) as service:
         yield service
     environment.undo()
-
-
-@pytest.fixture(scope="module")
-def capture(service: RunningService) -> str:
-    return uploaded_capture(service, service.data.parent)
-
-
-@pytest.fixture
-def client(service: RunningService, way: Network) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=service.url, timeout=60) as client:
-        yield client
-    way.heal()
 
 
 def submitted(client: httpx.Client, capture: str) -> str:
