@@ -58,16 +58,12 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
     folder = tmp_path_factory.mktemp("proxy")
     port = free_port()
     url = f"https://{HOST}:{port}"
-    key = made_key(folder / "data")
+    command = [sys.executable, "-m", "server.cli", "keys", "add", "proxy", "--data", str(folder / "data")]
+    key = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120).stdout.strip()
     with running_service(folder / "data", console="true", public_url=url) as service:
         write_site(folder, port, service.port)
         with nginx(program, folder, port):
             yield Proxied(service, url, key, folder / "certificate.pem")
-
-
-def made_key(data: Path) -> str:
-    command = [sys.executable, "-m", "server.cli", "keys", "add", "proxy", "--data", str(data)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=120).stdout.strip()
 
 
 def write_site(folder: Path, port: int, upstream: int) -> None:

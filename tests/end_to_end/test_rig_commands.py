@@ -41,7 +41,8 @@ def test_a_served_studio_is_checked_captured_and_closed(tmp_path: Path) -> None:
         np.testing.assert_allclose(rig["cam04"].centre_world, default_layout()["cam04"].centre_world, atol=1e-6)
         assert capture.images["cam00"].shape == (768, 1024, 3)
         assert all(len(capture.backgrounds[name]) == 5 for name in NAMES)
-        _post(studio["url"] + "/faults?kind=hung&camera=cam07")
+        hung = urllib.request.Request(studio["url"] + "/faults?kind=hung&camera=cam07", method="POST")
+        urllib.request.urlopen(hung, timeout=10).close()
         with pytest.raises(subprocess.CalledProcessError) as failed:
             command("rig", "capture", "--rig", studio["rig"], "--out", str(tmp_path / "two"))
         assert failed.value.returncode == 1
@@ -69,7 +70,3 @@ def test_where_the_capture_goes_must_be_said_or_served(tmp_path: Path) -> None:
         command("simulate")
     assert failed.value.returncode == 2
     assert "--serve" in failed.value.stderr
-
-
-def _post(url: str) -> None:
-    urllib.request.urlopen(urllib.request.Request(url, method="POST"), timeout=10).close()

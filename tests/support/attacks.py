@@ -14,7 +14,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import httpx
+import numpy as np
 
 from server.services.keys import Keys
 from server.settings import ServiceSettings
@@ -53,7 +55,9 @@ def flood_header(service: RunningService, megabytes: int, begin: bytes = REQUEST
 ASKING = """
 import json, sys
 from concurrent.futures import ThreadPoolExecutor
+import cv2
 import httpx
+import numpy as np
 url, key, count = sys.argv[1:]
 with httpx.Client(headers={"Authorization": f"Bearer {key}"}, timeout=120) as http, ThreadPoolExecutor(100) as pool:
     print(json.dumps(list(pool.map(lambda _: http.get(url).status_code, range(int(count))))))
@@ -195,6 +199,28 @@ def spoiled_capture(folder: Path, change: Callable[[Path], None]) -> bytes:
     """An archive of a small capture after ``change``, which gets the capture's folder."""
     change(small_capture(folder))
     return packed(folder)
+
+
+def slow_capture(folder: Path) -> bytes:
+    """A capture whose check takes one process half a minute and more: a PNG of 4,000,000 chunks."""
+
+    def change(folder: Path) -> None:
+        picture = folder / "images" / "cam00.png"
+        picture.write_bytes(png_of_chunks(picture.read_bytes(), 4_000_000))
+
+    return spoiled_capture(folder, change)
+
+
+def heavy_capture(folder: Path, segment: int = 65_533) -> bytes:
+    """A capture with 60 MB of EXIF in a picture."""
+
+    def change(folder: Path) -> None:
+        picture = folder / "images" / "cam00.png"
+        jpeg = cv2.imencode(".jpg", np.zeros((24, 24, 3), np.uint8))[1].tobytes()
+        picture.with_suffix(".jpg").write_bytes(jpeg_with_metadata(jpeg, 60, segment))
+        picture.unlink()
+
+    return spoiled_capture(folder, change)
 
 
 def add_keys(service: RunningService, *scopes: str) -> list[str]:

@@ -53,7 +53,7 @@ def literals_of(script: str) -> Iterator[str]:
     while match := TOKEN.search(script, at):
         at = match.end()
         if match["string"]:
-            yield _unquoted(match["string"])
+            yield re.sub(r"\\(.)", r"\1", match["string"][1:-1])
         elif match["tick"]:
             text, inner, at = _template(script, at)
             yield text
@@ -85,10 +85,6 @@ def _closing(script: str, at: int) -> int:
         depth += {"{": 1, "}": -1}.get(script[at], 0)
         at += 1
     return at - 1
-
-
-def _unquoted(literal: str) -> str:
-    return re.sub(r"\\(.)", r"\1", literal[1:-1])
 
 
 def _read_markup(markup: str, found: Component) -> None:

@@ -62,7 +62,7 @@ def _row(path: Path, truth: Path) -> str:
     surface = np.median(SurfaceIndex(head.vertices, head.faces).closest(found.points_world).distances)
     turned_to = [c for c in rig if (c.centre_world - found.points_world[NOSE_TIP]) @ found.facing_world > 0.0]
     row = f"| {path.name} | {len(found.detections)} of {len(turned_to)} | {seconds:.2f} | {surface:.2f} |"
-    if not _is_ict(path.name):
+    if path.name not in ("draw-b", "beard-smile", "three-brows", "circle-hair"):
         return row + " | | | | |"
     of_model = built_in_map("ict-facekit")
     true = of_model.points(head.vertices[:ICT_VERTICES])
@@ -91,10 +91,6 @@ def chi_square(
     of_points[np.arange(len(which)), :, np.arange(len(which)), :] = axes.T @ found.covariances[which] @ axes
     covariance = of_model.covariance(which) + views.T @ views + of_points.reshape(errors.size, -1)
     return float(errors.ravel() @ np.linalg.solve(covariance, errors.ravel()) / errors.size)
-
-
-def _is_ict(name: str) -> bool:
-    return name in ("draw-b", "beard-smile", "three-brows", "circle-hair")
 
 
 def _biased(found: MatchedFaces, rig: Rig) -> Float[np.ndarray, "468 3"]:

@@ -29,12 +29,8 @@ def checked_modules() -> list[str]:
     """The modules whose annotations, shapes included, every call in the tests must obey: all of rig, pipeline and
     calibration but compiled loops (``*_kernels.py``), which a wrapped function would break."""
     files = [path for room in ("rig", "pipeline", "calibration") for path in (ROOT / room).rglob("*.py")]
-    plain = [path for path in files if path.name != "__init__.py" and not _is_compiled(path)]
+    plain = [path for path in files if path.name != "__init__.py" and not path.stem.endswith("_kernels")]
     return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in plain]
-
-
-def _is_compiled(path: Path) -> bool:
-    return path.stem.endswith("_kernels")
 
 
 def checked(decorated: Any) -> Any:

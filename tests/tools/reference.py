@@ -196,7 +196,7 @@ def _described(module: ModuleType, tables: dict[str, type]) -> list[str]:
     lines: list[str] = []
     for title, kind in tables.items():
         node, types = classes[kind.__name__], typing.get_type_hints(kind)
-        lines += ["", f"## {title}", "", *_wrapped(ast.get_docstring(node) or ""), ""]
+        lines += ["", f"## {title}", "", *(ast.get_docstring(node) or "").replace("``", "`").splitlines(), ""]
         statements = [each for each in node.body if isinstance(each, ast.AnnAssign)]
         by_name = {each.target.id: each for each in statements if isinstance(each.target, ast.Name)}
         for field in dataclasses.fields(kind):
@@ -240,10 +240,6 @@ def _comment(statement: ast.AnnAssign, comments: dict[int, tuple[str, bool]]) ->
         line += 1
         lines.append(comments[line][0])
     return " ".join(lines)
-
-
-def _wrapped(text: str) -> list[str]:
-    return [line.replace("``", "`") for line in text.splitlines()]
 
 
 def main() -> None:

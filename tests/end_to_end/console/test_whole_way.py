@@ -77,7 +77,8 @@ def test_the_whole_way(
     expect(page.get_by_text("Queued job")).to_be_visible()
     page = v.go("/jobs")
     expect(page.locator("[data-job][data-state=succeeded]")).to_have_count(2, timeout=LONG_MS)
-    report = newest_report(studio)
+    job = httpx.get(studio.url + "/v1/jobs").json()["jobs"][0]["id"]
+    report = httpx.get(f"{studio.url}/v1/jobs/{job}/result/report.json").json()
     assert "features.json" in report["inputs"]
     page.locator("#to-result").click()
     page.wait_for_selector("canvas[data-loaded]:not([data-loaded=''])", timeout=LONG_MS)
@@ -196,8 +197,3 @@ def click_pixel(page: Page, camera: str, pixel: np.ndarray) -> None:
       const p = new DOMPoint(x + 0.5, y + 0.5).matrixTransform(svg.getScreenCTM()); return [p.x, p.y]; }"""
     x, y = page.evaluate(script, [camera, float(pixel[0]), float(pixel[1])])
     page.mouse.click(x, y)
-
-
-def newest_report(studio: RunningService) -> dict:
-    job = httpx.get(studio.url + "/v1/jobs").json()["jobs"][0]["id"]
-    return httpx.get(f"{studio.url}/v1/jobs/{job}/result/report.json").json()

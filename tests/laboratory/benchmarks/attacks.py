@@ -17,9 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import httpx
-import numpy as np
 
 from tests.server.worker.test_durability import pinned_worker
 from tests.support.attacks import (
@@ -29,10 +27,10 @@ from tests.support.attacks import (
     client,
     flood_header,
     half_body,
-    jpeg_with_metadata,
+    heavy_capture,
     limit_files,
-    png_of_chunks,
     silent_connections,
+    slow_capture,
     spoiled_capture,
 )
 from tests.support.services import (
@@ -128,13 +126,7 @@ def send_halves(field: Field) -> Seen:
 
 
 def send_metadata(field: Field) -> Seen:
-    jpeg = cv2.imencode(".jpg", np.zeros((24, 24, 3), np.uint8))[1]
-
-    def change(folder: Path) -> None:
-        (folder / "images" / "cam00.png").unlink()
-        (folder / "images" / "cam00.jpg").write_bytes(jpeg_with_metadata(jpeg.tobytes(), 60))
-
-    archive = spoiled_capture(field.folder / "metadata", change)
+    archive = heavy_capture(field.folder / "metadata")
     with client(field.service, field.attacker) as http:
         row = others_under(field, "60 MB of EXIF in a JPEG", lambda: upload(http, archive))
         began = time.monotonic()
@@ -145,11 +137,7 @@ def send_metadata(field: Field) -> Seen:
 
 
 def give_up_uploads(field: Field) -> Seen:
-    def change(folder: Path) -> None:
-        picture = folder / "images" / "cam00.png"
-        picture.write_bytes(png_of_chunks(picture.read_bytes(), 4_000_000))
-
-    slow, fine = spoiled_capture(field.folder / "slow", change), packed(small_capture(field.folder / "fine"))
+    slow, fine = slow_capture(field.folder / "slow"), packed(small_capture(field.folder / "fine"))
     with ThreadPoolExecutor(2) as pool:  # both processes that check have begun
         list(pool.map(lambda _: seconds_of_upload(field, fine), range(4)))
     calm_s = seconds_of_upload(field, fine)

@@ -1,7 +1,5 @@
 """The subject's face through a whole rig: drawn heads and posters as cameras see them, and real recordings."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -209,7 +207,7 @@ def test_a_living_person_before_four_cameras() -> None:
     rig = read_rig_file(folder / "camera_array.toml")
     networks, distances, missed = load_networks(), [], []
     for shot in range(0, 26, 2):
-        images = {name: read_image(_shot(folder, name, shot)) for name in rig.names}
+        images = {name: read_image(folder / name / f"shot{shot:02}.jpg") for name in rig.names}
         matched = find_subject(images, rig, networks).matched
         if matched is None:
             missed.append(shot)
@@ -218,10 +216,6 @@ def test_a_living_person_before_four_cameras() -> None:
     assert set(missed) <= {18}  # the board hides his face from all but one
     assert 62.0 < np.median(distances) < 70.0
     assert np.std(distances) < 4.0
-
-
-def _shot(folder: Path, camera: str, shot: int) -> Path:
-    return folder / camera / f"shot{shot:02}.jpg"
 
 
 @pytest.mark.slow

@@ -143,20 +143,18 @@ def test_near_plane_and_neighbours(renderer):
     want = (depth > 1) & (depth < 700) & (np.abs(x * depth) < 40)
     assert_masks_agree(masks[camera.name], want)
     assert want.any()
+    across, ahead = np.meshgrid(np.linspace(-39, 39, 60), np.linspace(-799, 699, 2000))
     for other in rig:  # for the other cameras the strip's far end alone is in front: cut it into small triangles
         if other is not camera:
-            fine = world_from_camera.apply(_strip_points())
+            fine = world_from_camera.apply(
+                np.stack([across.ravel(), np.full(across.size, 30.0), ahead.ravel()], axis=1)
+            )
             depth_there = other.camera_from_world.apply(fine)[:, 2]
             seen = other.project(fine[depth_there > 1])
             inside = (np.abs(seen - (k.width / 2 - 0.5, k.height / 2 - 0.5)) < (k.width / 2 - 1, k.height / 2 - 1)).all(
                 1
             )
             assert masks[other.name].any() == bool(inside.any())
-
-
-def _strip_points() -> np.ndarray:
-    x, z = np.meshgrid(np.linspace(-39, 39, 60), np.linspace(-799, 699, 2000))
-    return np.stack([x.ravel(), np.full(x.size, 30.0), z.ravel()], axis=1)
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

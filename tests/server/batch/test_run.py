@@ -108,7 +108,7 @@ def test_shares_side_by_side_begin_nothing_twice_and_a_share_has_one_process(tmp
     for share in ("1/2", "2/2"):
         command = [*COMMAND, str(shots), str(out), "2", share]
         begun.append(subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE))
-        await_lock(out / ".batch" / f"{share.replace('/', '-of-')}.lock")
+        await_true((out / ".batch" / f"{share.replace('/', '-of-')}.lock").exists, 60)
     with pytest.raises(ShareTaken, match="share 1/2"):
         run_pinned(shots, out, shard=Shard(1, 2))
     printed = [json.loads(process.communicate(timeout=120)[0]) for process in begun]
@@ -119,10 +119,6 @@ def test_shares_side_by_side_begin_nothing_twice_and_a_share_has_one_process(tmp
     )
     assert (out / "heads.csv").read_text().count(",done,") == 12
     assert not (out / ".batch").exists()
-
-
-def await_lock(lock: Path) -> None:
-    await_true(lambda: lock.exists(), 60)
 
 
 @pytest.mark.slow

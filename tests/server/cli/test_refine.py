@@ -16,18 +16,12 @@ from rig.errors import InputError
 from rig.formats.cameras.cameras_json import read_rig
 from rig.formats.captures.capture_folder import write_capture
 from rig.messages.message import verbatim
-from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from server.cli.refine import refine_locally
 from tests.server.cli.test_main import run
 from tests.support.silhouette_subjects import captures_of, disturbed, rms
 
 TRUE = default_layout()
-
-
-def write_masks(folder: Path, rig: Rig, masks: dict[str, np.ndarray]) -> None:
-    blank = np.zeros((768, 1024, 3), np.uint8)
-    write_capture(folder, Capture(dict.fromkeys(rig.names, blank), masks=masks), rig)
 
 
 @pytest.mark.slow
@@ -37,7 +31,9 @@ def test_cameras_come_back_and_the_page_says_so(renderer, tmp_path: Path) -> Non
     off = disturbed(TRUE, 0.5, np.random.default_rng(1))
     folders = [tmp_path / f"subject{i}" for i in range(3)]
     for folder, seen in zip(folders, captures_of(renderer, TRUE, 3, np.random.default_rng(5)), strict=True):
-        write_masks(folder, off, {name: silhouette.mask for name, silhouette in seen.items()})
+        masks = {name: silhouette.mask for name, silhouette in seen.items()}
+        blank = np.zeros((768, 1024, 3), np.uint8)
+        write_capture(folder, Capture(dict.fromkeys(off.names, blank), masks=masks), off)
     out = tmp_path / "refined.json"
     done = run("refine", *map(str, folders), "--out", str(out), "--json")
     assert done.returncode == 0, done.stderr

@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-import cv2
 import httpx
-import numpy as np
 import pytest
 
 from tests.support.attacks import (
@@ -17,14 +15,12 @@ from tests.support.attacks import (
     ask_often,
     client,
     half_body,
-    jpeg_with_metadata,
-    png_of_chunks,
+    heavy_capture,
     silent_connections,
-    spoiled_capture,
+    slow_capture,
 )
 from tests.support.services import RunningService, await_true, packed, running_service, small_capture, upload
 
-CHUNKS = 4_000_000  # of a PNG: half a minute and more of one process
 CHECK_S = 12.0
 
 
@@ -39,32 +35,11 @@ def keys(service: RunningService) -> list[str]:
     return add_keys(service, "read,capture", "read,capture")
 
 
-@pytest.fixture(scope="module")
-def fine(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    return packed(small_capture(tmp_path_factory.mktemp("fine") / "capture"))
-
-
-@pytest.fixture(scope="module")
-def slow(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    def change(folder: Path) -> None:
-        picture = folder / "images" / "cam00.png"
-        picture.write_bytes(png_of_chunks(picture.read_bytes(), CHUNKS))
-
-    return spoiled_capture(tmp_path_factory.mktemp("slow") / "capture", change)
-
-
 @pytest.mark.parametrize("segment", [65_533, 20])
 def test_metadata_is_refused_before_it_is_read(
     service: RunningService, keys: list[str], tmp_path: Path, segment: int
 ) -> None:
-    def change(folder: Path) -> None:
-        picture = folder / "images" / "cam00.png"
-        done, data = cv2.imencode(".jpg", np.zeros((24, 24, 3), np.uint8))
-        assert done
-        picture.with_suffix(".jpg").write_bytes(jpeg_with_metadata(data.tobytes(), 60, segment))
-        picture.unlink()
-
-    archive = spoiled_capture(tmp_path / "capture", change)
+    archive = heavy_capture(tmp_path / "capture", segment)
     with client(service, keys[0]) as http:
         upload(http, archive[:1000])  # a child process has begun
         began = time.monotonic()
@@ -76,8 +51,9 @@ def test_metadata_is_refused_before_it_is_read(
 
 @pytest.mark.slow
 def test_a_slow_check_keeps_no_other_key_waiting_and_ends(
-    service: RunningService, keys: list[str], slow: bytes, fine: bytes
+    service: RunningService, keys: list[str], tmp_path: Path
 ) -> None:
+    slow, fine = slow_capture(tmp_path / "slow"), packed(small_capture(tmp_path / "fine"))
     with client(service, keys[1]) as other:
         assert upload(other, fine).status_code == 201
         for _ in range(2):  # given up by their sender

@@ -68,10 +68,6 @@ def upload(client: httpx.Client, folder: Path, seed: int, **fields: str) -> http
     return client.post("/v1/captures/uploads", files={"file": packed_capture(folder, seed).read_bytes()}, data=fields)
 
 
-def consented(client: httpx.Client) -> str:
-    return client.post("/v1/sessions", json={"label": "Anna", "consent": "signed 2026-11-22"}).json()["id"]
-
-
 def test_consent_comes_before_the_first_picture(client: httpx.Client, tmp_path: Path) -> None:
     silent = client.post("/v1/sessions", json={"label": "Bert"}).json()["id"]
     for fields in ({}, {"session": silent}):
@@ -86,7 +82,8 @@ def test_consent_comes_before_the_first_picture(client: httpx.Client, tmp_path: 
 def test_a_removal_says_what_stays_and_an_erasure_leaves_nothing(
     client: httpx.Client, service: RunningService, tmp_path: Path
 ) -> None:
-    session = consented(client)
+    consented = {"label": "Anna", "consent": "signed 2026-11-22"}
+    session = client.post("/v1/sessions", json=consented).json()["id"]
     removed = upload(client, tmp_path, 2, session=session).json()["id"]
     erased = upload(client, tmp_path, 3, session=session).json()["id"]
     client.patch(f"/v1/captures/{erased}", json={"session": None})  # with or without a session

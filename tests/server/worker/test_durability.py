@@ -131,7 +131,7 @@ def test_real_heads_survive_kills_to_the_last_byte(total: int, kills: int, tmp_p
         assert {"head.ply", "head.glb", "contact_sheet.png"} <= undisturbed.keys()
         jobs = [submit(service, capture, number, settings) for number in range(1, total + 1)]
         for number in range(kills):
-            await_running(client, jobs)
+            await_true(lambda: any(client.get(f"/v1/jobs/{j}").json()["state"] == "running" for j in jobs), 60)
             time.sleep(rng.uniform(0.2, 3.0))
             if number % 2:
                 service.kill()
@@ -165,11 +165,6 @@ def kill_a_session(url: str) -> None:
 def files_of(job: dict[str, Any]) -> dict[str, str]:
     """sha256 of a job's files, without what tells how long it took."""
     return {name: file["sha256"] for name, file in job["files"].items() if name != "report.json"}
-
-
-def await_running(client: httpx.Client, jobs: list[str]) -> None:
-    """Until one of the jobs runs."""
-    await_true(lambda: not all(client.get(f"/v1/jobs/{job}").json()["state"] != "running" for job in jobs), 60)
 
 
 @contextmanager

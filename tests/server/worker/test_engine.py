@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import pytest
 import sqlalchemy as sa
 from dbos import DBOS
 
@@ -14,14 +13,10 @@ from server.worker.engine import take_over
 ALIVE = {"machine": "m", "host": "h", "pid": 1, "pid_started": 1, "queue": "cpu", "concurrency": 1, "version": "0"}
 
 
-@pytest.fixture
-def engine(tmp_path: Path) -> sa.Engine:
+def test_jobs_of_the_dead_and_of_strays_go_back_to_their_places(tmp_path: Path) -> None:
     settings = ServiceSettings(data=tmp_path)
     DBOS.migrate(system_database_url=settings.url)
-    return open_database(settings)
-
-
-def test_jobs_of_the_dead_and_of_strays_go_back_to_their_places(engine: sa.Engine) -> None:
+    engine = open_database(settings)
     table = sa.Table("workflow_status", sa.MetaData(), autoload_with=engine)
     rows = [("a", "PENDING", "dead"), ("b", "PENDING", "stray"), ("c", "PENDING", "alive"), ("d", "CANCELLED", "dead")]
     with engine.begin() as connection:

@@ -58,7 +58,8 @@ def test_a_swollen_cheek_is_found_with_its_height_side_and_volume(height_mm: flo
 
 def test_an_opened_jaw_does_not_move_the_forehead() -> None:
     """The lower face turns by 6 degrees about the ears: the alignment stays as exact as it was."""
-    head, hinge = mannequin().vertices, marks_middle()
+    head = mannequin().vertices
+    hinge = head[[row_of("tragion_left"), row_of("tragion_right")]].mean(axis=0)
     low = np.clip((hinge[1] - 20.0 - head[:, 1]) / 20.0, 0.0, 1.0)
     angle = np.radians(6.0) * low
     y, z = head[:, 1] - hinge[1], head[:, 2] - hinge[2]
@@ -68,10 +69,6 @@ def test_an_opened_jaw_does_not_move_the_forehead() -> None:
     np.testing.assert_allclose(found.fit.motion.translation, MOVED.translation, atol=1e-4)
     assert found.changed[row_of("gnathion")]
     assert not found.changed[EARLIER.stable].any()
-
-
-def marks_middle() -> np.ndarray:
-    return mannequin().vertices[[row_of("tragion_left"), row_of("tragion_right")]].mean(axis=0)
 
 
 def smooth_noise(seed: int, std_mm: float) -> np.ndarray:
