@@ -161,9 +161,6 @@ class Worker:
                     log.warning("job failed", kind=failed.kind, detail=failed.detail.text)
                     worker.outcomes.publish(job_id, "failed", request.get("webhook"), failure=failed.kind)
                     raise failed from error
-                except AWAY as error:  # of the engine's own writes, on a disk that is full
-                    log.warning("job interrupted", reason=str(error)[:200])
-                    raise WorkerStopped from error
                 except (Cancelled, dbos_error.DBOSWorkflowCancelledError):
                     worker.results.discard(job_id)
                     raise
@@ -196,11 +193,14 @@ class Worker:
 
     @contextmanager
     def _noted(self) -> Iterator[None]:
-        """Notes the id of a workflow while it runs here."""
+        """Notes the id of a workflow while it runs here. One whose writes the database refuses ends without a verdict."""
         identity = DBOS.workflow_id or ""
         self._here.add(identity)
         try:
             yield
+        except AWAY as error:
+            log.warning("interrupted", workflow=identity, reason=str(error)[:200])
+            raise WorkerStopped from error
         finally:
             self._here.discard(identity)
 

@@ -75,7 +75,8 @@ def _command_list(commands: TyperGroup) -> str:
         for path, command in (entry for name in names for entry in _leaves((name,), commands.commands[name])):
             words = " ".join(path)
             anchor = f"eigenhead-{'-'.join(path)}"
-            lines.append(f"| [`{words}`](commands/{page}.md#{anchor}) | {_first_sentence(command)} |")
+            first = (command.help or "").strip().partition("\n")[0]
+            lines.append(f"| [`{words}`](commands/{page}.md#{anchor}) | {first} |")
     lines += ["", "`eigenhead --install-completion` teaches the shell commands, options and their values."]
     return "\n".join(lines) + "\n"
 
@@ -103,10 +104,6 @@ def _context(path: tuple[str, ...], command: Any) -> typer.Context:
     for name in path[:-1]:
         parent = typer.Context(TyperGroup(name=name), info_name=name, parent=parent, **options)
     return typer.Context(command, info_name=path[-1], parent=parent, **options)
-
-
-def _first_sentence(command: Any) -> str:
-    return (command.help or "").strip().split("\n")[0]
 
 
 def _variables() -> str:

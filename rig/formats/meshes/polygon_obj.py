@@ -6,7 +6,7 @@ kept."""
 
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -95,9 +95,9 @@ class _Reading:
     faults: list[Message] = field(default_factory=list)
     untold: int = 0  # faults beyond those
 
-    def fault(self, code: str, number: int, **parameters: str | int) -> None:
+    def fault(self, make: Callable[[], Message]) -> None:
         if len(self.faults) < FAULTS_TOLD:
-            self.faults.append(compose(code, line=number, **parameters))
+            self.faults.append(make())
         else:
             self.untold += 1
 
@@ -119,19 +119,19 @@ class _Reading:
             found = ()
         if len(found) == count and all(map(math.isfinite, found)):
             return found
-        self.fault("line-no-numbers", number, text=f"{line.strip()!r:.60}", wanted=count)
+        self.fault(lambda: compose("line-no-numbers", line=number, text=f"{line.strip()!r:.60}", wanted=count))
         return (0.0,) * count
 
     def _face(self, number: int, line: str, words: list[str]) -> None:
         if len(words) > MOST_SIDES:
-            self.fault("line-many-corners", number, most=MOST_SIDES)
+            self.fault(lambda: compose("line-many-corners", line=number, most=MOST_SIDES))
             return
         try:
             named = [[int(part) if part else None for part in word.split("/")[:2]] for word in words]
         except ValueError:
             named = []
         if len(named) < 3:
-            self.fault("line-no-polygon", number, text=f"{line.strip()!r:.60}")
+            self.fault(lambda: compose("line-no-polygon", line=number, text=f"{line.strip()!r:.60}"))
             return
         for corner in named:
             self.corners.append(self._row(number, corner[0], len(self.vertices)))
@@ -144,7 +144,7 @@ class _Reading:
         is checked at the end of the file."""
         row = -1 if index is None else index - 1 if index > 0 else count + index
         if not index or row < 0:
-            self.fault("line-strange-row", number, row=f"{index}")
+            self.fault(lambda: compose("line-strange-row", line=number, row=f"{index}"))
             return 0
         return row
 

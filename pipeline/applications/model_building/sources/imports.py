@@ -30,6 +30,7 @@ from rig.errors import EigenheadError, how_to_install
 from rig.formats.meshes.pickled_arrays import DAMAGE, open_npz
 from rig.geometry import RigidTransform, rigid_fit
 from rig.mesh import vertex_normals
+from rig.messages.message import compose
 from rig.progress import Progress
 
 
@@ -120,7 +121,7 @@ def import_model(path: Path, *, name: str | None = None, report: Progress | None
                 read = _read_ours if "meta" in file else read_ict_compact if "landmarks68" in file else read_plain
             foreign = read(path)
         except (OSError, *DAMAGE) as fault:
-            raise CannotImport(path, f"damaged or incomplete ({fault})") from None
+            raise CannotImport(path, compose("file-incomplete", reason=str(fault)).text) from None
         if isinstance(foreign, ModelParts):
             return replace(foreign, name=name) if name else foreign
     else:
