@@ -193,7 +193,7 @@ class Worker:
 
     @contextmanager
     def _noted(self) -> Iterator[None]:
-        """Notes the id of a workflow while it runs here. One whose writes the database refuses ends without a verdict."""
+        """Notes the id of a workflow while it runs. One whose writes the database refuses ends without a verdict."""
         identity = DBOS.workflow_id or ""
         self._here.add(identity)
         try:
