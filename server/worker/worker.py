@@ -131,6 +131,12 @@ class Worker:
         """Makes ``run_until_stopped`` end the process, within half a second."""
         self._stop.set()
 
+    def enqueue_delivery_of(self, job_id: str, request: JobRequest) -> None:
+        """Enqueues the delivery of a job's result, if the request asks for one."""
+        if "deliver_to" in request:
+            place, hook = request["deliver_to"], request.get("webhook")
+            enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, self.settings, hook)
+
     def _register(self) -> None:
         worker = self
 
@@ -166,9 +172,7 @@ class Worker:
                     raise
                 worker.outcomes.publish(job_id, "succeeded", request.get("webhook"))
                 worker._captures.leave(job_id, request["capture_id"])
-                if "deliver_to" in request:
-                    place, hook = request["deliver_to"], request.get("webhook")
-                    enqueue_delivery(DBOS.enqueue_workflow_with_options, job_id, place, worker.settings, hook)
+                worker.enqueue_delivery_of(job_id, request)
                 return files
 
         @DBOS.step(name="post", retries_allowed=True, interval_seconds=2.0, backoff_rate=2.0, max_attempts=9)

@@ -10,7 +10,8 @@ from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
 from rig.recorded_lens import RecordedLens
 from rig.rig import Rig
-from rig.studio.scene.layout import ARRANGEMENTS_DEG, arrangement, default_layout
+from rig.studio.scene.layout import ARRANGEMENTS_DEG, default_layout
+from tests.support.layouts import arrangement
 from tests.support.scenes import fan
 
 GL = np.diag([1.0, -1.0, -1.0])

@@ -35,9 +35,10 @@ def drawn_pictures(left_deg: float = 0.0, up_deg: float = 0.0) -> dict[str, Imag
 
 
 def hidden_from(names: Collection[str], pictures: dict[str, ImageRgb]) -> dict[str, ImageRgb]:
-    """The pictures with a board before the lenses of some cameras."""
-    board = np.full((LENS.height, LENS.width, 3), WALL, np.uint8)
-    return {name: board if name in names else picture for name, picture in pictures.items()}
+    """The pictures with a board before the lenses of some cameras, with noise."""
+    boards = np.random.default_rng(0).normal(WALL, 2.0, (len(pictures), LENS.height, LENS.width, 3))
+    shown = dict(zip(pictures, np.clip(boards, 0, 255).astype(np.uint8), strict=True))
+    return {name: shown[name] if name in names else picture for name, picture in pictures.items()}
 
 
 def write_drawn_capture(folder: Path, left_deg: float = 0.0, hidden: Collection[str] = ()) -> Path:

@@ -6,13 +6,11 @@ jaw as parts of a mesh do (``pivots.jaw_motions``). A shape that presses lips th
 what moves about it, as lids are off eyeballs (``eyeballs.lifted``).
 """
 
-import hashlib
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -22,7 +20,6 @@ from pipeline.applications.templates.pivots import Points
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.geometry.registration.procrustes import procrustes
 from pipeline.head_model.visemes import VISEMES, mixed
-from rig.atomic_write import write_atomically
 from rig.geometry import RigidTransform
 from rig.mesh import Mesh
 
@@ -52,22 +49,6 @@ def load_inner_mouth() -> tuple[dict[str, InnerPart], Mapping[str, Float[np.ndar
             mesh = Mesh(vertices, file[f"{name}_faces"].astype(np.int32), file[f"{name}_colours"])
             parts[name] = InnerPart(mesh, file[f"{name}_tongue_out"].astype(float))
         return parts, dict(zip(ANCHORS, file["anchors"].astype(float), strict=True))
-
-
-def save_inner_mouth(path: Path, parts: Mapping[str, InnerPart], anchors: Mapping[str, Float[np.ndarray, " 3"]]) -> str:
-    """Writes the file and returns its sha256. Raises OSError."""
-    arrays: dict[str, Any] = {"anchors": np.array([anchors[name] for name in ANCHORS], np.float32)}
-    for name, part in parts.items():
-        arrays |= {
-            f"{name}_vertices": part.mesh.vertices.astype(np.float32),
-            f"{name}_faces": part.mesh.faces.astype(np.uint16),
-            f"{name}_colours": np.asarray(part.mesh.colours, np.uint8),
-            f"{name}_tongue_out": part.tongue_out.astype(np.float32),
-        }
-    packed = io.BytesIO()
-    np.savez_compressed(packed, **arrays)
-    write_atomically(path, packed.getvalue())
-    return hashlib.sha256(packed.getvalue()).hexdigest()
 
 
 ABOUT_MM = 25.0  # beyond the teeth, where the mesh is looked at: what a shape may bring to them

@@ -52,19 +52,6 @@ def _chunks(places: Float[np.ndarray, "n 3"]) -> list[Float[np.ndarray, "_ 3"]]:
     return [places[start : start + CHUNK] for start in range(0, len(places), CHUNK)]
 
 
-def draw_relief(
-    rng: np.random.Generator, centres: Float[np.ndarray, "c 3"], radius_mm: float, slope: float
-) -> SkinRelief:
-    """Draws a relief of waves in all directions with equal power in each octave of slope. ``slope`` is its root mean
-    square."""
-    directions = rng.standard_normal((WAVES, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    lengths_mm = np.exp(rng.uniform(np.log(SHORTEST_MM), np.log(LONGEST_MM), WAVES))
-    amplitudes_mm = slope * np.sqrt(3.0 / WAVES) * lengths_mm / (2 * np.pi)  # two thirds of a wave's slope is seen
-    vectors = directions * (2 * np.pi / lengths_mm)[:, None]
-    return SkinRelief(vectors, rng.uniform(0, 2 * np.pi, WAVES), amplitudes_mm, centres, radius_mm)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RelievedSkin:
     """Holds skin with its relief (head frame, mm). ``places`` are its points before the relief moved them; ``values``

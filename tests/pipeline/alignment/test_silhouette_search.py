@@ -9,7 +9,8 @@ from pipeline.alignment.silhouette_search import body_up, fan_strength, turn_bet
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.rig import Rig
-from rig.studio.scene.layout import circle_directions, default_layout, rig_from_directions
+from rig.studio.scene.layout import default_layout, rig_from_directions
+from tests.support.layouts import circle_directions
 
 UP = np.array([0.0, 1.0, 0.0])
 

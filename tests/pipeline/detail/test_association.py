@@ -3,8 +3,8 @@
 import numpy as np
 
 from pipeline.detail.association import associate
-from pipeline.geometry.surface_index import closest_on_triangles_naive
 from rig.mesh import vertex_normals
+from tests.support.closest_points import closest_on_triangles_naive
 from tests.support.subdivided_spheres import subdivided_sphere
 
 

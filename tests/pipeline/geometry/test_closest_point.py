@@ -2,29 +2,9 @@
 
 import numpy as np
 import pytest
-from jaxtyping import Float, Int
 
-from pipeline.geometry.surface_index import closest_candidates, closest_on_triangles_naive
-
-
-def closest_candidates_naive(
-    points: Float[np.ndarray, "n 3"],
-    corners: Float[np.ndarray, "f 3 3"],
-    facing: Float[np.ndarray, "n 3"] | None = None,
-    facing_mm: float = 0.0,
-) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Computes the same as ``closest_candidates`` with all triangles as candidates, by testing every pair."""
-    triangle, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)
-    for row, point in enumerate(points):
-        found, blends = closest_on_triangles_naive(np.repeat(point[None], len(corners), 0), corners)
-        cost = np.linalg.norm(found - point, axis=1)
-        if facing is not None:
-            cost = cost + 0.5 * facing_mm * (1.0 - normals @ facing[row])
-        triangle[row] = cost.argmin()
-        weights[row] = blends[triangle[row]]
-    return triangle, weights
+from pipeline.geometry.surface_index import closest_candidates
+from tests.support.closest_points import closest_candidates_naive, closest_on_triangles_naive
 
 
 def random_triangles(seed: int, count: int = 40) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from pipeline.imaging.silhouette import silhouette_from_mask
 from pipeline.segmentation.segment import segment
 from pipeline.view_checks.image_assignment import ExchangedPictures, WrongRig, assign_images, misplaced_plates
 from rig.capture import Capture, reassign_images
-from rig.studio.scene.layout import arrangement
+from tests.support.layouts import arrangement
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow]  # the studio takes ten seconds for one capture
 EXCHANGE = {"cam04": "cam06", "cam06": "cam04"}

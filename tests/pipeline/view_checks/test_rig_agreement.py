@@ -13,7 +13,8 @@ from pipeline.view_checks.rig_agreement import are_loose, misplaced_camera, wron
 from rig.geometry import RigidTransform, rotation_from_vector
 from rig.plausibility import rig_faults
 from rig.rig import Rig
-from rig.studio.scene.layout import ARRANGEMENTS_DEG, HEIGHT, WIDTH, arrangement, default_layout
+from rig.studio.scene.layout import ARRANGEMENTS_DEG, HEIGHT, WIDTH, default_layout
+from tests.support.layouts import arrangement
 from tests.support.subjects import off_by
 
 pytestmark = pytest.mark.gl

@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 
 from rig.rig import Rig
-from rig.studio.scene.layout import (
-    DEFAULT_DIRECTIONS_DEG,
-    circle_directions,
-    default_layout,
-    rig_from_directions,
-    row_directions,
-)
+from rig.studio.scene.layout import DEFAULT_DIRECTIONS_DEG, default_layout, rig_from_directions
+from tests.support.layouts import circle_directions, row_directions
 
 
 def size_px(rig: Rig, name: str) -> float:

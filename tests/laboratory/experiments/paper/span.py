@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.applications.model_building.sources.imports import SurfaceFit, fit_surface
-from pipeline.applications.model_building.training.model_metrics import of_draws
 from pipeline.head_model.landmarks import SEVEN_POINTS
 from pipeline.head_model.model import HeadModel
 from pipeline.head_model.subdivision import vertex_areas
@@ -23,6 +22,7 @@ from rig.formats.meshes.mesh_file import read_mesh
 from rig.geometry import rigid_fit
 from rig.progress import Progress
 from tests.laboratory.experiments.records import Outcome
+from tests.support.model_draws import of_draws
 
 SIGMA_MM = 1.5  # residual that weighs as much as one standard deviation of a coefficient, per cm² of face
 POINTS = 4000  # points of the truth in a fit; all of them count in the figures

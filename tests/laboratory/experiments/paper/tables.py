@@ -26,9 +26,10 @@ from rig.geometry import Similarity
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from rig.studio.scene.layout import arrangement, default_layout
+from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown, pictures
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
+from tests.support.layouts import arrangement
 from tests.support.subjects import Planted, binary_silhouettes, exact, subjects_of_section_5_2
 
 STATISTICS = {"min": np.min, "max": np.max, "mean": np.mean, "median": np.median, "std": np.std}

@@ -27,13 +27,7 @@ from rig.geometry import Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
 from rig.rig import Rig
-from rig.studio.scene.layout import (
-    DEFAULT_DIRECTIONS_DEG,
-    DISTANCE_MM,
-    circle_directions,
-    rig_from_directions,
-    row_directions,
-)
+from rig.studio.scene.layout import DEFAULT_DIRECTIONS_DEG, DISTANCE_MM, rig_from_directions
 from rig.studio.scene.simulate import simulate
 from rig.studio.scene.subject import Colour, Subject, random_look
 from rig.studio.scene.visible import PARTS, VisiblePoints, sees
@@ -42,6 +36,7 @@ from rig.studio.sensor.preset import PRESET, Preset
 from rig.studio.sensor.realism import REALISM, made_real
 from tests.laboratory.experiments.people.view_subsets import even_views, frontal_views, is_circle
 from tests.laboratory.experiments.surface.visible_surface import read_visible
+from tests.support.layouts import circle_directions, row_directions
 
 EVIDENCE = ("plates", "masks", "neither")
 FRONTAL_COUNTS, CIRCLE_COUNTS = (3, 5, 8, 11), (5, 8, 11, 12, 16)

@@ -5,8 +5,9 @@ import pytest
 
 from rig.geometry import Similarity, rotation_from_vector
 from rig.rig import Rig
-from rig.studio.scene.layout import circle_directions, default_layout, rig_from_directions, row_directions
+from rig.studio.scene.layout import default_layout, rig_from_directions
 from tests.laboratory.experiments.people.view_subsets import even_views, frontal_views, is_circle
+from tests.support.layouts import circle_directions, row_directions
 
 
 def facing(yaw_deg: float) -> Similarity:

@@ -1,7 +1,7 @@
 """Figures of a model's own random heads."""
 
-from pipeline.applications.model_building.training.model_metrics import of_draws
 from pipeline.head_model.model import load_model, with_modes
+from tests.support.model_draws import of_draws
 
 
 def test_draws_of_two_modes_are_spanned_by_two_modes_and_lie_closer_the_more_there_are() -> None:

@@ -1,0 +1,28 @@
+"""Provides arrangements of cameras beside the default one: the paper's, rows and circles."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rig.rig import Rig
+from rig.studio.scene.layout import ARRANGEMENTS_DEG, rig_from_directions
+
+
+def arrangement(name: str) -> Rig:
+    """Returns one of the four rigs of section 5.3 of the paper: "a" even, "b" informative, "c" vertical, "d" to the
+    side."""
+    return rig_from_directions(ARRANGEMENTS_DEG[name])
+
+
+def row_directions(count: int, spacing_mm: float, distance_mm: float) -> tuple[tuple[float, float], ...]:
+    """Computes the directions (azimuth, elevation in degrees) of a level row of cameras in front of the face, from the
+    subject's right to its left."""
+    offsets = spacing_mm * (np.arange(count) - (count - 1) / 2)
+    return tuple((float(np.degrees(np.arctan2(offset, distance_mm))), 0.0) for offset in offsets)
+
+
+def circle_directions(count: int, elevations_deg: Sequence[float] = (0.0,)) -> tuple[tuple[float, float], ...]:
+    """Computes the directions (azimuth, elevation in degrees) of cameras on a full circle, cam00 at the front.
+    Successive cameras take the elevations in turn."""
+    azimuths = (np.arange(count) * 360.0 / count + 180.0) % 360.0 - 180.0
+    return tuple((float(azimuth), elevations_deg[i % len(elevations_deg)]) for i, azimuth in enumerate(azimuths))
