@@ -87,7 +87,7 @@ def ingest_archive(
     described = check_capture(root, image_pixels, report, networks=networks)
     if warnings is not None:
         described = _with_calibration(described, root, warnings)
-    else:
+    elif all(fault.camera is not None for fault in described.faults):  # else there is nobody to find outlines of
         findings = _outline_findings(root, len(described.cameras), networks, report)
         described = replace(described, warnings=findings, face=_beside(described.face, findings))
     filed = _filed_names(root)
