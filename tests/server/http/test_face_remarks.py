@@ -13,7 +13,7 @@ def test_a_capture_says_who_lacks_the_face_and_where_it_looks(http: httpx.Client
     assert made.status_code == 201, made.text
     capture = made.json()
     assert capture["verdict"] == "good"
-    missing, turned = (told for told in capture["warnings"] if told["code"].startswith("face-"))
+    missing, turned = (remark for remark in capture["warnings"] if remark["code"].startswith("face-"))
     assert (missing["code"], missing["parameters"]) == ("face-missing", {"cameras": ["cam3"]})
     assert turned["code"] == "face-turned"
     assert turned["parameters"]["camera"] == "cam0"
@@ -24,8 +24,8 @@ def test_a_capture_says_who_lacks_the_face_and_where_it_looks(http: httpx.Client
 
 def test_pictures_without_a_face_have_one_line(http: httpx.Client, tmp_path: Path) -> None:
     wall = packed(write_drawn_capture(tmp_path / "wall", hidden=drawn_studio().names))
-    told = [warning["code"] for warning in upload(http, wall).json()["warnings"]]
-    assert told == ["pose-doubtful", "face-nowhere"]  # a wall has no outline, either
+    codes = [warning["code"] for warning in upload(http, wall).json()["warnings"]]
+    assert codes == ["pose-doubtful", "face-nowhere"]  # a wall has no outline, either
 
 
 def test_an_empty_seat_has_its_fault_alone(http: httpx.Client, archive: bytes) -> None:
