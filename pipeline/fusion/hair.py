@@ -206,7 +206,7 @@ def distance_to_shell(
     return gaussian_filter(field, SHELL_STEPS).ravel(), shown
 
 
-def depth_inside(hair: Places, views: ViewStack) -> tuple[PointTree, Float[np.ndarray, " n"]]:
+def depth_inside(hair: Places, views: ViewStack) -> tuple[PointTree, Float[np.ndarray, " _"]]:
     """Returns the places of the hair, and how deep (mm) inside the hull each lies."""
     deep = -distance_to_hull(hair, views)
     within = (deep > 0.0) & (deep < DEEPEST_MM)

@@ -250,7 +250,7 @@ def _is_covariance(matrix: np.ndarray) -> bool:
 
 def is_number(value: Any) -> bool:
     """Tells whether a decoded value is a finite number of a size that occurs, and no truth value."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12  # NaN fails too
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(abs(value) < 1e12)  # NaN fails too
 
 
 def _read_size(value: Any, where: str, faults: list[Message]) -> int:

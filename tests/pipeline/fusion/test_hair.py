@@ -113,7 +113,10 @@ def test_scatter_of_strands_is_smoothed_and_skin_stays() -> None:
 def test_scattered_depth_makes_handles_and_loosened_depth_of_hair_none(outlines: Scene) -> None:
     rng, handles = np.random.default_rng(0), []
     noise = [np.where(each.known, rng.normal(0.0, 4.0, each.known.shape), 0.0) for each in outlines.maps]
-    maps = [replace(each, depth_mm=each.depth_mm + off) for each, off in zip(outlines.maps, noise, strict=True)]
+    maps = [
+        replace(each, depth_mm=(each.depth_mm + off).astype(np.float32))
+        for each, off in zip(outlines.maps, noise, strict=True)
+    ]
     shown = np.where(np.arange(3) == Part.HAIR.channel, 255, 0).astype(np.uint8)
     labels = {c.name: PartMap(c.name, np.tile(shown, (300, 400, 1))) for c in outlines.rig}
     for scatter in (0.0, 1.0):
