@@ -184,7 +184,7 @@ def local_share(depth_map: DepthMap, parts: Mapping[str, PartMap], rig: Rig) -> 
 @traced
 def distance_to_shell(
     hair: Places, views: ViewStack, box: Grid
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]:
     """Returns, at the nodes of a whole box, the signed distance (mm, positive outside) to the shell, and how far a
     photograph shows its outside there, 0 to 1: what all cameras see from behind, no silhouette bounds."""
     from scipy.ndimage import gaussian_filter  # only such hair needs it

@@ -152,7 +152,7 @@ def solve(
     if hair is not None:
         shell, outside = distance_to_shell(hair, views, grid)  # of hair, where photographs show its outside
         mixed = outside * np.maximum(shell, votes.bound) + (1.0 - outside) * guess
-        guess = np.where(grid.outer | (votes.weight >= WEAK), guess, mixed)
+        guess = np.where(grid.outer | (votes.weight >= WEAK), guess, mixed).astype(np.float32)
     level = solve_level(grid, votes, guess, SWEEPS, FACTOR)
     box = level.field.reshape(grid.shape)
     for halving in range(halvings):

@@ -97,7 +97,7 @@ GPU, LLVMPIPE = "NVIDIA H200/PCIe/SSE2, 4.3.0 NVIDIA 580.159.04", "llvmpipe (LLV
 
 
 @pytest.mark.parametrize(
-    ("renderer", "software"),
+    ("description", "software"),
     [
         (GPU, False),
         ("AMD Radeon RX 7900 (radeonsi, navi31), 4.6 Mesa 24.0.5", False),
@@ -106,8 +106,8 @@ GPU, LLVMPIPE = "NVIDIA H200/PCIe/SSE2, 4.3.0 NVIDIA 580.159.04", "llvmpipe (LLV
         ("Google SwiftShader, OpenGL ES 3.0", True),
     ],
 )
-def test_renderers_that_draw_with_the_processor_are_no_gpu(renderer: str, software: bool) -> None:
-    assert is_software(renderer) == software
+def test_renderers_that_draw_with_the_processor_are_no_gpu(description: str, software: bool) -> None:
+    assert is_software(description) == software
 
 
 @pytest.mark.gl
