@@ -14,16 +14,8 @@ import httpx
 import pytest
 
 from tests.support.loopback import Hook, hooked
-from tests.support.object_server import KEYS, Network, client_of, network_before
-from tests.support.services import (
-    RunningService,
-    await_state,
-    await_true,
-    packed_capture,
-    running_service,
-    uploaded_capture,
-    worker_pids,
-)
+from tests.support.object_server import KEYS, Network, client_of
+from tests.support.services import RunningService, await_state, await_true, packed_capture, running_service, worker_pids
 
 NAMES = {"head.glb", "head.ply", "overlays/cam00.png"}
 
@@ -34,12 +26,6 @@ def bucket(object_server: str) -> Any:
     client.create_bucket(Bucket="studio-out")
     client.put_object(Bucket="studio-out", Key="first", Body=b"makes the server take up its disk")
     return client
-
-
-@pytest.fixture(scope="module")
-def way(bucket: Any, object_server: str) -> Iterator[Network]:
-    with network_before(object_server) as network:
-        yield network
 
 
 @pytest.fixture(scope="module")
@@ -64,18 +50,6 @@ def service(way: Network, hook: Hook, tmp_path_factory: pytest.TempPathFactory) 
     ) as service:
         yield service
     environment.undo()
-
-
-@pytest.fixture(scope="module")
-def capture(service: RunningService) -> str:
-    return uploaded_capture(service, service.data.parent)
-
-
-@pytest.fixture
-def client(service: RunningService, way: Network) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=service.url, timeout=30) as client:
-        yield client
-    way.heal()
 
 
 def submitted(client: httpx.Client, capture: str, to: str, **more: Any) -> str:
