@@ -12,6 +12,7 @@ from pipeline.applications.templates.carrying import SurfaceBinding
 from pipeline.applications.templates.contact import RestSurface, kept_apart, rest_surface
 from pipeline.applications.templates.eyeballs import STRAIGHT, Eyeball, lifted, placed_eyeballs
 from pipeline.applications.templates.inner_mouth import InnerMouth, kept_off_teeth, placed_inner_mouth
+from pipeline.applications.templates.lips import shut_lips
 from pipeline.applications.templates.pivots import EYE_REACH_MM, Points, jaw_motions, pivots
 from pipeline.applications.templates.shape_carrying import Neutral, carried_shapes, loose_parts
 from pipeline.head_model.visemes import VISEMES, mixed
@@ -83,9 +84,10 @@ def animated_head(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Adds pivots, eyeballs, teeth and a tongue to a model's full level (head frame, mm), whose triangles ``opened``
-    leave out what closes eyes and mouth. Its lips and lids are as the model's shapes have them."""
+    """Shuts the lips of a model's full level (head frame, mm), whose triangles ``opened`` leave out what closes eyes and
+    mouth, and adds pivots, eyeballs, teeth and a tongue. What lips and lids do is what the model's shapes say."""
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
+    vertices = shut_lips(vertices, opened, landmarks)
     bare = AnimatedMesh(vertices, shapes, pivots(landmarks, vertices, shapes, []), {}, gazes=gazes)
     jaw = jaw_motions(landmarks, vertices, shapes)
     return _with_parts(bare, opened, landmarks, jaw, np.full(len(vertices), -1))

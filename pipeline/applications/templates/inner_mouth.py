@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.applications.templates.pivots import Points
@@ -57,6 +57,8 @@ SPARE_MM = 0.5  # by which they are moved back once more
 OPENING = (0.0, 0.5, 1.0)  # weights of jawOpen at which parts must be free of the mesh
 GAP_MM = 0.4  # between lips and teeth in a shape that presses them together
 DEEP_MM = 10.0  # behind the teeth's front, a point is in the mouth, not in a tooth
+SHADE_MM = 40.0  # behind the lips, where the light of DEEP_LIGHT is left
+DEEP_LIGHT = 0.15  # of the light at the lips
 WEIGHTS = (0.5, 1.0)
 STILL_MM = 0.05  # a mouth that a shape moves less is left alone
 ROUNDS = 20
@@ -117,7 +119,7 @@ def placed_inner_mouth(
     shift = landmarks["stomion"] - place.apply(anchors["stomion"])
     shift[2] = 0.0  # how far behind the lips, the whole mouth says
     parts = {
-        name: Mesh(place.apply(part.mesh.vertices) + shift, part.mesh.faces, part.mesh.colours)
+        name: Mesh(place.apply(part.mesh.vertices) + shift, part.mesh.faces, _shaded(part.mesh))
         for name, part in shipped.items()
     }
     if _has_own(mesh, loose, parts):
@@ -131,6 +133,14 @@ def placed_inner_mouth(
             return InnerMouth(absence="mouth-sealed") if _is_covered(mesh, triangles, shapes, inner) else inner
         back += STEP_MM
     return InnerMouth(absence="no-room")
+
+
+def _shaded(part: Mesh) -> UInt8[np.ndarray, "n 3"]:
+    """Returns a part's colours with the shadow of the mouth, which viewers do not compute."""
+    z = part.vertices[:, 2]
+    assert part.colours is not None
+    light = 1.0 - np.clip((z.max() - z) / SHADE_MM, 0.0, 1.0) * (1.0 - DEEP_LIGHT)
+    return np.asarray(light[:, None] * part.colours, np.uint8)
 
 
 def _has_own(mesh: Float[np.ndarray, "t 3"], loose: Int[np.ndarray, " t"], parts: Mapping[str, Mesh]) -> bool:
