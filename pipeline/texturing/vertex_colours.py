@@ -55,6 +55,8 @@ MAX_KNOWN = 0.5  # of the corners of its triangles, by area, that some view sees
 BARELY = np.float32(1e-9)  # weight of a view at a corner that it does not see
 
 REFERENCE_HIDDEN_MM = 1.5  # a vertex this far behind the nearest surface is hidden: a pixel's slope on a steep cheek
+SURE_SHARE = 0.1  # of the median weight of what is seen: with less, blurred edges and background are in the colour
+DOUBTFUL_MM2 = 1000.0  # of connected surface that no view shows surely; a nostril, which is dark, has a tenth
 GREY = 0.22  # linear: what a head gets that no camera saw
 STRONG_GAIN = 1.5  # a camera that differs so much from the others has another exposure, and an operator should know
 
@@ -153,6 +155,8 @@ def texture(
     agreed, seen = blend_views(weights, balanced, outlier)
     if not seen.any():
         return _untextured(len(seen))
+    doubtful = wide_doubtful_surface(weights, mesh_world)
+    weights[:, doubtful], seen[doubtful], hidden = 0.0, 0, hidden | doubtful
     decision = None
     if around is not None:
         masks = {name: silhouettes[name].mask for name in views.names}
@@ -165,6 +169,20 @@ def texture(
     filled = int(np.count_nonzero(seen == 0))
     dim = None if dim_share is None else underexposed_views(weights, balanced, dim_share)
     return Texture(shown, seen, by_camera, _by_name(views, offsets), filled, decision, dim, _gain_warnings(by_camera))
+
+
+def wide_doubtful_surface(weights: Float32[np.ndarray, "k v"], mesh_world: Mesh) -> Bool[np.ndarray, " v"]:
+    """Tells which vertices lie on a wide part of the surface that no view shows surely, as the back of a head before
+    frontal cameras with the edge of what they show. Its colour is filled from what is seen surely."""
+    total = weights.sum(axis=0)
+    unsure = total < SURE_SHARE * np.median(total[total > 0])
+    faces = mesh_world.faces[unsure[mesh_world.faces].all(axis=1)]
+    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    joined = sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(total), len(total)))
+    part = connected_components(joined, directed=False)[1]
+    normals = face_normals(mesh_world.vertices, faces)
+    area_mm2 = np.bincount(part[faces[:, 0]], 0.5 * np.linalg.norm(normals, axis=1), minlength=part.max() + 1)
+    return np.asarray(unsure & (area_mm2[part] > DOUBTFUL_MM2))
 
 
 def underexposed_views(

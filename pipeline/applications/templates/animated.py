@@ -84,8 +84,8 @@ def animated_head(
     *,
     gazes: Mapping[str, Float[np.ndarray, " 3"]] = STRAIGHT,
 ) -> AnimatedMesh:
-    """Shuts the lips of a model's full level (head frame, mm), whose triangles ``opened`` leave out what closes eyes and
-    mouth, and adds pivots, eyeballs, teeth and a tongue. What lips and lids do is what the model's shapes say."""
+    """Shuts the lips of a model's full level (head frame, mm), and adds pivots, eyeballs, teeth and a tongue. The
+    triangles ``opened`` leave out what closes eyes and mouth. Lips and lids move as the model's shapes have them."""
     landmarks: Points = {name: vertices[row] for name, row in landmark_rows.items()}
     vertices = shut_lips(vertices, opened, landmarks)
     bare = AnimatedMesh(vertices, shapes, pivots(landmarks, vertices, shapes, []), {}, gazes=gazes)

@@ -16,9 +16,9 @@ from pipeline.settings import TextureSettings
 from pipeline.texturing.layout.uv_unwrap import unwrap
 from pipeline.texturing.neighbourhood import Neighbourhood, fill_unknown, neighbours
 from pipeline.texturing.paint import paint_texture
-from pipeline.texturing.vertex_colours import Texture, fill_unobserved_patches, texture
+from pipeline.texturing.vertex_colours import Texture, fill_unobserved_patches, texture, wide_doubtful_surface
 from pipeline.texturing.vertex_colours_kernels import OUTLIER
-from pipeline.texturing.visibility import sharpened
+from pipeline.texturing.visibility import see_weights, sharpened
 from rig.capture import Capture
 from rig.colour_space import srgb_from_linear
 from rig.mesh import Mesh
@@ -277,7 +277,8 @@ def test_a_strip_across_an_opening_takes_one_photograph() -> None:
     skin = found.colours.copy()
     skin[rim] = (150, 110, 90)
     layout = unwrap(mesh.vertices, mesh.faces)
-    seen = fill_unobserved_patches(hidden, mesh, shot.silhouettes, depths)
+    unseen = ~(found.decision.weights > 0).any(axis=0)  # the back, which is filled
+    seen = fill_unobserved_patches(hidden, mesh, shot.silhouettes, depths, unseen)
     assert len(np.unique(seen.slots[rim, 0])) == 1  # no seams in it
     assert fill_unobserved_patches(hidden, mesh, shot.silhouettes, depths, np.ones(len(skin), bool)) is hidden
     others = np.setdiff1d(np.arange(len(mesh.vertices)), rim)
@@ -290,6 +291,30 @@ def test_a_strip_across_an_opening_takes_one_photograph() -> None:
         shown = cv2.remap(image, middle[None, :, 0], middle[None, :, 1], cv2.INTER_LINEAR)[0]
         off.append(np.median(np.abs(shown - truth)))
     assert off[1] < 5 < 15 < off[0]
+
+
+def test_the_edge_of_what_views_show_does_not_colour_the_back() -> None:
+    """Before frontal cameras the wall that shines through the edge of hair made the back of a head grey."""
+    shot = shoot()
+    faces, views = shot.mesh.faces, shot.rig.subset(shot.rig.names[2:5])
+    depths = depth_maps(views, shot.mesh)
+    weights = np.stack(
+        [
+            see_weights(
+                camera, shot.silhouettes[camera.name], depths[camera.name], shot.mesh.vertices, shot.mesh.normals()
+            )
+            for camera in views
+        ]
+    )
+    doubtful = wide_doubtful_surface(weights, shot.mesh)
+    assert doubtful[~(weights > 0).any(axis=0)].mean() > 0.95
+    edge = doubtful & (weights > 0).any(axis=0)
+    assert 0.01 < edge.mean() < 0.1
+    weights[:, :] = 1.0
+    spot = np.zeros(len(doubtful), bool)
+    spot[faces[:6]] = True
+    weights[:, spot] = 0.0
+    assert not wide_doubtful_surface(weights, shot.mesh).any()  # a nostril stays
 
 
 def test_what_views_see_by_its_vertices_stays() -> None:
