@@ -56,6 +56,9 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on std
 Anyway = Annotated[
     bool, typer.Option("--anyway", help="Make a head, with a warning, where a check would refuse the capture.")
 ]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Refuse a capture if one of its pictures is missing, damaged or black.")
+]
 Data = Annotated[
     Path | None,
     typer.Option(

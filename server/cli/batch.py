@@ -12,6 +12,7 @@ from server.cli.answers import (
     Anyway,
     Data,
     Json,
+    Strict,
     answer,
     chosen,
     completing,
@@ -81,6 +82,7 @@ def batch(
         ),
     ] = None,
     anyway: Anyway = False,
+    strict: Strict = False,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
     json_out: Json = False,
@@ -95,7 +97,7 @@ def batch(
     outputs = {"surface": surface, "formats": formats.split(",") if formats else None}
     requested = {name: value for name, value in outputs.items() if value}
     options = {"outputs": requested or None, "anyway": anyway or None}
-    document = settings_document(settings, method=method, detail=detail, **options)
+    document = settings_document(settings, strict=strict, method=method, detail=detail, **options)
     with wrong_usage("FOLDER|LIST"):
         batch_captures = _captures_in(captures, out)
     with wrong_usage("settings"):

@@ -10,6 +10,7 @@ from server.cli.answers import (
     Anyway,
     Data,
     Json,
+    Strict,
     answer,
     chosen,
     completing,
@@ -123,6 +124,7 @@ def reconstruct(
     model: Model = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
     anyway: Anyway = False,
+    strict: Strict = False,
     detail: Annotated[
         str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
     ] = None,
@@ -158,7 +160,8 @@ def reconstruct(
     options["texture"] = {"chart": True} if chart else None
     worn = {"colour": cap, "thickness_mm": cap_thickness}
     options["cap"] = {name: value for name, value in worn.items() if value is not None} or None
-    document = settings_document(settings, method=method, front=front, detail=detail, device=device, **options)
+    named = {"method": method, "front": front, "detail": detail, "device": device}
+    document = settings_document(settings, strict=strict, **named, **options)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
     for warning in written["warnings"]:
@@ -173,6 +176,7 @@ def check(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
     chart: Annotated[bool, typer.Option("--chart", help="Look for the colour chart in the clean plates.")] = False,
+    strict: Strict = False,
     json_out: Json = False,
 ) -> None:
     """Say what is wrong with a capture, without a fit.
@@ -182,7 +186,7 @@ def check(
     from server.tasks.settings_file import settings_document
 
     with progress_bar() as report:
-        document = settings_document(settings, texture={"chart": True} if chart else None)
+        document = settings_document(settings, strict=strict, texture={"chart": True} if chart else None)
         checks = checked(capture, document, report=report)
     answer(checks, json_out, lines(checks))
     if checks["faults"]:
