@@ -1,36 +1,26 @@
 """Implements the commands of calibration: board, calibrate, refine, convert."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from rig.messages.message import texts_of
-from server.cli.answers import (
-    Json,
-    Overwrite,
-    answer,
-    chosen,
-    prepare_file,
-    prepare_folder,
-    progress_bar,
-    warn,
-    wrong_usage,
-)
+from server.cli.answers import Json, Overwrite, answer, prepare_file, prepare_folder, progress_bar, warn, wrong_usage
 
 app = typer.Typer(rich_markup_mode=None)
 
 
-def _formats() -> tuple[str, ...]:
-    from rig.formats.cameras.cameras_file import FORMATS
-
-    return FORMATS
+CameraFormat = Literal[
+    "eigenhead", "colmap", "colmap-text", "caliscope", "aniposelib", "metashape", "realitycapture",
+    "realitycapture-csv", "nerfstudio", "opencv-yaml", "blender",
+]  # fmt: skip
 
 
 @app.command(epilog="Example: eigenhead board --kind charuco --squares 9x6 --square-mm 25 --out board.pdf")
 def board(
     out: Annotated[Path, typer.Option(help="The PDF to write; board.toml goes beside it.", dir_okay=False)],
-    kind: Annotated[str, typer.Option(help="checkerboard or charuco.")] = "checkerboard",
+    kind: Annotated[Literal["checkerboard", "charuco"], typer.Option(help="Of the pattern.")] = "checkerboard",
     squares: Annotated[str, typer.Option(help="COLUMNSxROWS, counted in squares.")] = "9x6",
     square_mm: Annotated[float, typer.Option(help="Side of a square.")] = 25.0,
     overwrite: Overwrite = False,
@@ -74,13 +64,13 @@ def calibrate(
     *,
     board: Annotated[Path | None, typer.Option(help="The board.toml.", exists=True, dir_okay=False)] = None,
     source: Annotated[
-        str, chosen("board, or scene: photographs of anything.", lambda: ("board", "scene"), "--from")
+        Literal["board", "scene"], typer.Option("--from", help="A scene: photographs of anything.")
     ] = "board",
     scale: Annotated[
         Path | None, typer.Option(help="From a scene: a known length, scale.json.", exists=True, dir_okay=False)
     ] = None,
     lenses: Annotated[
-        str | None, chosen("From a scene: one (all of one camera) or each; guessed.", lambda: ("one", "each"))
+        Literal["one", "each"] | None, typer.Option(help="From a scene: one of all cameras, or each its own; guessed.")
     ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
@@ -205,14 +195,7 @@ def convert(
     out: Annotated[
         Path, typer.Option(help="The file to write; for COLMAP, RealityCapture's XMP and OpenCV's YAML the folder.")
     ],
-    to: Annotated[
-        str,
-        chosen(
-            "eigenhead, colmap, colmap-text, caliscope, aniposelib, metashape, realitycapture, "
-            "realitycapture-csv, nerfstudio, opencv-yaml or blender.",
-            _formats,
-        ),
-    ] = "eigenhead",
+    to: Annotated[CameraFormat, typer.Option(help="The program that shall read them.")] = "eigenhead",
     json_out: Json = False,
 ) -> None:
     """Convert calibrations to and from other programs."""

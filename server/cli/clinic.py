@@ -2,11 +2,11 @@
 
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder, warn
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, prepare_folder, warn
 
 if TYPE_CHECKING:
     from pipeline.applications.clinic.comparison import Comparison
@@ -17,13 +17,6 @@ Result = Annotated[Path, typer.Argument(help="A result folder.", exists=True, fi
 Model = Annotated[
     str | None, typer.Option(help="The head model's name or file, if not the one that report.json names.")
 ]
-
-
-def axes_choices() -> tuple[str, ...]:
-    """Returns the names of a patient's axes."""
-    from rig.formats.meshes.markups import AXES
-
-    return AXES
 
 
 @app.command(epilog="Example: eigenhead compare heads/anna-march heads/anna-june --out compared/anna")
@@ -87,7 +80,7 @@ def register(
     out: Annotated[Path, typer.Option(help="The folder of the registered head.", file_okay=False)],
     *,
     axes: Annotated[
-        str | None, chosen("Of the surface, LPS or RAS; by default what its header states, else LPS.", axes_choices)
+        Literal["LPS", "RAS"] | None, typer.Option(help="Of the surface; by default what its header states, else LPS.")
     ] = None,
     landmarks: Annotated[
         Path | None,

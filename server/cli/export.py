@@ -1,12 +1,11 @@
 """Implements ``eigenhead export``, which writes a capture or a result for other programs."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder, progress_bar, warn
-from server.cli.clinic import axes_choices
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, prepare_folder, progress_bar, warn
 from server.cli.heads import Albedo, Morphs, TemplateName
 
 if TYPE_CHECKING:
@@ -18,17 +17,7 @@ app = typer.Typer(rich_markup_mode=None)
 SLICER = "slicer"
 
 
-def _forms() -> tuple[str, ...]:
-    from pipeline.settings import FORMATS
-    from rig.formats.cameras.dataset_json import DATASET_FORMATS
-
-    return (*FORMATS, SLICER, *DATASET_FORMATS)
-
-
-def _planes() -> tuple[str, ...]:
-    from pipeline.applications.clinic.anatomical_frame import PLANES
-
-    return PLANES
+ExportFormat = Literal["glb", "ply", "obj", "usdz", "stl", "3mf", "slicer", "nerfstudio", "gaussian-avatars"]
 
 
 @app.command(
@@ -43,9 +32,7 @@ def export(
             exists=True,
         ),
     ],
-    form: Annotated[
-        str, chosen("glb, ply, obj, usdz, stl, 3mf, slicer, nerfstudio or gaussian-avatars.", _forms, "--as")
-    ],
+    form: Annotated[ExportFormat, typer.Option("--as", help="The last two are of a capture.")],
     out: Annotated[Path, typer.Option(help="The folder that is written.", file_okay=False)],
     *,
     result: Annotated[
@@ -53,8 +40,8 @@ def export(
         typer.Option(help="The capture's result folder: head and FLAME parameters.", exists=True, file_okay=False),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
-    axes: Annotated[str, chosen("For slicer: LPS (the default) or RAS.", axes_choices)] = "LPS",
-    plane: Annotated[str, chosen("For slicer: head (the default), or frankfurt.", _planes)] = "head",
+    axes: Annotated[Literal["LPS", "RAS"], typer.Option(help="For slicer.")] = "LPS",
+    plane: Annotated[Literal["head", "frankfurt"], typer.Option(help="For slicer.")] = "head",
     marked: Annotated[
         Path | None,
         typer.Option(

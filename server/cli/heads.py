@@ -1,8 +1,7 @@
 """Implements the commands that make and judge heads: check, reconstruct, verify, demo."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, get_args, get_type_hints
+from typing import Annotated, Literal
 
 import typer
 
@@ -12,7 +11,6 @@ from server.cli.answers import (
     Json,
     Strict,
     answer,
-    chosen,
     completing,
     model_names,
     number,
@@ -22,29 +20,6 @@ from server.cli.answers import (
 )
 
 app = typer.Typer(rich_markup_mode=None)
-
-
-def of_setting(name: str) -> Callable[[], tuple[str, ...]]:
-    """Returns a function that lists the allowed values of a setting of the pipeline, read from its type annotation."""
-
-    def choices() -> tuple[str, ...]:
-        from pipeline.settings import Settings
-
-        options = get_type_hints(Settings)[name]
-        return tuple(v for option in (options, *get_args(options)) for v in get_args(option) if isinstance(v, str))
-
-    return choices
-
-
-def of_output(name: str) -> Callable[[], tuple[str, ...]]:
-    """Returns a function that lists the allowed values of a setting of the outputs, read from its type annotation."""
-
-    def choices() -> tuple[str, ...]:
-        from pipeline.settings import OutputSettings
-
-        return get_args(get_type_hints(OutputSettings)[name])
-
-    return choices
 
 
 def _templates() -> tuple[str, ...]:
@@ -81,11 +56,19 @@ Trace = Annotated[
 ]
 
 Device = Annotated[
-    str | None,
-    chosen(
-        "What compares photographs: cpu, gl (OpenGL), or auto, the default: a GPU beside few cores.",
-        of_setting("device"),
-    ),
+    Literal["auto", "cpu", "gl"] | None,
+    typer.Option(help="What compares photographs; auto takes a GPU beside few cores.", show_default="auto"),
+]
+Method = Annotated[
+    Literal["contour", "simplex"] | None,
+    typer.Option(help="Who solves; simplex is the paper's own, and slower.", show_default="contour"),
+]
+Detail = Annotated[
+    Literal["span", "kernel", "photo", "fine", "pores"] | None,
+    typer.Option(help="How fine the head becomes, from seconds to minutes.", show_default="fine"),
+]
+Surface = Annotated[
+    Literal["head", "bust", "both", "hair"] | None, typer.Option(help="What is written.", show_default="both")
 ]
 TemplateName = Annotated[
     str | None,
@@ -120,15 +103,13 @@ def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     out: Annotated[Path, typer.Option(help="The result folder.", file_okay=False)],
     *,
-    method: Annotated[str | None, chosen("contour (the default) or simplex.", of_setting("method"))] = None,
+    method: Method = None,
     model: Model = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
     anyway: Anyway = False,
     strict: Strict = False,
-    detail: Annotated[
-        str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
-    ] = None,
-    surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
+    detail: Detail = None,
+    surface: Surface = None,
     formats: Formats = None,
     albedo: Albedo = False,
     cap: CapColour = None,

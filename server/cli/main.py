@@ -3,16 +3,71 @@ once."""
 
 import os
 import sys
-from typing import Annotated
+from collections.abc import Iterator
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup, TyperOption
 
 from rig.errors import EigenheadError
 from server.cli import batch, cameras, clinic, export, heads, measure, models, rig, service, simulate, templates, wrap
-from server.cli.answers import fail
+from server.cli.answers import be_quiet, fail, use_threads
+
+ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
+    "heads": ("Heads", ("reconstruct", "batch", "check", "export")),
+    "clinic": ("Clinic", ("compare", "register", "measure")),
+    "trials": ("Trials", ("simulate", "demo", "verify")),
+    "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
+    "rig": ("The rig", ("rig",)),
+    "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),
+    "models": ("Models and templates", ("model", "template", "wrap")),
+}
+
+
+class Commands(TyperGroup):
+    """Lists the commands by what they are for. Gives each the options of all, and each example a line of its own."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for command in _leaves(self):
+            command.epilog = "\b\n" + (command.epilog or "").replace("   ", "\n")
+            command.params += [
+                TyperOption(
+                    param_decls=["--threads"],
+                    type=int,
+                    metavar="N",
+                    expose_value=False,
+                    is_eager=True,
+                    callback=lambda _context, _option, value: use_threads(value),
+                    help="Of compiled loops; all processors by default.",
+                ),
+                TyperOption(
+                    param_decls=["--quiet"],
+                    is_flag=True,
+                    default=False,
+                    expose_value=False,
+                    is_eager=True,
+                    callback=lambda _context, _option, value: be_quiet(value),
+                    help="No progress and no warnings, errors alone.",
+                ),
+            ]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Writes a section for each room."""
+        width = formatter.width - 6 - max(map(len, self.commands))
+        for title, names in ROOMS.values():
+            with formatter.section(title):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(width)) for name in names])
+
+
+def _leaves(group: TyperGroup) -> Iterator[Any]:
+    for command in group.commands.values():
+        yield from _leaves(command) if isinstance(command, TyperGroup) else [command]
+
 
 app = typer.Typer(
     name="eigenhead",
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # importing rich's markdown alone takes half a second
