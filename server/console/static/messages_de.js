@@ -161,6 +161,7 @@ export default {
   "header-too-large": "Der Kopf einer Anfrage darf {bytes:,} Bytes haben; weniger oder kürzere Felder senden.",
   "json-body-too-large": "Ein JSON-Dokument darf {bytes:,} Bytes haben.",
   "body-no-json": "Was gesendet wurde, ist kein JSON.",
+  "changed-since": "Es wurde inzwischen geändert: noch einmal holen und das ändern.",
   "imports-not-allowed": "Dieser Dienst importiert von nirgends: Sein Betreiber nennt Server in EIGENHEAD_IMPORT_ORIGINS. Hochladen.",
   "stored-imports-not-allowed": "Dieser Dienst holt Aufnahmen aus keinem Objektspeicher: Sein Betreiber nennt Orte in EIGENHEAD_IMPORT_PREFIXES. Hochladen.",
   "objects-many": "Unter {place} liegen mehr als {most} Objekte; eine Aufnahme ist ein Ordner.",
