@@ -218,7 +218,6 @@ def demo(
     out: Annotated[Path, typer.Option(help="Where the result goes.", file_okay=False)] = Path("out/demo"),
     seed: Annotated[int, typer.Option(help="Subject and noise of the simulated studio.", min=0)] = 1,
     full: Annotated[bool, typer.Option("--full", help="The default job, with the dense surface and the bust.")] = False,
-    compare: Annotated[bool, typer.Option("--compare", help="Solve by the paper's simplex too: minutes more.")] = False,
     json_out: Json = False,
 ) -> None:
     """Run the main job end to end.
@@ -227,7 +226,7 @@ def demo(
     from server.cli.demo import run_demo
 
     with progress_bar() as report:
-        done = run_demo(out, seed=seed, full=full, compare=compare, report=report)
+        done = run_demo(out, seed=seed, full=full, report=report)
     error = done["error_mm"]
     answer(
         done,
@@ -235,10 +234,6 @@ def demo(
         [
             f"head           {done['ply']}",
             f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
-            *(
-                f"  {name:<12} {of['error_mm']['mean']:.2f} mm mean, {of['seconds']:.1f} s, {of['evaluations']} steps"
-                for name, of in done["methods"].items()
-            ),
             f"time           {done['seconds']:.1f} s",
             f"contact sheet  {done['contact_sheet']}",
         ],

@@ -3,14 +3,14 @@ once."""
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup, TyperOption
 
 from rig.errors import EigenheadError
-from server.cli import batch, cameras, clinic, export, heads, measure, models, rig, service, simulate, templates, wrap
+from server.cli import batch, cameras, clinic, export, heads, models, rig, service, simulate, templates
 from server.cli.answers import be_quiet, fail, use_threads
 
 ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
@@ -22,6 +22,7 @@ ROOMS = {  # page below docs/commands: its title, and its commands in the order 
     "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),
     "models": ("Models and templates", ("model", "template", "wrap")),
 }
+THREADS, QUIET = "Of compiled loops; all processors by default.", "No progress and no warnings, errors alone."
 
 
 class Commands(TyperGroup):
@@ -31,26 +32,8 @@ class Commands(TyperGroup):
         super().__init__(**attributes)
         for command in _leaves(self):
             command.epilog = "\b\n" + (command.epilog or "").replace("   ", "\n")
-            command.params += [
-                TyperOption(
-                    param_decls=["--threads"],
-                    type=int,
-                    metavar="N",
-                    expose_value=False,
-                    is_eager=True,
-                    callback=lambda _context, _option, value: use_threads(value),
-                    help="Of compiled loops; all processors by default.",
-                ),
-                TyperOption(
-                    param_decls=["--quiet"],
-                    is_flag=True,
-                    default=False,
-                    expose_value=False,
-                    is_eager=True,
-                    callback=lambda _context, _option, value: be_quiet(value),
-                    help="No progress and no warnings, errors alone.",
-                ),
-            ]
+            command.params += [_option("--threads", use_threads, THREADS, type=int, metavar="N")]
+            command.params += [_option("--quiet", be_quiet, QUIET, is_flag=True, default=False)]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Writes a section for each room."""
@@ -58,6 +41,11 @@ class Commands(TyperGroup):
         for title, names in ROOMS.values():
             with formatter.section(title):
                 formatter.write_dl([(name, self.commands[name].get_short_help_str(width)) for name in names])
+
+
+def _option(name: str, use: Callable[[Any], None], told: str, **kind: Any) -> TyperOption:
+    """Returns an option of every command: ``use`` takes its value, the command does not."""
+    return TyperOption(param_decls=[name], callback=lambda *of: use(of[-1]), help=told, expose_value=False, **kind)
 
 
 def _leaves(group: TyperGroup) -> Iterator[Any]:
@@ -73,7 +61,7 @@ app = typer.Typer(
     rich_markup_mode=None,  # importing rich's markdown alone takes half a second
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for room in (service, heads, simulate, batch, export, clinic, measure, wrap, cameras):
+for room in (service, heads, simulate, batch, export, clinic, templates, cameras):
     app.add_typer(room.app)
 groups = {"keys": service.keys_app, "rig": rig.rig_app, "model": models.model_app, "template": templates.template_app}
 for name, group in groups.items():
@@ -95,16 +83,6 @@ def of_all(
     ] = False,
 ) -> None:
     """One shot of a calibrated camera rig in, a textured 3D head with its uncertainty out."""
-
-
-@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-def experiments(context: typer.Context) -> None:
-    """Say where the experiments are."""
-    name = next((word for word in context.args if not word.startswith("-")), "NAME")
-    print(
-        f"experiments are in the laboratory of a checkout: python -m tests.laboratory {name} [--json]", file=sys.stderr
-    )
-    raise typer.Exit(2)
 
 
 def main() -> None:

@@ -5,7 +5,6 @@ import hashlib
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
 from weakref import WeakValueDictionary
@@ -150,18 +149,19 @@ class Conditions:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one ASGI connection."""
         kinds = self._methods(scope) if scope["type"] == "http" else set[str]()
-        method, can_change = scope.get("method"), bool(kinds & CHANGES)
-        wanted = Headers(scope=scope).get("if-match") if kinds else None
-        if method == "HEAD" and "GET" in kinds - {"HEAD"} and "HEAD" not in kinds:
-            got = scope | {"method": "GET"}
+        method, wanted = scope.get("method"), Headers(scope=scope).get("if-match") if kinds else None
+        if method == "HEAD" and "GET" in kinds and "HEAD" not in kinds:
+            got = {**scope, "method": "GET"}
             await self._app(got, receive, partial(_send_start, send))
             scope["route"] = got.get("route")
-        elif method == "GET" and can_change:
-            await (await self._state(scope, receive)).send_on(send)
+        elif method == "GET" and kinds & CHANGES:
+            start, content, tag = await self._state(scope, receive)
+            await send({**start, "headers": [*start["headers"], *([(b"etag", tag.encode())] if tag else [])]})
+            await send({"type": "http.response.body", "body": content})
         elif method in CHANGES and "GET" in kinds and wanted is not None:
             async with self._locks.setdefault(scope["path"], asyncio.Lock()):
-                held = await self._state(scope | {"method": "GET"}, _no_content)
-                if held.status == 200 and not {"*", held.tag} & {tag.strip() for tag in wanted.split(",")}:
+                *_, held = await self._state({**scope, "method": "GET"}, _no_content)
+                if held and not {"*", held} & {tag.strip() for tag in wanted.split(",")}:
                     await Problem(412, "changed-since", compose("changed-since")).response()(scope, receive, send)
                 else:
                     await self._app(scope, receive, send)
@@ -171,39 +171,18 @@ class Conditions:
     def _methods(self, scope: Scope) -> set[str]:
         """Returns the methods of the routes with the path of a request."""
         fitting = (route for route in self._routes if route.matches(scope)[0] is not Match.NONE)
-        return {method for route in fitting for method in route.methods}
+        return {method for route in fitting for method in route.methods or ()}
 
-    async def _state(self, scope: Scope, receive: Receive) -> "_State":
-        state = _State()
-        await self._app(scope, receive, state.take)
-        return state
+    async def _state(self, scope: Scope, receive: Receive) -> tuple[Message, bytes, str]:
+        """Returns the start and content of what a GET answers, and the tag of what it found, empty where nothing."""
+        told: list[Message] = []
 
+        async def take(message: Message) -> None:
+            told.append(message)
 
-@dataclass(slots=True)
-class _State:
-    """Holds the answer to a GET."""
-
-    start: Message = field(default_factory=dict)
-    content: bytes = b""
-
-    @property
-    def status(self) -> int:
-        return self.start["status"]
-
-    @property
-    def tag(self) -> str:
-        return f'"{hashlib.sha256(self.content).hexdigest()}"'
-
-    async def take(self, message: Message) -> None:
-        if message["type"] == "http.response.start":
-            self.start = message
-        else:
-            self.content += message.get("body", b"")
-
-    async def send_on(self, send: Send) -> None:
-        tags = [(b"etag", self.tag.encode())] if self.status == 200 else []
-        await send(self.start | {"headers": [*self.start["headers"], *tags]})
-        await send({"type": "http.response.body", "body": self.content})
+        await self._app(scope, receive, take)
+        content = b"".join(message.get("body", b"") for message in told[1:])
+        return told[0], content, f'"{hashlib.sha256(content).hexdigest()}"' if told[0]["status"] == 200 else ""
 
 
 async def _no_content() -> Message:

@@ -25,23 +25,11 @@ from tests.support.services import ROOT, small_capture
 from tests.support.small_captures import small_rig
 
 COMMANDS = [
-    *(
-        "serve",
-        "worker",
-        "check",
-        "reconstruct",
-        "verify",
-        "simulate",
-        "demo",
-        "prepare",
-        "doctor",
-        "board",
-        "calibrate",
-    ),
-    *("keys add", "keys list", "keys remove", "rig check", "rig preview", "rig capture", "rig plates"),
+    *("serve", "worker", "check", "reconstruct", "verify", "simulate", "demo", "prepare", "doctor", "board"),
+    *("calibrate", "keys add", "keys list", "keys remove", "rig check", "rig preview", "rig capture", "rig plates"),
     *("model list", "model info", "model import", "model remove"),
     *("template add", "template list", "template remove"),
-]
+]  # fmt: skip
 
 
 def run(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
@@ -111,17 +99,6 @@ def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path) -> None:
     done = run(*arguments, EIGENHEAD_DATA=str(tmp_path))
     assert done.returncode == 2
     assert done.stdout == ""
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [([], "NAME"), (["limit", "--subjects", "3", "--json"], "limit"), (["--json", "real"], "real")],
-)
-def test_experiments_are_in_the_laboratory(arguments: list[str], name: str) -> None:
-    done = run("experiments", *arguments)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert f"python -m tests.laboratory {name} [--json]" in done.stderr
-    assert done.stderr.count("\n") == 1
 
 
 def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:
