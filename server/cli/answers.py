@@ -75,13 +75,19 @@ def use_threads(value: int | None) -> None:
         os.environ["EIGENHEAD_THREADS"] = str(value)
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
-Anyway = Annotated[
-    bool, typer.Option("--anyway", help="Make a head, with a warning, where a check would refuse the capture.")
-]
-Strict = Annotated[
-    bool, typer.Option("--strict", help="Refuse a capture if one of its pictures is missing, damaged or black.")
-]
+def given(help_text: str) -> Any:
+    """Returns a typer option that takes a file that exists."""
+    return typer.Option(help=help_text, exists=True, dir_okay=False)
+
+
+def switch(name: str, help_text: str) -> Any:
+    """Returns a typer option that is given or not, without a negative form."""
+    return typer.Option(name, help=help_text)
+
+
+Json = Annotated[bool, switch("--json", "Print one JSON object on stdout and nothing else.")]
+Anyway = Annotated[bool, switch("--anyway", "Make a head, with a warning, where a check would refuse the capture.")]
+Strict = Annotated[bool, switch("--strict", "Refuse a capture if one of its pictures is missing, damaged or black.")]
 Data = Annotated[
     Path | None,
     typer.Option(
@@ -91,7 +97,7 @@ Data = Annotated[
         callback=_use_data,
     ),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+Overwrite = Annotated[bool, switch("--overwrite", "Replace what is there.")]
 
 
 def service_settings(**overrides: Any) -> Any:

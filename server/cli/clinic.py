@@ -1,5 +1,5 @@
-"""Implements ``eigenhead compare``, ``register`` and ``measure``: two visits of a person, a head on the surface of a CT,
-and what helmets, masks and spectacles are fitted by."""
+"""Implements ``eigenhead compare``, ``register`` and ``measure``: two visits of a person, a head on the surface of a
+CT, and what helmets, masks and spectacles are fitted by."""
 
 from collections.abc import Collection, Mapping, Sequence
 from datetime import date
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, prepare_folder, warn
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, given, prepare_folder, warn
 
 if TYPE_CHECKING:
     from pipeline.applications.clinic.comparison import Comparison
@@ -86,12 +86,7 @@ def register(
         Literal["LPS", "RAS"] | None, typer.Option(help="Of the surface; by default what its header states, else LPS.")
     ] = None,
     landmarks: Annotated[
-        Path | None,
-        typer.Option(
-            help="Of the surface, .mrk.json, .json, .pp or .ljson: three or more of docs/models.md.",
-            exists=True,
-            dir_okay=False,
-        ),
+        Path | None, given("Of the surface, .mrk.json, .json, .pp or .ljson: three or more of docs/models.md.")
     ] = None,
     model: Model = None,
     overwrite: Overwrite = False,
@@ -138,9 +133,7 @@ def _registration_lines(document: dict[str, Any], out: Path) -> list[str]:
 def measure(
     result: Result,
     *,
-    sizes: Annotated[
-        Path | None, typer.Option(help="Tables of sizes, a TOML file (docs/clinic.md).", exists=True, dir_okay=False)
-    ] = None,
+    sizes: Annotated[Path | None, given("Tables of sizes, a TOML file (docs/clinic.md).")] = None,
     model: Model = None,
     data: Data = None,
     json_out: Json = False,

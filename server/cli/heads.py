@@ -12,10 +12,12 @@ from server.cli.answers import (
     Strict,
     answer,
     completing,
+    given,
     model_names,
     number,
     prepare_file,
     progress_bar,
+    switch,
     warn,
 )
 
@@ -79,19 +81,14 @@ TemplateName = Annotated[
     ),
 ]
 Morphs = Annotated[
-    bool,
-    typer.Option(
-        "--morphs", help="Write posed.glb too, with morph targets by Apple's names; of a template head-NAME.glb."
-    ),
+    bool, switch("--morphs", "Write posed.glb too, with morph targets by Apple's names; of a template head-NAME.glb.")
 ]
-Albedo = Annotated[
-    bool, typer.Option("--albedo", help="Also texture/albedo.png: the texture with its light taken off.")
-]
+Albedo = Annotated[bool, switch("--albedo", "Also texture/albedo.png: the texture with its light taken off.")]
 Model = Annotated[
     str | None,
     typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
 ]
-Slicer = Annotated[bool, typer.Option("--slicer", help="Write landmarks.mrk.json too, a point list for 3D Slicer.")]
+Slicer = Annotated[bool, switch("--slicer", "Write landmarks.mrk.json too, a point list for 3D Slicer.")]
 CapColour = Annotated[
     str | None, typer.Option(help="Of a worn swim or wig cap, about: #rrggbb, or a name as blue.", metavar="COLOUR")
 ]
@@ -114,11 +111,11 @@ def reconstruct(
     albedo: Albedo = False,
     cap: CapColour = None,
     cap_thickness: CapThickness = None,
-    chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in clean plates.")] = False,
+    chart: Annotated[bool, switch("--chart", "True colours, by a ColorChecker in clean plates.")] = False,
     normal_map: Annotated[
-        bool, typer.Option("--normal-map", help="head.glb of few triangles, with a normal map of what they leave out.")
+        bool, switch("--normal-map", "head.glb of few triangles, with a normal map of what they leave out.")
     ] = False,
-    neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
+    neutral: Annotated[bool, switch("--neutral", "Write neutral.glb too, without the expression.")] = False,
     morphs: Morphs = False,
     slicer: Slicer = False,
     template: TemplateName = None,
@@ -156,7 +153,7 @@ def reconstruct(
 def check(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
-    chart: Annotated[bool, typer.Option("--chart", help="Look for the colour chart in the clean plates.")] = False,
+    chart: Annotated[bool, switch("--chart", "Look for the colour chart in the clean plates.")] = False,
     strict: Strict = False,
     json_out: Json = False,
 ) -> None:
@@ -179,9 +176,7 @@ def verify(
     captures: Annotated[
         list[Path], typer.Argument(help="Captures of the mannequin, or folders of their results.", exists=True)
     ],
-    reference: Annotated[
-        Path, typer.Option(help="Its scan: .ply, .obj or .glb in mm, in any frame.", exists=True, dir_okay=False)
-    ],
+    reference: Annotated[Path, given("Its scan: .ply, .obj or .glb in mm, in any frame.")],
     out: Annotated[Path, typer.Option(help="Where report.json and certificate.pdf go.", file_okay=False)] = Path(
         "out/verify"
     ),
@@ -217,7 +212,7 @@ def verify(
 def demo(
     out: Annotated[Path, typer.Option(help="Where the result goes.", file_okay=False)] = Path("out/demo"),
     seed: Annotated[int, typer.Option(help="Subject and noise of the simulated studio.", min=0)] = 1,
-    full: Annotated[bool, typer.Option("--full", help="The default job, with the dense surface and the bust.")] = False,
+    full: Annotated[bool, switch("--full", "The default job, with the dense surface and the bust.")] = False,
     json_out: Json = False,
 ) -> None:
     """Run the main job end to end.
