@@ -46,6 +46,7 @@ WARNING_CODES = (
     "outlines-unexplained",
     "picture-duplicated",
     "picture-levels",
+    "picture-lost",
     "pictures-grey",
     "plates-exchanged",
     "pose-doubtful",

@@ -17,6 +17,7 @@ PROBLEM_TYPES = {
     "camera-missing": "Camera missing",
     "capture-in-use": "Capture in use",
     "capture-missing": "Capture missing",
+    "changed-since": "Changed since",
     "consent-missing": "Consent missing",
     "data-unwritable": "Data unwritable",
     "database-unavailable": "Database unavailable",

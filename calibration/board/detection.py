@@ -118,15 +118,21 @@ def ignore_progress(stage: str, fraction: float) -> None:
 
 
 def detect_folder(
-    folder: Path, board: Board, *, cache: Path | None = None, workers: int = 2, report: Progress = ignore_progress
+    folder: Path,
+    board: Board,
+    *,
+    cache: Path | None = None,
+    workers: int = 2,
+    together: bool = True,
+    report: Progress = ignore_progress,
 ) -> Detections:
     """Finds the board in every picture of ``folder``. A ChArUco board is also found if its first square is white, or if
     its markers begin at another number than described.
 
-    ``cache`` is a folder that keeps results by the pictures' SHA-256. Raises InputError for damaged input, and
-    WrongBoard if no picture shows the board and some show another.
+    ``cache`` is a folder that keeps results by the pictures' SHA-256; ``together``: cameras must share shots. Raises
+    InputError for damaged input, and WrongBoard if no picture shows the board and some show another.
     """
-    pictures = list_pictures(folder)
+    pictures = list_pictures(folder, together=together)
     detections = _detect_pictures(folder, pictures, board, cache, workers, report)
     if board.kind == "charuco":
         detections = _with_measured_pattern(folder, pictures, detections, cache, workers, report)

@@ -30,8 +30,9 @@ Filed = Mapping[str, Mapping[str, Path]]
 _Thing = TypeVar("_Thing")
 
 
-def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
-    """Returns the pictures of a folder as {camera: {shot: path}}. Raises InputError that names every fault."""
+def list_pictures(folder: Path, *, together: bool = True) -> dict[str, dict[str, Path]]:
+    """Returns the pictures of a folder as {camera: {shot: path}}. ``together``: cameras must share shots. Raises
+    InputError that names every fault."""
     if not folder.is_dir():
         raise InputError(str(folder), [compose("no-picture-folder")])
     faults, filed = list[Message](), dict[str, dict[str, Path]]()
@@ -46,7 +47,7 @@ def list_pictures(folder: Path) -> dict[str, dict[str, Path]]:
     faults += [compose("camera-rename", fault=fault) for name in cameras if (fault := name_fault(name))]
     if not cameras:
         faults.append(compose("no-pictures"))
-    faults += _named_apart(cameras)
+    faults += _named_apart(cameras) if together else []
     if faults:
         raise InputError(str(folder.name), say_once(faults, cameras))
     return cameras

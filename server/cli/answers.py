@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from time import monotonic
 from types import FrameType
 from typing import Annotated, Any, NoReturn
 
@@ -22,6 +23,9 @@ from rig.progress import Progress
 
 # Set before OpenCV is loaded, here and in workers. OpenCV would log damaged pictures; our own errors name them better.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+
+
+LINE_S = 30.0  # between lines of progress in a log
 
 
 class CannotWrite(EigenheadError):
@@ -52,10 +56,38 @@ def _use_data(folder: Path | None) -> Path | None:
     return folder
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
-Anyway = Annotated[
-    bool, typer.Option("--anyway", help="Make a head, with a warning, where a check would refuse the capture.")
-]
+_quiet: list[bool] = []  # holds something once --quiet was given
+
+
+def be_quiet(value: bool) -> None:
+    """Notes ``--quiet``: neither progress nor warnings are shown."""
+    _quiet.extend([value] if value else [])
+
+
+def is_quiet() -> bool:
+    """Tells whether ``--quiet`` was given."""
+    return bool(_quiet)
+
+
+def use_threads(value: int | None) -> None:
+    """Sets the variable EIGENHEAD_THREADS from ``--threads``, so that this process and its children use as many."""
+    if value is not None:
+        os.environ["EIGENHEAD_THREADS"] = str(value)
+
+
+def given(help_text: str) -> Any:
+    """Returns a typer option that takes a file that exists."""
+    return typer.Option(help=help_text, exists=True, dir_okay=False)
+
+
+def switch(name: str, help_text: str) -> Any:
+    """Returns a typer option that is given or not, without a negative form."""
+    return typer.Option(name, help=help_text)
+
+
+Json = Annotated[bool, switch("--json", "Print one JSON object on stdout and nothing else.")]
+Anyway = Annotated[bool, switch("--anyway", "Make a head, with a warning, where a check would refuse the capture.")]
+Strict = Annotated[bool, switch("--strict", "Refuse a capture if one of its pictures is missing, damaged or black.")]
 Data = Annotated[
     Path | None,
     typer.Option(
@@ -65,7 +97,7 @@ Data = Annotated[
         callback=_use_data,
     ),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+Overwrite = Annotated[bool, switch("--overwrite", "Replace what is there.")]
 
 
 def service_settings(**overrides: Any) -> Any:
@@ -97,29 +129,10 @@ def _setting_fault(fault: Any, options: Mapping[str, object]) -> str:
     return f"{'.'.join([name, *inner])}: {fault['msg'].removeprefix('Value error, ')}"
 
 
-def one_of(choices: Callable[[], tuple[str, ...]]) -> Callable[[str | None], str | None]:
-    """Returns a typer callback that refuses a value which is none of the choices.
-
-    ``choices`` is called only if the option is given, since listing them may import heavy modules.
-    """
-
-    def check(value: str | None) -> str | None:
-        if value is not None and value not in choices():
-            raise typer.BadParameter(f"{value!r} is none of {', '.join(choices())}")
-        return value
-
-    return check
-
-
 def completing(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     """Returns a function for completion by the shell: it lists the choices that begin with what was typed."""
     # The parameter's name tells typer what to pass.
     return lambda incomplete: [choice for choice in choices() if choice.startswith(incomplete)]
-
-
-def chosen(help_text: str, choices: Callable[[], tuple[str, ...]], *names: str) -> Any:
-    """Returns a typer option that takes one of the choices and completes them in the shell."""
-    return typer.Option(*names, help=help_text, callback=one_of(choices), autocompletion=completing(choices))
 
 
 def _finite(value: float | None) -> float | None:
@@ -197,9 +210,9 @@ def terminated_like_interrupted() -> Iterator[None]:
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
     """Yields a function that shows progress (stage, fraction 0 to 1) as a bar on standard error. If that is no
-    terminal, it shows nothing."""
-    if not sys.stderr.isatty():
-        yield lambda stage, fraction: None
+    terminal, it writes a line every ``LINE_S``."""
+    if _quiet or not sys.stderr.isatty():
+        yield _line_writer()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -210,14 +223,27 @@ def progress_bar() -> Iterator[Progress]:
         yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
 
 
+def _line_writer() -> Progress:
+    told_s = monotonic()
+
+    def write(stage: str, fraction: float) -> None:
+        nonlocal told_s
+        if not _quiet and monotonic() - told_s >= LINE_S:
+            told_s = monotonic()
+            print(f"eigenhead: {stage} {fraction:.0%}", file=sys.stderr, flush=True)
+
+    return write
+
+
 def answer(document: Any, as_json: bool, lines: list[str]) -> None:
     """Prints the command's result on stdout: ``document`` as one JSON object, or ``lines`` for people."""
     print(json.dumps(document, allow_nan=False) if as_json else "\n".join(lines))
 
 
 def warn(message: str) -> None:
-    """Prints a warning on standard error; the command goes on."""
-    print(f"eigenhead: {message}", file=sys.stderr)
+    """Prints a warning on standard error, unless ``--quiet`` was given; the command goes on."""
+    if not _quiet:
+        print(f"eigenhead: {message}", file=sys.stderr)
 
 
 def fail(message: str) -> NoReturn:

@@ -12,17 +12,15 @@ from server.cli.answers import (
     Anyway,
     Data,
     Json,
+    Strict,
     answer,
-    chosen,
-    completing,
     fail,
-    model_names,
     prepare_folder,
     terminated_like_interrupted,
     warn,
     wrong_usage,
 )
-from server.cli.heads import format_names, of_output, of_setting
+from server.cli.heads import Detail, Formats, Method, Model, Surface
 
 if TYPE_CHECKING:
     from server.batch.captures import BatchCapture
@@ -64,23 +62,13 @@ def batch(
         int | None, typer.Option(help="Captures at once; by default one a core, as far as memory goes.", min=1, max=512)
     ] = None,
     shard: Annotated[str | None, typer.Option(help="K/N: the K-th of N shares alone, 1/8 say.")] = None,
-    method: Annotated[str | None, chosen("contour (the default) or simplex.", of_setting("method"))] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
-    ] = None,
-    detail: Annotated[
-        str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
-    ] = None,
-    surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
-    formats: Annotated[
-        str | None,
-        typer.Option(
-            help="Of the heads: glb, ply (both by default), obj, usdz, stl, 3mf, with commas between.",
-            callback=format_names,
-        ),
-    ] = None,
+    method: Method = None,
+    model: Model = None,
+    detail: Detail = None,
+    surface: Surface = None,
+    formats: Formats = None,
     anyway: Anyway = False,
+    strict: Strict = False,
     settings: Annotated[Path | None, typer.Option(help="More settings, a TOML or JSON file.", exists=True)] = None,
     data: Data = None,
     json_out: Json = False,
@@ -95,7 +83,7 @@ def batch(
     outputs = {"surface": surface, "formats": formats.split(",") if formats else None}
     requested = {name: value for name, value in outputs.items() if value}
     options = {"outputs": requested or None, "anyway": anyway or None}
-    document = settings_document(settings, method=method, detail=detail, **options)
+    document = settings_document(settings, strict=strict, method=method, detail=detail, **options)
     with wrong_usage("FOLDER|LIST"):
         batch_captures = _captures_in(captures, out)
     with wrong_usage("settings"):

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from server.batch.run import Outcome
+from server.cli.answers import is_quiet
 
 if TYPE_CHECKING:
     from server.batch.plan import BatchTask
@@ -84,7 +85,7 @@ class BatchDisplay:
     def opened(cls, workers: int, tasks: "Sequence[BatchTask]") -> "Iterator[BatchDisplay]":
         """Yields a display that is closed at the end of the block."""
         expected_s = max((sum(task.expected_s.values()) for task in tasks), default=0.0)
-        if not sys.stderr.isatty():
+        if is_quiet() or not sys.stderr.isatty():
             yield cls(workers, expected_s)
             return
         from rich.console import Console
@@ -125,7 +126,7 @@ class BatchDisplay:
         self._show()
         if outcome.failure is not None:
             self._say(f"eigenhead: {outcome.name}: {outcome.failure.message}")
-        elif self._bar is None and outcome.state == "made":
+        elif self._bar is None and outcome.state == "made" and not is_quiet():
             ended, left = self._progress.ended, told_time(self._progress.remaining_s())
             self._say(f"{ended} of {self._count}: {outcome.name} in {outcome.seconds:.0f} s, about {left} left")
 

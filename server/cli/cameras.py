@@ -1,38 +1,30 @@
 """Implements the commands of calibration: board, calibrate, refine, convert."""
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from rig.messages.message import texts_of
-from server.cli.answers import (
-    Json,
-    Overwrite,
-    answer,
-    chosen,
-    prepare_file,
-    prepare_folder,
-    progress_bar,
-    warn,
-    wrong_usage,
-)
+from rig.atomic_write import write_atomically
+from rig.messages.message import compose, texts_of
+from server.cli.answers import Json, Overwrite, answer, prepare_file, prepare_folder, progress_bar, warn, wrong_usage
 
 app = typer.Typer(rich_markup_mode=None)
 
 
-def _formats() -> tuple[str, ...]:
-    from rig.formats.cameras.cameras_file import FORMATS
+CameraFormat = Literal[
+    "eigenhead", "colmap", "colmap-text", "caliscope", "aniposelib", "metashape", "realitycapture",
+    "realitycapture-csv", "nerfstudio", "opencv-yaml", "blender",
+]  # fmt: skip
 
-    return FORMATS
 
-
-@app.command(epilog="Example: eigenhead board --kind charuco --squares 9x6 --square-mm 25 --out board.pdf")
+@app.command(epilog="Example: eigenhead board --kind charuco --squares 12x9 --square-mm 30 --out board.pdf")
 def board(
     out: Annotated[Path, typer.Option(help="The PDF to write; board.toml goes beside it.", dir_okay=False)],
-    kind: Annotated[str, typer.Option(help="checkerboard or charuco.")] = "checkerboard",
-    squares: Annotated[str, typer.Option(help="COLUMNSxROWS, counted in squares.")] = "9x6",
-    square_mm: Annotated[float, typer.Option(help="Side of a square.")] = 25.0,
+    kind: Annotated[Literal["checkerboard", "charuco"], typer.Option(help="Of the pattern.")] = "charuco",
+    squares: Annotated[str, typer.Option(help="COLUMNSxROWS, counted in squares.")] = "12x9",
+    square_mm: Annotated[float, typer.Option(help="Side of a square.")] = 30.0,
     overwrite: Overwrite = False,
     json_out: Json = False,
 ) -> None:
@@ -74,16 +66,19 @@ def calibrate(
     *,
     board: Annotated[Path | None, typer.Option(help="The board.toml.", exists=True, dir_okay=False)] = None,
     source: Annotated[
-        str, chosen("board, or scene: photographs of anything.", lambda: ("board", "scene"), "--from")
+        Literal["board", "scene"], typer.Option("--from", help="A scene: photographs of anything.")
     ] = "board",
     scale: Annotated[
         Path | None, typer.Option(help="From a scene: a known length, scale.json.", exists=True, dir_okay=False)
     ] = None,
     lenses: Annotated[
-        str | None, chosen("From a scene: one (all of one camera) or each; guessed.", lambda: ("one", "each"))
+        Literal["one", "each"] | None, typer.Option(help="From a scene: one of all cameras, or each its own; guessed.")
     ] = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces.")] = None,
     previous: Annotated[Path | None, typer.Option(help="The rig's last cameras.json.", exists=True)] = None,
+    intrinsics_only: Annotated[
+        bool, typer.Option("--intrinsics-only", help="Of a board: each camera's lens alone; no common moments needed.")
+    ] = False,
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Of a board: write cameras.json even where checks refuse it.")
     ] = False,
@@ -91,7 +86,9 @@ def calibrate(
 ) -> None:
     """Calibrate a rig from pictures of a board or scene."""
     if source == "scene":
-        for option, value in (("--board", board), ("--previous", previous), ("--anyway", anyway or None)):
+        given = {"--board": board, "--previous": previous}
+        given |= {"--anyway": anyway or None, "--intrinsics-only": intrinsics_only or None}
+        for option, value in given.items():
             if value is not None:
                 raise typer.BadParameter("is for a board; a scene takes none", param_hint=option)
         prepare_file(out)
@@ -103,7 +100,42 @@ def calibrate(
     if board is None:
         raise typer.BadParameter("say which board, or --from scene", param_hint="--board")
     prepare_file(out)
-    _calibrate_board(images, board, out, front, previous, json_out, anyway=anyway)
+    if intrinsics_only:
+        _calibrate_lenses(images, board, out, json_out)
+    else:
+        _calibrate_board(images, board, out, front, previous, json_out, anyway=anyway)
+
+
+def _calibrate_lenses(images: Path, board: Path, out: Path, json_out: bool) -> None:
+    """Writes each camera's lens in the keys of cameras.json, without a pose, with the standard deviations of fx fy cx
+    cy (px) k1 k2 p1 p2 k3."""
+    from dataclasses import asdict
+
+    from calibration.adjustment.intrinsics import estimate_lenses
+    from calibration.board.board import read_board
+    from calibration.board.detection import detect_folder
+    from calibration.quality.outliers import drop_blurred
+    from calibration.result import CalibrationRefused
+
+    with progress_bar() as report:
+        detections, _ = drop_blurred(detect_folder(images, read_board(board), together=False, report=report))
+    lenses = estimate_lenses(detections)
+    absent = [name for name in detections.sizes if name not in lenses]
+    said = [compose("camera-without-board", camera=name, why=compose("no-picture-of-board")) for name in absent]
+    if not lenses:
+        raise CalibrationRefused(said)
+    for message in (*said, *(lens.weakness for lens in lenses.values() if lens.weakness)):
+        warn(message.text)
+    cameras = []
+    for name, lens in lenses.items():
+        k, figures = lens.intrinsics, {"rms_px": lens.rms_px, "views": lens.views, "sigma": lens.sigma.tolist()}
+        focal = {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
+        distortion = {"model": "brown-conrady", **asdict(k.distortion)}
+        held = {"width": k.width, "height": k.height, "intrinsics": focal, "distortion": distortion}
+        cameras.append({"name": name, **held, **figures})
+    document = {"format": "eigenhead-lenses/1", "cameras": cameras}
+    write_atomically(out, json.dumps(document, indent=1).encode())
+    answer(document, json_out, [str(out), *(f"{name}  {lens.rms_px:.3f} px" for name, lens in lenses.items())])
 
 
 def _calibrate_board(
@@ -205,14 +237,7 @@ def convert(
     out: Annotated[
         Path, typer.Option(help="The file to write; for COLMAP, RealityCapture's XMP and OpenCV's YAML the folder.")
     ],
-    to: Annotated[
-        str,
-        chosen(
-            "eigenhead, colmap, colmap-text, caliscope, aniposelib, metashape, realitycapture, "
-            "realitycapture-csv, nerfstudio, opencv-yaml or blender.",
-            _formats,
-        ),
-    ] = "eigenhead",
+    to: Annotated[CameraFormat, typer.Option(help="The program that shall read them.")] = "eigenhead",
     json_out: Json = False,
 ) -> None:
     """Convert calibrations to and from other programs."""

@@ -40,6 +40,7 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
 
     Raises InputError for wrong settings, and WrongVariable or WorkFailed if this machine, not the capture, is at fault.
     """
+    from pipeline.evidence.plausibility import refuse
     from pipeline.settings import settings_from_document
 
     chosen = settings_from_document(settings)
@@ -56,6 +57,7 @@ def checked(capture: Path, settings: dict[str, object], *, report: Progress) -> 
             _check_front(chosen.front, document["cameras"])
             document["front"] = chosen.front or content.front
             shot, rig = read_scaled_capture(folder)
+            refuse(shot.remarks, chosen.fail_on)
             document["warnings"] = documents_of(check_views(shot, rig, chosen, load_networks(), report=report))
     except (DamagedNetwork, WrongVariable, WorkFailed):
         raise

@@ -1,15 +1,18 @@
-"""Implements ``eigenhead compare`` and ``register``: two visits of a person, and a head on the surface of a CT."""
+"""Implements ``eigenhead compare``, ``register`` and ``measure``: two visits of a person, a head on the surface of a
+CT, and what helmets, masks and spectacles are fitted by."""
 
+from collections.abc import Collection, Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder, warn
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, given, prepare_folder, warn
 
 if TYPE_CHECKING:
     from pipeline.applications.clinic.comparison import Comparison
+    from pipeline.applications.clinic.sizes import SizeTable
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -17,13 +20,6 @@ Result = Annotated[Path, typer.Argument(help="A result folder.", exists=True, fi
 Model = Annotated[
     str | None, typer.Option(help="The head model's name or file, if not the one that report.json names.")
 ]
-
-
-def axes_choices() -> tuple[str, ...]:
-    """Returns the names of a patient's axes."""
-    from rig.formats.meshes.markups import AXES
-
-    return AXES
 
 
 @app.command(epilog="Example: eigenhead compare heads/anna-march heads/anna-june --out compared/anna")
@@ -87,15 +83,10 @@ def register(
     out: Annotated[Path, typer.Option(help="The folder of the registered head.", file_okay=False)],
     *,
     axes: Annotated[
-        str | None, chosen("Of the surface, LPS or RAS; by default what its header states, else LPS.", axes_choices)
+        Literal["LPS", "RAS"] | None, typer.Option(help="Of the surface; by default what its header states, else LPS.")
     ] = None,
     landmarks: Annotated[
-        Path | None,
-        typer.Option(
-            help="Of the surface, .mrk.json, .json, .pp or .ljson: three or more of docs/models.md.",
-            exists=True,
-            dir_okay=False,
-        ),
+        Path | None, given("Of the surface, .mrk.json, .json, .pp or .ljson: three or more of docs/models.md.")
     ] = None,
     model: Model = None,
     overwrite: Overwrite = False,
@@ -108,16 +99,13 @@ def register(
     part in it. Writes the head and its landmarks in the surface's frame, and what is left between the two."""
     if (out / "registration.json").exists() and not overwrite:
         raise Overwrites(out / "registration.json")
-    from typing import cast
-
     from pipeline.applications.clinic.patient_files import write_registration
     from pipeline.applications.clinic.registration import read_surface_landmarks
     from pipeline.applications.clinic.registration import register as register_head
     from pipeline.applications.clinic.surface import read_surface
     from pipeline.applications.clinic.visit import read_visit
-    from rig.formats.meshes.markups import Axes
 
-    patient = read_surface(surface, cast(Axes | None, axes))
+    patient = read_surface(surface, axes)
     marks = None if landmarks is None else read_surface_landmarks(landmarks, patient.axes)
     visit = read_visit(result, model)
     for warning in visit.warnings:
@@ -139,3 +127,73 @@ def _registration_lines(document: dict[str, Any], out: Path) -> list[str]:
         f"of the {figures['kept_share']:.0%} that the fit used: {figures['kept_std_mm']:.3f} mm (standard deviation)",
         str(out / "residual.ply"),
     ]
+
+
+@app.command(epilog="Example: eigenhead measure heads/anna --sizes helmets.toml")
+def measure(
+    result: Result,
+    *,
+    sizes: Annotated[Path | None, given("Tables of sizes, a TOML file (docs/clinic.md).")] = None,
+    model: Model = None,
+    data: Data = None,
+    json_out: Json = False,
+) -> None:
+    """Measure a head for helmets, masks and spectacles.
+
+    Prints each measure with its standard deviation and ISO name, and of every table of sizes how likely each size
+    fits."""
+    from pipeline.applications.clinic.fitting import ISO_NAMES, MEASURES, Fitted, fitting_measures
+    from pipeline.applications.clinic.sizes import choose_size, read_size_tables
+    from pipeline.applications.clinic.visit import read_visit
+    from rig.messages.message import documents_of
+
+    tables = [] if sizes is None else read_size_tables(sizes)
+    visit = read_visit(result, model)
+    _check_measures(sizes, tables, {*visit.measurements, *MEASURES})
+    measures = {
+        name: Fitted(of.value_mm, of.std_mm, "mm") for name, of in visit.measurements.items() if of.std_mm is not None
+    }
+    measures |= fitting_measures(visit)
+    _check_measures(sizes, tables, measures.keys())
+    chosen = [choose_size(table, measures[table.measure].value, measures[table.measure].std) for table in tables]
+    for warning in visit.warnings:
+        warn(str(warning))
+    document = {
+        "warnings": documents_of(visit.warnings),
+        "measures": {
+            name: {"value": of.value, "std": of.std, "unit": of.unit, "iso": ISO_NAMES.get(name)}
+            for name, of in measures.items()
+        },
+        "sizes": {
+            of.table: {"measure": of.measure, "best": of.best, "probabilities": dict(of.probabilities), "none": of.none}
+            for of in chosen
+        },
+    }
+    answer(document, json_out, _measure_lines(document))
+
+
+def _check_measures(path: Path | None, tables: "Sequence[SizeTable]", known: Collection[str]) -> None:
+    """Raises InputError if a table is by a measure that this head does not have."""
+    from rig.errors import InputError
+    from rig.messages.message import compose
+
+    listed = ", ".join(sorted(known))
+    faults = [
+        compose("size-measure-unknown", table=of.name, measure=of.measure, known=listed)
+        for of in tables
+        if of.measure not in known
+    ]
+    if faults and path is not None:
+        raise InputError(path.name, faults)
+
+
+def _measure_lines(document: Mapping[str, Any]) -> list[str]:
+    lines = [
+        f"{name:<26} {of['value']:>7.1f} {of['unit']:<3}  (standard deviation {of['std']:.1f})"
+        + (f"  {of['iso']}" if of["iso"] else "")
+        for name, of in document["measures"].items()
+    ]
+    for table, of in document["sizes"].items():
+        shares = ", ".join(f"{size} {share:.0%}" for size, share in of["probabilities"].items())
+        lines.append(f"{table}, by {of['measure']}: {of['best']}  ({shares}, none {of['none']:.0%})")
+    return lines

@@ -1,34 +1,22 @@
 """Implements ``eigenhead export``, which writes a capture or a result for other programs."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, chosen, prepare_folder, progress_bar, warn
-from server.cli.clinic import axes_choices
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, given, prepare_folder, progress_bar, warn
 from server.cli.heads import Albedo, Morphs, TemplateName
 
 if TYPE_CHECKING:
     from pipeline.settings import OutputSettings
+    from rig.formats.cameras.dataset_json import DatasetFormat
+    from rig.formats.meshes.markups import Axes
 
 app = typer.Typer(rich_markup_mode=None)
 
 
-SLICER = "slicer"
-
-
-def _forms() -> tuple[str, ...]:
-    from pipeline.settings import FORMATS
-    from rig.formats.cameras.dataset_json import DATASET_FORMATS
-
-    return (*FORMATS, SLICER, *DATASET_FORMATS)
-
-
-def _planes() -> tuple[str, ...]:
-    from pipeline.applications.clinic.anatomical_frame import PLANES
-
-    return PLANES
+ExportFormat = Literal["glb", "ply", "obj", "usdz", "stl", "3mf", "slicer", "nerfstudio", "gaussian-avatars"]
 
 
 @app.command(
@@ -43,9 +31,7 @@ def export(
             exists=True,
         ),
     ],
-    form: Annotated[
-        str, chosen("glb, ply, obj, usdz, stl, 3mf, slicer, nerfstudio or gaussian-avatars.", _forms, "--as")
-    ],
+    form: Annotated[ExportFormat, typer.Option("--as", help="The last two are of a capture.")],
     out: Annotated[Path, typer.Option(help="The folder that is written.", file_okay=False)],
     *,
     result: Annotated[
@@ -53,15 +39,10 @@ def export(
         typer.Option(help="The capture's result folder: head and FLAME parameters.", exists=True, file_okay=False),
     ] = None,
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
-    axes: Annotated[str, chosen("For slicer: LPS (the default) or RAS.", axes_choices)] = "LPS",
-    plane: Annotated[str, chosen("For slicer: head (the default), or frankfurt.", _planes)] = "head",
+    axes: Annotated[Literal["LPS", "RAS"], typer.Option(help="For slicer.")] = "LPS",
+    plane: Annotated[Literal["head", "frankfurt"], typer.Option(help="For slicer.")] = "head",
     marked: Annotated[
-        Path | None,
-        typer.Option(
-            help="For slicer: porion and orbitale, marked over an export without a plane, .mrk.json.",
-            exists=True,
-            dir_okay=False,
-        ),
+        Path | None, given("For slicer: porion and orbitale, marked over an export without a plane, .mrk.json.")
     ] = None,
     template: TemplateName = None,
     morphs: Morphs = False,
@@ -79,7 +60,7 @@ def export(
     if form in FORMATS:
         outputs = OutputSettings(formats=(form,), template=template, morphs=morphs, albedo="file" if albedo else "none")
         _export_head(capture, out, outputs, overwrite=overwrite, json_out=json_out)
-    elif form == SLICER:
+    elif form == "slicer":
         _export_patient(capture, out, axes, plane, marked=marked, overwrite=overwrite, json_out=json_out)
     else:
         _export_dataset(capture, out, form, result=result, settings=settings, overwrite=overwrite, json_out=json_out)
@@ -97,13 +78,17 @@ def _export_head(result: Path, out: Path, outputs: "OutputSettings", *, overwrit
 
 
 def _export_dataset(
-    capture: Path, out: Path, form: str, *, result: Path | None, settings: Path | None, overwrite: bool, json_out: bool
+    capture: Path,
+    out: Path,
+    form: "DatasetFormat",
+    *,
+    result: Path | None,
+    settings: Path | None,
+    overwrite: bool,
+    json_out: bool,
 ) -> None:
     """Writes a capture as a data set."""
-    from typing import cast
-
     from pipeline.settings import settings_from_document
-    from rig.formats.cameras.dataset_json import DatasetFormat
     from server.cli.reconstruct_local import check_apart
     from server.tasks.export_dataset import export_folder
     from server.tasks.reconstruct_folder import folder_of
@@ -115,45 +100,32 @@ def _export_dataset(
         raise Overwrites(out / "transforms.json")
     prepare_folder(out)
     with progress_bar() as report, folder_of(capture) as folder:
-        exported = export_folder(folder, out, cast(DatasetFormat, form), result=result, chosen=wanted, report=report)
+        exported = export_folder(folder, out, form, result=result, chosen=wanted, report=report)
     for warning in exported.warnings:
         warn(f"{warning.code}: {warning}")
-    document = {
-        "out": str(out),
-        "as": form,
-        "cameras": exported.cameras,
-        "left_out": exported.left_out,
-        "points": exported.points,
-    }
-    document |= {"flame": exported.flame}
+    figures = {name: getattr(exported, name) for name in ("cameras", "left_out", "points", "flame")}
     summary = (
         f"{len(exported.cameras)} views"
         + (", FLAME parameters" if exported.flame else "")
         + (f", without {', '.join(exported.left_out)}" if exported.left_out else "")
     )
-    answer(document, json_out, [f"{out}  {summary}"])
+    answer({"out": str(out), "as": form, **figures}, json_out, [f"{out}  {summary}"])
 
 
 def _export_patient(
-    result: Path, out: Path, axes: str, plane: str, *, marked: Path | None, overwrite: bool, json_out: bool
+    result: Path, out: Path, axes: "Axes", plane: str, *, marked: Path | None, overwrite: bool, json_out: bool
 ) -> None:
     """Writes a result's head in a patient's axes."""
-    from typing import cast
-
     from pipeline.applications.clinic.anatomical_frame import frankfurt_axes, head_axes
     from pipeline.applications.clinic.patient_files import FRAME_FILE, marked_points, write_patient_files
     from pipeline.applications.clinic.visit import read_visit
-    from rig.formats.meshes.markups import Axes
 
     if (out / FRAME_FILE).exists() and not overwrite:
         raise Overwrites(out / FRAME_FILE)
-    patient_axes = cast(Axes, axes)
     visit = read_visit(result)
-    points = marked_points(marked, visit, patient_axes)
+    points = marked_points(marked, visit, axes)
     in_plane = plane == "frankfurt" or marked is not None
-    frame = (
-        frankfurt_axes(visit.measured, patient_axes, points) if in_plane else head_axes(visit.measured, patient_axes)
-    )
+    frame = frankfurt_axes(visit.measured, axes, points) if in_plane else head_axes(visit.measured, axes)
     prepare_folder(out)
     document = write_patient_files(out, visit, frame)
     lines = [f"{out}  {frame.axes}, {'Frankfurt plane' if in_plane else 'the attitude of the head frame'}"]

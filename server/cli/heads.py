@@ -1,8 +1,7 @@
 """Implements the commands that make and judge heads: check, reconstruct, verify, demo."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, get_args, get_type_hints
+from typing import Annotated, Literal
 
 import typer
 
@@ -10,40 +9,19 @@ from server.cli.answers import (
     Anyway,
     Data,
     Json,
+    Strict,
     answer,
-    chosen,
     completing,
+    given,
     model_names,
     number,
     prepare_file,
     progress_bar,
+    switch,
     warn,
 )
 
 app = typer.Typer(rich_markup_mode=None)
-
-
-def of_setting(name: str) -> Callable[[], tuple[str, ...]]:
-    """Returns a function that lists the allowed values of a setting of the pipeline, read from its type annotation."""
-
-    def choices() -> tuple[str, ...]:
-        from pipeline.settings import Settings
-
-        options = get_type_hints(Settings)[name]
-        return tuple(v for option in (options, *get_args(options)) for v in get_args(option) if isinstance(v, str))
-
-    return choices
-
-
-def of_output(name: str) -> Callable[[], tuple[str, ...]]:
-    """Returns a function that lists the allowed values of a setting of the outputs, read from its type annotation."""
-
-    def choices() -> tuple[str, ...]:
-        from pipeline.settings import OutputSettings
-
-        return get_args(get_type_hints(OutputSettings)[name])
-
-    return choices
 
 
 def _templates() -> tuple[str, ...]:
@@ -80,11 +58,19 @@ Trace = Annotated[
 ]
 
 Device = Annotated[
-    str | None,
-    chosen(
-        "What compares photographs: cpu, gl (OpenGL), or auto, the default: a GPU beside few cores.",
-        of_setting("device"),
-    ),
+    Literal["auto", "cpu", "gl"] | None,
+    typer.Option(help="What compares photographs; auto takes a GPU beside few cores.", show_default="auto"),
+]
+Method = Annotated[
+    Literal["contour", "simplex"] | None,
+    typer.Option(help="Who solves; simplex is the paper's own, and slower.", show_default="contour"),
+]
+Detail = Annotated[
+    Literal["span", "kernel", "photo", "fine", "pores"] | None,
+    typer.Option(help="How fine the head becomes, from seconds to minutes.", show_default="fine"),
+]
+Surface = Annotated[
+    Literal["head", "bust", "both", "hair"] | None, typer.Option(help="What is written.", show_default="both")
 ]
 TemplateName = Annotated[
     str | None,
@@ -95,19 +81,14 @@ TemplateName = Annotated[
     ),
 ]
 Morphs = Annotated[
-    bool,
-    typer.Option(
-        "--morphs", help="Write posed.glb too, with morph targets by Apple's names; of a template head-NAME.glb."
-    ),
+    bool, switch("--morphs", "Write posed.glb too, with morph targets by Apple's names; of a template head-NAME.glb.")
 ]
-Albedo = Annotated[
-    bool, typer.Option("--albedo", help="Also texture/albedo.png: the texture with its light taken off.")
-]
+Albedo = Annotated[bool, switch("--albedo", "Also texture/albedo.png: the texture with its light taken off.")]
 Model = Annotated[
     str | None,
     typer.Option(help="A model's name or file; makehuman-138 by default.", autocompletion=completing(model_names)),
 ]
-Slicer = Annotated[bool, typer.Option("--slicer", help="Write landmarks.mrk.json too, a point list for 3D Slicer.")]
+Slicer = Annotated[bool, switch("--slicer", "Write landmarks.mrk.json too, a point list for 3D Slicer.")]
 CapColour = Annotated[
     str | None, typer.Option(help="Of a worn swim or wig cap, about: #rrggbb, or a name as blue.", metavar="COLOUR")
 ]
@@ -119,23 +100,22 @@ def reconstruct(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     out: Annotated[Path, typer.Option(help="The result folder.", file_okay=False)],
     *,
-    method: Annotated[str | None, chosen("contour (the default) or simplex.", of_setting("method"))] = None,
+    method: Method = None,
     model: Model = None,
     front: Annotated[str | None, typer.Option(help="The camera that the subject faces; guessed by default.")] = None,
     anyway: Anyway = False,
-    detail: Annotated[
-        str | None, chosen("span, kernel, photo, fine (the default) or pores.", of_setting("detail"))
-    ] = None,
-    surface: Annotated[str | None, chosen("head, bust, both (the default), or hair.", of_output("surface"))] = None,
+    strict: Strict = False,
+    detail: Detail = None,
+    surface: Surface = None,
     formats: Formats = None,
     albedo: Albedo = False,
     cap: CapColour = None,
     cap_thickness: CapThickness = None,
-    chart: Annotated[bool, typer.Option("--chart", help="True colours, by a ColorChecker in clean plates.")] = False,
+    chart: Annotated[bool, switch("--chart", "True colours, by a ColorChecker in clean plates.")] = False,
     normal_map: Annotated[
-        bool, typer.Option("--normal-map", help="head.glb of few triangles, with a normal map of what they leave out.")
+        bool, switch("--normal-map", "head.glb of few triangles, with a normal map of what they leave out.")
     ] = False,
-    neutral: Annotated[bool, typer.Option("--neutral", help="Write neutral.glb too, without the expression.")] = False,
+    neutral: Annotated[bool, switch("--neutral", "Write neutral.glb too, without the expression.")] = False,
     morphs: Morphs = False,
     slicer: Slicer = False,
     template: TemplateName = None,
@@ -158,7 +138,8 @@ def reconstruct(
     options["texture"] = {"chart": True} if chart else None
     worn = {"colour": cap, "thickness_mm": cap_thickness}
     options["cap"] = {name: value for name, value in worn.items() if value is not None} or None
-    document = settings_document(settings, method=method, front=front, detail=detail, device=device, **options)
+    named = {"method": method, "front": front, "detail": detail, "device": device}
+    document = settings_document(settings, strict=strict, **named, **options)
     with progress_bar() as report:
         written = reconstruct_locally(capture, out, model=model, settings=document, report=report, trace=trace)
     for warning in written["warnings"]:
@@ -172,7 +153,8 @@ def reconstruct(
 def check(
     capture: Annotated[Path, typer.Argument(help="A capture folder, or a .zip, .tar or .tar.gz of one.", exists=True)],
     settings: Annotated[Path | None, typer.Option(help="Of the job, a TOML or JSON file.", exists=True)] = None,
-    chart: Annotated[bool, typer.Option("--chart", help="Look for the colour chart in the clean plates.")] = False,
+    chart: Annotated[bool, switch("--chart", "Look for the colour chart in the clean plates.")] = False,
+    strict: Strict = False,
     json_out: Json = False,
 ) -> None:
     """Say what is wrong with a capture, without a fit.
@@ -182,7 +164,7 @@ def check(
     from server.tasks.settings_file import settings_document
 
     with progress_bar() as report:
-        document = settings_document(settings, texture={"chart": True} if chart else None)
+        document = settings_document(settings, strict=strict, texture={"chart": True} if chart else None)
         checks = checked(capture, document, report=report)
     answer(checks, json_out, lines(checks))
     if checks["faults"]:
@@ -194,9 +176,7 @@ def verify(
     captures: Annotated[
         list[Path], typer.Argument(help="Captures of the mannequin, or folders of their results.", exists=True)
     ],
-    reference: Annotated[
-        Path, typer.Option(help="Its scan: .ply, .obj or .glb in mm, in any frame.", exists=True, dir_okay=False)
-    ],
+    reference: Annotated[Path, given("Its scan: .ply, .obj or .glb in mm, in any frame.")],
     out: Annotated[Path, typer.Option(help="Where report.json and certificate.pdf go.", file_okay=False)] = Path(
         "out/verify"
     ),
@@ -232,8 +212,7 @@ def verify(
 def demo(
     out: Annotated[Path, typer.Option(help="Where the result goes.", file_okay=False)] = Path("out/demo"),
     seed: Annotated[int, typer.Option(help="Subject and noise of the simulated studio.", min=0)] = 1,
-    full: Annotated[bool, typer.Option("--full", help="The default job, with the dense surface and the bust.")] = False,
-    compare: Annotated[bool, typer.Option("--compare", help="Solve by the paper's simplex too: minutes more.")] = False,
+    full: Annotated[bool, switch("--full", "The default job, with the dense surface and the bust.")] = False,
     json_out: Json = False,
 ) -> None:
     """Run the main job end to end.
@@ -242,7 +221,7 @@ def demo(
     from server.cli.demo import run_demo
 
     with progress_bar() as report:
-        done = run_demo(out, seed=seed, full=full, compare=compare, report=report)
+        done = run_demo(out, seed=seed, full=full, report=report)
     error = done["error_mm"]
     answer(
         done,
@@ -250,10 +229,6 @@ def demo(
         [
             f"head           {done['ply']}",
             f"error          {error['median']:.2f} mm median, {error['mean']:.2f} mm mean, {error['max']:.2f} mm max",
-            *(
-                f"  {name:<12} {of['error_mm']['mean']:.2f} mm mean, {of['seconds']:.1f} s, {of['evaluations']} steps"
-                for name, of in done["methods"].items()
-            ),
             f"time           {done['seconds']:.1f} s",
             f"contact sheet  {done['contact_sheet']}",
         ],

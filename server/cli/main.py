@@ -3,22 +3,65 @@ once."""
 
 import os
 import sys
-from typing import Annotated
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup, TyperOption
 
 from rig.errors import EigenheadError
-from server.cli import batch, cameras, clinic, export, heads, measure, models, rig, service, simulate, templates, wrap
-from server.cli.answers import fail
+from server.cli import batch, cameras, clinic, export, heads, models, rig, service, simulate, templates
+from server.cli.answers import be_quiet, fail, use_threads
+
+ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
+    "heads": ("Heads", ("reconstruct", "batch", "check", "export")),
+    "clinic": ("Clinic", ("compare", "register", "measure")),
+    "trials": ("Trials", ("simulate", "demo", "verify")),
+    "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
+    "rig": ("The rig", ("rig",)),
+    "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),
+    "models": ("Models and templates", ("model", "template", "wrap")),
+}
+THREADS, QUIET = "Of compiled loops; all processors by default.", "No progress and no warnings, errors alone."
+
+
+class Commands(TyperGroup):
+    """Lists the commands by what they are for. Gives each the options of all, and each example a line of its own."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for command in _leaves(self):
+            command.epilog = "\b\n" + (command.epilog or "").replace("   ", "\n")
+            command.params += [_option("--threads", use_threads, THREADS, type=int, metavar="N")]
+            command.params += [_option("--quiet", be_quiet, QUIET, is_flag=True, default=False)]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Writes a section for each room."""
+        width = formatter.width - 6 - max(map(len, self.commands))
+        for title, names in ROOMS.values():
+            with formatter.section(title):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(width)) for name in names])
+
+
+def _option(name: str, use: Callable[[Any], None], told: str, **kind: Any) -> TyperOption:
+    """Returns an option of every command: ``use`` takes its value, the command does not."""
+    return TyperOption(param_decls=[name], callback=lambda *of: use(of[-1]), help=told, expose_value=False, **kind)
+
+
+def _leaves(group: TyperGroup) -> Iterator[Any]:
+    for command in group.commands.values():
+        yield from _leaves(command) if isinstance(command, TyperGroup) else [command]
+
 
 app = typer.Typer(
     name="eigenhead",
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # importing rich's markdown alone takes half a second
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for room in (service, heads, simulate, batch, export, clinic, measure, wrap, cameras):
+for room in (service, heads, simulate, batch, export, clinic, templates, cameras):
     app.add_typer(room.app)
 groups = {"keys": service.keys_app, "rig": rig.rig_app, "model": models.model_app, "template": templates.template_app}
 for name, group in groups.items():
@@ -40,16 +83,6 @@ def of_all(
     ] = False,
 ) -> None:
     """One shot of a calibrated camera rig in, a textured 3D head with its uncertainty out."""
-
-
-@app.command(hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-def experiments(context: typer.Context) -> None:
-    """Say where the experiments are."""
-    name = next((word for word in context.args if not word.startswith("-")), "NAME")
-    print(
-        f"experiments are in the laboratory of a checkout: python -m tests.laboratory {name} [--json]", file=sys.stderr
-    )
-    raise typer.Exit(2)
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from server.cli.answers import Data, Json, answer, prepare_file, progress_bar
+from server.cli.answers import Data, Json, answer, prepare_file, progress_bar, switch
 
 model_app = typer.Typer(help="Head models.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -72,7 +72,7 @@ def model_build(
     name: Annotated[str | None, typer.Option(help="What to call it.")] = None,
     skip_bad: Annotated[bool, typer.Option(help="Leave out scans that cannot be used, instead of stopping.")] = False,
     from_results: Annotated[
-        bool, typer.Option("--from-results", help="Update the model that made the heads of these results.")
+        bool, switch("--from-results", "Update the model that made the heads of these results.")
     ] = False,
     json_out: Json = False,
 ) -> None:

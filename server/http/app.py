@@ -1,21 +1,27 @@
 """Composes the API as an ASGI app: routers, middleware, and the tasks that run beside the requests."""
 
 import asyncio
+import hashlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
+from functools import partial
 from importlib.metadata import version
+from weakref import WeakValueDictionary
 
 import structlog
 from fastapi import FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 from fastapi.routing import APIRoute
+from starlette.datastructures import Headers
+from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from rig.messages.message import compose
 from server.http.auth import FairShares
 from server.http.json_bodies import JsonBodies
 from server.http.linger import DrainRequestBody
-from server.http.openapi import describe, operation_name
+from server.http.openapi import CHANGES, describe, operation_name
 from server.http.routes import batches, calibrations, captures, jobs, operations, rig, sessions, storage, uploads
 from server.metrics import Metrics
 from server.services.health import check_egl, check_store, store_places
@@ -24,6 +30,7 @@ from server.services.service import Service, open_service
 from server.settings import ServiceSettings
 from server.storage.store import new_id
 from server.wire import problems
+from server.wire.problems import Problem
 
 LAG_EVERY_S = 0.02
 BATCHES_AGAIN_S = 5.0
@@ -78,6 +85,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
     routes = [route for router in routers for route in router.routes if isinstance(route, APIRoute)]
     problems.install(app, routes)
     app.add_middleware(JsonBodies, routes=routes)
+    app.add_middleware(Conditions, routes=routes)
     if mount_pages is not None:
         mount_pages(app, settings)
     if settings.cors_origins:
@@ -91,7 +99,7 @@ def create_app(settings: ServiceSettings, mount_pages: MountPages | None = None)
     app.add_middleware(FairShares)
     app.add_middleware(Watch, metrics=metrics)
     app.add_middleware(DrainRequestBody)  # outside Watch, so that Watch does not time a slow client
-    describe(app)
+    describe(app, settings.public_url)
     return app
 
 
@@ -128,6 +136,64 @@ class Watch:
                 if route not in ("/healthz", "/readyz", "/metrics"):
                     ms = round((time.monotonic() - began) * 1000, 1)
                     log.info("request", method=scope["method"], path=scope["path"], status=status, ms=ms)
+
+
+class Conditions:
+    """Answers HEAD as GET without the content, tags the state of what can be changed (ETag), and refuses with 412 a
+    change whose ``If-Match`` names another state."""
+
+    def __init__(self, app: ASGIApp, routes: Sequence[APIRoute]) -> None:
+        self._app, self._routes = app, routes
+        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()  # by path
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one ASGI connection."""
+        kinds = self._methods(scope) if scope["type"] == "http" else set[str]()
+        method, wanted = scope.get("method"), Headers(scope=scope).get("if-match") if kinds else None
+        if method == "HEAD" and "GET" in kinds and "HEAD" not in kinds:
+            got = {**scope, "method": "GET"}
+            await self._app(got, receive, partial(_send_start, send))
+            scope["route"] = got.get("route")
+        elif method == "GET" and kinds & CHANGES:
+            start, content, tag = await self._state(scope, receive)
+            await send({**start, "headers": [*start["headers"], *([(b"etag", tag.encode())] if tag else [])]})
+            await send({"type": "http.response.body", "body": content})
+        elif method in CHANGES and "GET" in kinds and wanted is not None:
+            async with self._locks.setdefault(scope["path"], asyncio.Lock()):
+                *_, held = await self._state({**scope, "method": "GET"}, _no_content)
+                if held and not {"*", held} & {tag.strip() for tag in wanted.split(",")}:
+                    await Problem(412, "changed-since", compose("changed-since")).response()(scope, receive, send)
+                else:
+                    await self._app(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+    def _methods(self, scope: Scope) -> set[str]:
+        """Returns the methods of the routes with the path of a request."""
+        fitting = (route for route in self._routes if route.matches(scope)[0] is not Match.NONE)
+        return {method for route in fitting for method in route.methods or ()}
+
+    async def _state(self, scope: Scope, receive: Receive) -> tuple[Message, bytes, str]:
+        """Returns the start and content of what a GET answers, and the tag of what it found, empty where nothing."""
+        told: list[Message] = []
+
+        async def take(message: Message) -> None:
+            told.append(message)
+
+        await self._app(scope, receive, take)
+        content = b"".join(message.get("body", b"") for message in told[1:])
+        return told[0], content, f'"{hashlib.sha256(content).hexdigest()}"' if told[0]["status"] == 200 else ""
+
+
+async def _no_content() -> Message:
+    return {"type": "http.request"}
+
+
+async def _send_start(send: Send, message: Message) -> None:
+    """Sends the start of an answer, and that it has no content."""
+    if message["type"] == "http.response.start":
+        await send(message)
+        await send({"type": "http.response.body"})
 
 
 async def _look_around(service: Service) -> None:

@@ -15,10 +15,7 @@ class NewCalibration(Received):
     model_config = ConfigDict(
         json_schema_extra={
             "examples": [
-                {
-                    "board": {"kind": "checkerboard", "columns": 9, "rows": 6, "square_mm": 25.0},
-                    "captures": [EXAMPLE_ID],
-                },
+                {"board": {"kind": "charuco", "columns": 12, "rows": 9, "square_mm": 30.0}, "captures": [EXAMPLE_ID]},
                 {
                     "from": "scene",
                     "scale": {"tag": {"dictionary": "DICT_4X4_50", "size_mm": 40.0}},

@@ -18,6 +18,7 @@ from server.wire import problems
 
 SETTINGS = {"type": "object", "title": "Settings"}  # placeholder of settings, until ``_name_settings`` replaces it
 REFERENCE = "#/components/schemas/{model}"
+CHANGES = frozenset({"PUT", "PATCH", "DELETE"})  # methods that If-Match makes conditional
 TEXTUAL = ("application/json", problems.MEDIA_TYPE, "text/")
 
 
@@ -26,8 +27,9 @@ def operation_name(route: APIRoute) -> str:
     return route.name
 
 
-def describe(app: FastAPI) -> None:
-    """Replaces ``app.openapi`` by a function that returns the completed document, which is made once."""
+def describe(app: FastAPI, address: str | None) -> None:
+    """Replaces ``app.openapi`` by a function that returns the completed document, which is made once. ``address``: what
+    the service is known as; None where it is that of the request."""
     original = app.openapi
 
     def openapi() -> JsonObject:
@@ -36,6 +38,8 @@ def describe(app: FastAPI) -> None:
             _name_problems(document)
             _name_settings(document)
             _mark_files(document)
+            _name_conditions(document)
+            document["servers"] = [{"url": address or "/"}]
         return app.openapi_schema or {}
 
     app.openapi = openapi
@@ -56,6 +60,22 @@ def _name_problems(document: JsonObject) -> None:
     for status, answer in _responses(document):
         if status[0] in "45" and problems.MEDIA_TYPE in answer.get("content", {}):
             answer["content"] = {problems.MEDIA_TYPE: answer["content"][problems.MEDIA_TYPE]}
+
+
+def _name_conditions(document: JsonObject) -> None:
+    """Adds ``If-Match`` to what changes or removes something that can be got, and ``ETag`` to what gets it."""
+    text = {"schema": {"type": "string"}}
+    tag = {"description": "of this state; If-Match takes it", **text}
+    for path in document["paths"].values():
+        changes = [call for method, call in path.items() if method.upper() in CHANGES]
+        if not changes or "get" not in path:
+            continue
+        path["get"]["responses"]["200"]["headers"] = {"ETag": tag}
+        for call in changes:
+            told = "the ETag of the state that is meant to be changed: 412 if it is another by now"
+            parameters = call.setdefault("parameters", [])
+            parameters.append({"name": "If-Match", "in": "header", "required": False, "description": told, **text})
+            call["responses"] |= {"412": {**call["responses"]["422"], "description": "Precondition Failed"}}
 
 
 def _name_settings(document: JsonObject) -> None:

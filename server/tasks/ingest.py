@@ -8,6 +8,7 @@ import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,9 +35,9 @@ from rig.formats.captures.capture_folder import (
     SCALE,
     capture_root,
     has_known_length,
+    judge_lost,
     open_capture,
     read_shot,
-    size_fault,
 )
 from rig.formats.captures.features_json import FEATURES_FORMAT, features_from_bytes
 from rig.formats.captures.shot_files import ASIDE, BESIDE_PICTURES, ShotFiles, picture_folder
@@ -254,11 +255,12 @@ def check_capture(
     empty: list[str] = []
     views: dict[str, ViewCheck] = {}
     small: dict[str, tuple[ImageRgb, Camera]] = {}
+    lost: dict[str, list[Message]] = {}
     for number, camera in enumerate(rig):
         report("check", number / len(rig))
         of_sizes, of_files = _size_faults(root, files, camera, image_pixels), list[Message]()
         if not of_sizes:
-            shot, is_empty = _read_view(root, rig.subset([camera.name]), of_files, files, digests)
+            shot, is_empty = _read_view(root, rig.subset([camera.name]), of_files, lost, files, digests)
             empty += [camera.name] if is_empty else []
             views |= _view_of(shot, camera.name, measured)
             image = shot.images.get(camera.name)
@@ -269,20 +271,25 @@ def check_capture(
         of_points = feature_faults(features_from_bytes(features.read_bytes(), rig, faults), rig)
         faults += of_points
         digests[FEATURES] = sha256_of(features)
-    if len(empty) == len(rig):
+    losses = judge_lost(lost, rig, faults)
+    kept = rig.subset([name for name in rig.names if name not in lost])
+    if len(empty) == len(kept):
         faults.append(compose("every-picture-its-plate"))
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
     digests |= _camera_digests(root, rig_file, rig)
+    for name in lost:  # kept, so that a job says what is wrong with them
+        digests |= {path.relative_to(root).as_posix(): sha256_of(path) for _, path in files.of_camera(name)}
     is_metric = not (has_known_length(root) or (root / FIGURES).is_file())  # no length follows, or was assumed
     return CaptureContent(
-        cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in rig),
-        front=rig.front_camera(),
+        cameras=tuple(CameraSize(c.name, c.intrinsics.width, c.intrinsics.height) for c in kept),
+        front=kept.front_camera(),
         inputs=dict(sorted(digests.items())),
         bytes=sum(entry(root, name).stat().st_size for name in digests),
         faults=tuple(view_faults(views, ShotConfig())),
         checks={name: view.document() for name, view in views.items()},
-        face=_face_of(small, rig, networks, is_metric=is_metric) if networks is not None and small else None,
+        warnings=tuple(losses),
+        face=_face_of(small, kept, networks, is_metric=is_metric) if networks is not None and small else None,
     )
 
 
@@ -317,17 +324,21 @@ def _view_of(shot: Capture, name: str, measured: bool) -> dict[str, ViewCheck]:
 
 
 def _read_view(
-    root: Path, rig: Rig, faults: list[Message], files: ShotFiles, digests: dict[str, str]
+    root: Path,
+    rig: Rig,
+    faults: list[Message],
+    lost: dict[str, list[Message]],
+    files: ShotFiles,
+    digests: dict[str, str],
 ) -> tuple[Capture, bool]:
-    """Reads the files of the one camera of ``rig``, never more than two of its pictures at once, and adds their SHA-256
-    to ``digests``. Returns the picture with its first plate and its mask, and whether the picture is, pixel for pixel,
-    one of its clean plates: noise never repeats."""
+    """Reads the files of the one camera of ``rig``, never more than two of its pictures at once, adds their SHA-256 to
+    ``digests``, and to ``lost`` what cannot be used. Returns the picture with its first plate and its mask, and whether
+    the picture is, pixel for pixel, one of its clean plates: noise never repeats."""
     (name,) = rig.names
     first, *others = files.plates.get(name, ()) or (None,)
     plates = {} if first is None else {name: (first,)}
-    shot = read_shot(
-        root, rig, faults, replace(files, plates=plates, texture_sets={}), with_features=False, with_cut_outs=False
-    )
+    read_part = partial(read_shot, root, rig, faults, with_features=False, with_cut_outs=False, lost=lost)
+    shot = read_part(replace(files, plates=plates, texture_sets={}))
     digests |= shot.digests
     image = shot.images.get(name)
     is_empty = image is not None and any(np.array_equal(image, plate) for plate in shot.backgrounds.get(name, ()))
@@ -335,7 +346,7 @@ def _read_view(
     more = [replace(alone, plates={name: (plate,)}) for plate in others]
     more += [replace(alone, texture_sets={kind: of_set}) for kind, of_set in files.texture_sets.items()]
     for part in more:
-        read = read_shot(root, rig, faults, part, with_features=False, with_cut_outs=False)
+        read = read_part(part)
         digests |= read.digests
         is_empty |= image is not None and any(np.array_equal(image, plate) for plate in read.backgrounds.get(name, ()))
     return shot, is_empty
@@ -359,19 +370,15 @@ def check_features(context: WorkerContext, report: Progress, *, folder: str, poi
 def _size_faults(root: Path, files: ShotFiles, camera: Camera, image_pixels: int) -> list[Message]:
     """Sizes as the headers say, before anything is decoded: a small file may claim any size."""
     faults, pixels = list[Message](), 0
-    wanted = (camera.intrinsics.width, camera.intrinsics.height)
     for _, path in files.of_camera(camera.name):
         name = path.relative_to(root).as_posix()
         try:
             width, height = picture_size(path)
-        except InputError as error:
-            faults += [compose("of-file", file=name, fault=fault) for fault in error.faults]
+        except InputError:  # told when it is decoded
             continue
         pixels += width * height
         if width * height > image_pixels:
             faults.append(compose("picture-too-large", file=name, width=width, height=height, most=image_pixels))
-        elif (width, height) != wanted:
-            faults.append(size_fault(name, (width, height), camera.intrinsics))
     if pixels > PICTURES_MOST * image_pixels:
         faults.append(
             compose("camera-pixels-many", camera=camera.name, pixels=pixels, most=PICTURES_MOST * image_pixels)

@@ -84,6 +84,7 @@ def run_job(
     """
     from pipeline.applications.templates.write.writers import load_template_writers
     from pipeline.compute.trace import span
+    from pipeline.evidence.plausibility import refuse
     from pipeline.head_model.model import load_model
     from pipeline.reconstruct import reconstruct
     from pipeline.results.write import write_result
@@ -92,6 +93,7 @@ def run_job(
     from server.tasks.photographs import full_size_pictures
     from server.tasks.prepare import prepare_kernels
 
+    refuse(prepared.capture.remarks, chosen.fail_on)
     kind = f"{chosen.method} {chosen.detail} {chosen.outputs.surface}"
     with span("stage", "compiling"):
         context.keep(f"loops {kind}", lambda: prepare_kernels(preparation, chosen))

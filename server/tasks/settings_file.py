@@ -8,6 +8,8 @@ from pathlib import Path
 from rig.errors import InputError
 from rig.messages.message import compose
 
+LOST = "picture-lost"  # the warning of a camera that takes no part because its pictures cannot be used
+
 
 def read_settings_file(path: Path) -> dict[str, object]:
     """Reads settings from a TOML or JSON file. Raises InputError if it cannot be read or holds no table."""
@@ -27,10 +29,14 @@ def reason_of(error: OSError | ValueError | RecursionError) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
-def settings_document(path: Path | None, **options: str | bool | Mapping[str, object] | None) -> dict[str, object]:
+def settings_document(
+    path: Path | None, *, strict: bool = False, **options: str | bool | Mapping[str, object] | None
+) -> dict[str, object]:
     """Returns the settings of a TOML or JSON file, or none without a file, overridden by ``options``. Tables in both
-    are merged. Raises InputError if the file cannot be read."""
-    return merged_settings({} if path is None else read_settings_file(path), options)
+    are merged. ``strict``: a camera without usable pictures fails. Raises InputError if the file cannot be read."""
+    document = merged_settings({} if path is None else read_settings_file(path), options)
+    codes = document.get("fail_on", [])
+    return document | ({"fail_on": [*codes, LOST]} if strict and isinstance(codes, list) else {})
 
 
 def merged_settings(document: Mapping[str, object], over: Mapping[str, object]) -> dict[str, object]:

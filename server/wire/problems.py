@@ -147,7 +147,7 @@ def problem_from(error: Exception) -> Problem:
         again = {} if error.retry_after_s is None else {"Retry-After": str(error.retry_after_s)}
         return Problem(status_of(type(error)), error.kind, error.detail, error.errors, again)
     if isinstance(error, RequestValidationError):
-        faults = [compose("located", where=".".join(map(str, e["loc"])), fault=_fault_of(e)) for e in error.errors()]
+        faults = [_fault_of(e) for e in error.errors()]
         return Problem(422, "invalid-request", compose("request-unfit"), faults)
     if isinstance(error, HTTPException):
         phrase = HTTPStatus(error.status_code).phrase
@@ -167,11 +167,16 @@ def problem_from(error: Exception) -> Problem:
     return Problem(500, "internal-error", compose("service-failed"))
 
 
-def _fault_of(error: Mapping[str, Any]) -> Message | str:
+def _fault_of(error: Mapping[str, Any]) -> Message:
     """Words a fault that pydantic found. For a body that is no JSON pydantic says nothing helpful, so it is worded
     here."""
-    whole_body = error["loc"] == ("body",) and error["type"] == "model_attributes_type"
-    return compose("no-json-object") if whole_body else error["msg"]
+    where, fault = ".".join(map(str, error["loc"])), error["msg"]
+    if error["loc"] == ("body",) and error["type"] == "model_attributes_type":
+        fault = compose("no-json-object")
+    if error["type"] == "json_invalid":
+        where, at = map(str, error["loc"])
+        fault = compose("no-json-because", reason=f"{error['ctx']['error']}, character {at}")
+    return compose("located", where=where, fault=fault)
 
 
 def install(app: FastAPI, routes: Sequence[APIRoute]) -> None:

@@ -30,7 +30,7 @@ def durations() -> dict[str, float]:
 @pytest.mark.gl
 @pytest.mark.timeout(600)
 def test_the_demo_ends_with_a_head_near_the_truth(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "server.cli", "demo", "--compare", "--out", str(tmp_path / "out"), "--json"]
+    command = [sys.executable, "-m", "server.cli", "demo", "--out", str(tmp_path / "out"), "--json"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
@@ -39,10 +39,6 @@ def test_the_demo_ends_with_a_head_near_the_truth(tmp_path: Path) -> None:
     assert {"head.glb", "report.json", "overlays", "contact_sheet.png"} <= names
     assert answer["error_mm"]["median"] < HULL_MEDIAN_MM
     assert answer["error_mm"]["median"] <= answer["error_mm"]["mean"] <= answer["error_mm"]["max"]
-    simplex = answer["methods"]["simplex"]
-    assert Path(simplex["ply"]).is_file()
-    assert simplex["evaluations"] > 1000
-    assert answer["error_mm"]["mean"] < simplex["error_mm"]["mean"], "the default is there because it is closer"
 
 
 @pytest.mark.slow

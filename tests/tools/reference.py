@@ -8,6 +8,7 @@ import ast
 import dataclasses
 import io
 import json
+import re
 import tokenize
 import typing
 from collections.abc import Iterator
@@ -24,21 +25,13 @@ from pipeline import settings
 from pipeline.settings import Settings
 from rig.atomic_write import write_atomically
 from rig.formats import rig_toml
-from server.cli.main import app
+from server.cli.main import ROOMS, app
 from server.settings import PREFIX, ServiceSettings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 MADE = "<!-- Made of the program by `make reference`; changes belong there. -->\n"
 WIDTH = 100
-ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
-    "heads": ("Heads", ("reconstruct", "batch", "check", "export")),
-    "clinic": ("Clinic", ("compare", "register", "measure")),
-    "trials": ("Trials", ("simulate", "demo", "verify")),
-    "cameras": ("Cameras", ("board", "calibrate", "refine", "convert")),
-    "rig": ("The rig", ("rig",)),
-    "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),
-    "models": ("Models and templates", ("model", "template", "wrap")),
-}
+OF_ALL = re.compile(r"\n  (?:--json|--threads N|--quiet|-h, --help) [^\n]*(?:\n {6,}[^\n]*)*")
 OF_EVERY_COMMAND = {
     "CACHE": (
         "$XDG_CACHE_HOME/eigenhead, else ~/.cache/eigenhead",
@@ -70,6 +63,13 @@ def pages() -> dict[str, str]:
 def _command_list(commands: TyperGroup) -> str:
     lines = ["# Commands", "", MADE, "`eigenhead COMMAND --help` says the same as these pages. Exit status: 0 done,"]
     lines += ["1 failed, with one line on standard error that says why and what to do, 2 wrong usage.", ""]
+    lines += [
+        "All take `--threads N` (of compiled loops; all processors by default), `--quiet` (no progress and no warnings,"
+    ]
+    lines += [
+        "errors alone) and `--help`; those that answer `--json` (one JSON object on stdout and nothing else).",
+        "",
+    ]
     lines += ["| command | does |", "|---|---|"]
     for page, (_, names) in ROOMS.items():
         for path, command in (entry for name in names for entry in _leaves((name,), commands.commands[name])):
@@ -86,8 +86,15 @@ def _command_page(commands: TyperGroup, title: str, names: tuple[str, ...]) -> s
     for name in names:
         for path, command in _leaves((name,), commands.commands[name]):
             context = _context(("eigenhead", *path), command)
-            parts.append(f"\n## eigenhead {' '.join(path)}\n\n```text\n{command.get_help(context).rstrip()}\n```\n")
+            parts.append(
+                f"\n## eigenhead {' '.join(path)}\n\n```text\n{without_common(command.get_help(context))}\n```\n"
+            )
     return "".join(parts)
+
+
+def without_common(told: str) -> str:
+    """Returns the help of a command without the options of all commands, which the list of commands names."""
+    return OF_ALL.sub("", told).replace("Options:\n\n", "").rstrip()
 
 
 def _leaves(path: tuple[str, ...], command: Any) -> Iterator[tuple[tuple[str, ...], Any]]:

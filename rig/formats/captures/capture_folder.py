@@ -26,7 +26,7 @@ from rig.camera import Intrinsics
 from rig.capture import TEXTURE_SETS, Capture, Features
 from rig.errors import InputError
 from rig.formats.cameras.cameras_file import no_rig_fault, read_cameras, rig_file_parts, rig_files
-from rig.formats.cameras.cameras_json import write_rig
+from rig.formats.cameras.cameras_json import CAMERAS_LEAST, write_rig
 from rig.formats.cameras.reading import CamerasRead
 from rig.formats.cameras.unread_programs import program_of, unread_programs
 from rig.formats.captures.capture_masks import MaskSubjects, mask_subjects
@@ -47,12 +47,15 @@ from rig.text import suggest
 SCALE, FEATURES = "scale.json", "features.json"
 RIG_SUFFIXES = (".json", ".yml", ".yaml", ".xml", ".toml", ".txt", ".csv", ".npz", ".bin", ".out", ".pkl")
 ENCLOSING_MOST = 8  # levels of single folders around a capture, as nested packing leaves them
+REST_LEAST = 0.7  # share of the cameras: 8 of 11 still surround a head
+BLACK = 16  # of 255: a lens with its cap on shows noise below it
+LIT_LEAST = 1e-3  # share of pixels above it
 ALIKE_LEAST = 0.75  # likeness of two folders' names: "backgrounds" 0.95, "Image" 0.91, "textures" 0.44
 SETS_ALIKE = 0.9  # to texture_sets: "texture_set" 0.96, "texture-sets" 0.92; "textures", other programs' folder, 0.8
 
 
 def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Capture, Rig]:
-    """Reads a capture folder and returns its capture and cameras.
+    """Reads a capture folder and returns its capture and cameras, without those whose pictures cannot be used.
 
     Pictures and feature points of a ``recorded`` lens are undistorted. Pictures of more than ``pixels_most`` pixels are
     reduced, and their cameras with them (``rig.formats.pictures.work_size``). Raises InputError naming every fault of
@@ -60,7 +63,9 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     folder = capture_root(folder)
     rigs, read, files, faults = open_capture(folder)
     rig_file, rig = rigs[0], read.rig
-    capture = read_shot(folder, rig, faults, files, pixels_most=pixels_most)
+    lost: dict[str, list[Message]] = {}
+    capture = read_shot(folder, rig, faults, files, pixels_most=pixels_most, lost=lost)
+    losses = judge_lost(lost, rig, faults)
     if faults:
         raise InputError("capture", say_once(faults, rig.names))
     digests = dict(capture.digests)
@@ -69,8 +74,20 @@ def read_capture(folder: Path, *, pixels_most: int | None = None) -> tuple[Captu
     if has_known_length(folder):
         digests[SCALE] = hashlib.sha256(entry(folder, SCALE).read_bytes()).hexdigest()
     ordered = dict(sorted(digests.items()))
-    remarks = [*capture.remarks, *read.remarks, *unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
-    return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(rig, pixels_most)
+    unread = [*unread_files(folder, rigs), *unread_pictures(folder, files, rig)]
+    remarks = [*losses, *capture.remarks, *read.remarks, *unread]
+    kept = rig.subset([name for name in rig.names if name not in lost])
+    return replace(capture, digests=ordered, remarks=tuple(remarks)), work_rig(kept, pixels_most)
+
+
+def judge_lost(lost: Mapping[str, Sequence[Message]], rig: Rig, faults: list[Message]) -> list[Message]:
+    """Returns a warning for each camera that takes no part because its pictures cannot be used; ``lost`` says why.
+    Where the other cameras do not suffice, all that is wrong is appended to ``faults``."""
+    suffices = len(rig) - len(lost) >= max(CAMERAS_LEAST, REST_LEAST * len(rig))
+    if not suffices:
+        faults += [fault for of_camera in lost.values() for fault in of_camera]
+        return []
+    return [compose("picture-lost", camera=name, faults=of_camera) for name, of_camera in lost.items()]
 
 
 def open_capture(folder: Path) -> tuple[list[Path], CamerasRead, ShotFiles, list[Message]]:
@@ -187,16 +204,21 @@ def read_shot(
     pixels_most: int | None = None,
     with_features: bool = True,
     with_cut_outs: bool = True,
+    lost: dict[str, list[Message]] | None = None,
 ) -> Capture:
     """Returns the images of a folder for a known rig, at the size and undistorted as ``work_rig`` describes them.
 
-    Every fault is appended to ``faults``, except those of ``files``, which its finder has reported already."""
+    Every fault is appended to ``faults``, except those of ``files``, which its finder has reported already. With
+    ``lost``, pictures, masks and plates that cannot be used are noted there by camera, which then has none at all."""
     if files is None:
         files = find_files(folder, rig)
         faults += files.faults
+    for name, fault in files.absent.items():
+        if name in rig:
+            (faults if lost is None else lost.setdefault(name, [])).append(fault)
     jobs = [(kind, camera.name, path) for camera in rig for kind, path in files.of_camera(camera.name)]
     bits, levels = _sample_bits(jobs, faults)
-    pictures, digests = _decoded(folder, jobs, rig, faults, pixels_most=pixels_most, bits=bits)
+    pictures, digests = _decoded(folder, jobs, rig, faults, lost, pixels_most=pixels_most, bits=bits)
     images = {name: pixels for name, _, pixels in pictures.get("images", ())}
     masks = {name: (where, pixels) for name, where, pixels in pictures.get("masks", ())}
     backgrounds: dict[str, list[np.ndarray]] = {}
@@ -212,10 +234,13 @@ def read_shot(
         data = entry(folder, FEATURES).read_bytes()
         digests[FEATURES] = hashlib.sha256(data).hexdigest()
         features = _in_read_pictures(features_from_bytes(data, rig, faults), rig)
+        features = {
+            point: {n: at for n, at in of.items() if not lost or n not in lost} for point, of in features.items()
+        }
         features = work_features(features, rig, work_rig(rig, pixels_most))
     subjects = mask_subjects(masks, rig, faults, pixels_most=pixels_most)
-    if with_cut_outs and not masks and not backgrounds and len(images) == len(rig):
-        subjects = _cut_outs(folder, jobs, rig, pixels_most) or subjects
+    if with_cut_outs and images and not masks and not backgrounds and len(images) + len(lost or ()) == len(rig):
+        subjects = _cut_outs(folder, [job for job in jobs if job[1] in images], rig, pixels_most) or subjects
     shown, plates, rims = fill_rims(images, backgrounds, subjects.masks)
     return Capture(
         shown,
@@ -234,6 +259,7 @@ def _decoded(
     jobs: Sequence[tuple[str, str, Path]],
     rig: Rig,
     faults: list[Message],
+    lost: dict[str, list[Message]] | None,
     *,
     pixels_most: int | None,
     bits: Mapping[str, int],
@@ -251,10 +277,13 @@ def _decoded(
         where = path.relative_to(folder).as_posix()
         if pixels is None:
             assert fault is not None
-            faults.append(fault)
+            of_set = kind.startswith(TEXTURE_SETS)
+            (faults if lost is None or of_set else lost.setdefault(name, [])).append(fault)
             continue
         digests[where] = digest
         pictures.setdefault(kind, []).append((name, where, pixels))
+    if lost:
+        pictures = {kind: [one for one in of_kind if one[0] not in lost] for kind, of_kind in pictures.items()}
     return pictures, digests
 
 
@@ -360,6 +389,8 @@ def decode_picture(
         differs = size_fault(where, size, camera.intrinsics)
         pages = page_count(path)
         return None, "", differs if pages == 1 else compose("first-page-differs", fault=differs, pages=pages)
+    if kind == "images" and np.mean(pixels[::4, ::4] > BLACK) < LIT_LEAST:
+        return None, "", compose("of-file", file=where, fault=compose("picture-black"))
     if whole:  # masks are interpreted together, and before pixels are averaged
         return pixels, digest, fault
     if camera.recorded is not None:

@@ -36,7 +36,8 @@ NAME_SHOWN = 60  # characters of a name that is too long
 @dataclass(frozen=True, slots=True)
 class ShotFiles:
     """Holds the files of a shot by camera. ``strays`` are pictures of no camera, relative to the capture's folder;
-    ``faults`` are messages on files that are missing or ambiguous; ``texture_sets`` are files by set and camera."""
+    ``faults`` are messages on files that are missing or ambiguous; ``texture_sets`` are files by set and camera;
+    ``absent`` says, by camera, which of its files is missing while those of others are there."""
 
     images: Mapping[str, Path]
     masks: Mapping[str, Path]
@@ -44,6 +45,7 @@ class ShotFiles:
     strays: tuple[str, ...]
     faults: tuple[Message, ...]
     texture_sets: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
+    absent: Mapping[str, Message] = field(default_factory=dict)
 
     def of_camera(self, name: str) -> list[tuple[str, Path]]:
         """Returns the kind (the folder, relative to the capture's) and path of each file of a camera."""
@@ -68,13 +70,15 @@ def find_files(folder: Path, rig: Rig, left_out: Iterable[str] = ()) -> ShotFile
     }
     used = {path for kind in owned.values() for paths in kind.values() for path in _flat(paths)}
     strays = {kind: _strays(place, used, names, kind) for kind, place in places.items()}
-    missing, cause = _missing(folder, rig, images, masks, plates, places=places, strays=strays)
+    missing, absent, cause = _missing(folder, rig, images, masks, plates, places=places, strays=strays)
     if places["images"] != folder:
         strays["beside"] = [path for path in listed_pictures(folder) if path not in used]
     stray_names = [path.relative_to(folder).as_posix() for paths in strays.values() for path in paths]
+    if stray_names or missing or faults:  # one of the others may be what is missing
+        missing, absent = [*absent.values(), *missing], {}
     faults += missing + ([stray_sentence(stray_names, rig)] if missing and stray_names and not cause else [])
     sets = _texture_sets(folder, rig, names, faults)
-    return ShotFiles(images, masks, plates, tuple(stray_names), tuple(faults), sets)
+    return ShotFiles(images, masks, plates, tuple(stray_names), tuple(faults), sets, absent)
 
 
 def _texture_sets(folder: Path, rig: Rig, names: Sequence[str], faults: list[Message]) -> dict[str, dict[str, Path]]:
@@ -210,12 +214,13 @@ def _missing(
     *,
     places: Mapping[str, Path],
     strays: Mapping[str, Sequence[Path]],
-) -> tuple[list[Message], bool]:
-    """Returns faults for missing files, and whether they name the strays already.
+) -> tuple[list[Message], dict[str, Message], bool]:
+    """Returns faults of files, by camera what it alone lacks, and whether they name the strays already.
 
     If no camera has a file of its name and other files are there, that is reported as one cause."""
     inside = "" if places["images"] == folder else "images/"
     faults, alone, named = list[Message](), not any(entry(folder, kind).is_dir() for kind in BESIDE_PICTURES), False
+    absent: dict[str, Message] = {}
     lacking = [name for name in rig.names if name not in images]
     if cause := _cause(rig, lacking, strays["images"], inside or compose("the-folder"), compose("a-picture")):
         faults.append(cause)
@@ -228,17 +233,20 @@ def _missing(
                 faults.append(other)
             elif link := _broken_link(places["images"], name):
                 where, target = link.relative_to(folder).as_posix(), link.readlink().as_posix()
-                faults.append(compose("picture-link-broken", picture=where, target=target))
+                absent[name] = compose("picture-link-broken", picture=where, target=target)
             else:
-                faults.append(compose("picture-missing", picture=f"{inside}{name}.png"))
+                absent[name] = compose("picture-missing", picture=f"{inside}{name}.png")
     lacking = [] if alone else [name for name in rig.names if name not in plates and name not in masks]
     cause = _cause(rig, lacking, strays["masks"], "masks/", compose("a-mask"))
     cause = cause or _cause(rig, lacking, strays["background"], "background/", compose("a-clean-plate"))
     for name in () if cause else lacking:
         other = _of_other_kind(name, folder, [*strays["masks"], *strays["background"]])
         named = named or other is not None
-        faults.append(other or compose("plate-missing", camera=name))
-    return [*faults, *([cause] if cause else [])], named or bool(cause)
+        if other is None:
+            absent.setdefault(name, compose("plate-missing", camera=name))
+        else:
+            faults.append(other)
+    return [*faults, *([cause] if cause else [])], absent, named or bool(cause)
 
 
 def _of_other_kind(name: str, folder: Path, strays: Sequence[Path]) -> Message | None:

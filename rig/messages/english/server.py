@@ -117,6 +117,7 @@ TEMPLATES = {
     "header-too-large": "The header of a request may have {bytes:,} bytes; send fewer or shorter fields.",
     "json-body-too-large": "A JSON body may have {bytes:,} bytes.",
     "body-no-json": "The body is no JSON.",
+    "changed-since": "It was changed since: get it again, and change that.",
     "imports-not-allowed": "This service imports from nowhere: its operator names servers in EIGENHEAD_IMPORT_ORIGINS. Upload it.",
     "stored-imports-not-allowed": "This service takes captures from no object store: its operator names places in EIGENHEAD_IMPORT_PREFIXES. Upload it.",
     "objects-many": "More than {most} objects lie below {place}; a capture is one folder.",

@@ -77,7 +77,7 @@ def test_status_1_names_what_failed(shots: Path, tmp_path: Path) -> None:
     [
         (["--shard", "9/8"], "is no share such as 2/8"),
         (["--workers", "0"], "--workers"),
-        (["--detail", "deep"], "'deep' is none of span, kernel, photo, fine, pores"),
+        (["--detail", "deep"], "'deep' is not one of 'span', 'kernel', 'photo', 'fine', 'pores'"),
         (["--formats", "fbx"], "'fbx' is none of"),
     ],
 )

@@ -1,16 +1,24 @@
 """``eigenhead calibrate --from scene``: what it writes and says, what it refuses, and which options go together."""
 
 import json
+import re
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from calibration.board.board import write_board
 from rig.formats.cameras.cameras_file import FOLDER_FORMATS, FORMATS, write_rig_file
 from rig.formats.cameras.cameras_json import read_rig, write_rig
+from rig.formats.pictures.images import write_image
 from server.cli.answers import CannotWrite
 from server.cli.main import app
+from server.http.calibration_schemas import NewCalibration
 from tests.server.cli.test_main import run
+from tests.support.board_sessions import CHARUCO, board_poses, photograph, rig_of
+from tests.support.services import ROOT
 from tests.support.textured_wedge import wedge_rig, write_photographs
 
 
@@ -45,8 +53,8 @@ def test_faults_of_scale_json_end_it_before_the_work(tmp_path: Path) -> None:
     ("options", "text"),
     [
         ((), "--board"),
-        (("--from", "sky"), "'sky' is none of board, scene"),
-        (("--from", "scene", "--lenses", "two"), "'two' is none of one, each"),
+        (("--from", "sky"), "'sky' is not one of 'board', 'scene'"),
+        (("--from", "scene", "--lenses", "two"), "'two' is not one of 'one', 'each'"),
         (("--from", "scene", "--board", "{file}"), "is for a board"),
         (("--scale", "{file}"), "is for --from scene"),
     ],
@@ -104,3 +112,41 @@ def test_a_board_is_written_as_pdf_alone(tmp_path: Path) -> None:
         done.stderr.replace("│", " ").split()
     )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_one_board_is_the_default_of_command_page_and_documents(tmp_path: Path) -> None:
+    assert CliRunner().invoke(app, ["board", "--out", str(tmp_path / "board.pdf")]).exit_code == 0
+    written = tomllib.loads((tmp_path / "board.toml").read_text())
+    document = tomllib.loads(
+        "\n".join(re.findall(r"^    (\w+ = .*)$", (ROOT / "docs/calibration.md").read_text(), re.MULTILINE)[:6])
+    )
+    page = dict(
+        re.findall(r"^      (\w+): (.*),$", (ROOT / "server/console/pages/calibration.js").read_text(), re.MULTILINE)
+    )
+    schema = NewCalibration.model_json_schema()
+    assert schema["examples"][0]["board"].items() <= written.items()
+    assert document.items() <= written.items()
+    for key in ("kind", "columns", "rows", "square_mm"):
+        assert json.loads(page[key]) == written[key] == document[key]
+
+
+def test_intrinsics_only_needs_no_common_moments(tmp_path: Path) -> None:
+    """Each camera has shots of its own names; the lenses are within five of their standard deviations of the truth."""
+    rng = np.random.default_rng(4)
+    rig = rig_of(2, rng)
+    write_board(CHARUCO, tmp_path / "board.toml")
+    for camera in rig:
+        for shot, pose in enumerate(board_poses(CHARUCO, 16, rng)):
+            path = tmp_path / "shots" / camera.name / f"{camera.name}-{shot}.png"
+            write_image(path, photograph(camera, pose, CHARUCO, rng))
+    out = tmp_path / "lenses.json"
+    words = ["calibrate", str(tmp_path / "shots"), "--board", str(tmp_path / "board.toml"), "--out", str(out)]
+    done = run(*words, "--intrinsics-only", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(out.read_text())
+    assert document == json.loads(done.stdout)
+    for held in document["cameras"]:
+        k = rig[held["name"]].intrinsics
+        found = np.array([held["intrinsics"][name] for name in ("fx", "fy", "cx", "cy")])
+        assert (np.abs(found - [k.fx, k.fy, k.cx, k.cy]) < 5.0 * np.array(held["sigma"][:4])).all()
+        assert held["rms_px"] < 0.3

@@ -1,6 +1,7 @@
 """`eigenhead check`: every fault of a capture at once, and what outlines say, without a fit."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,17 +11,20 @@ import pytest
 
 from pipeline.head_model.model import load_model
 from rig.capture import Capture, reassign_images
-from rig.errors import InputError, WrongVariable
+from rig.errors import EigenheadError, InputError, WrongVariable
 from rig.formats.cameras.cameras_file import write_rig_file
 from rig.formats.captures.archive import ArchiveLimits, pack_folder
-from rig.formats.captures.capture_folder import write_capture
+from rig.formats.captures.capture_folder import read_capture, write_capture
+from rig.formats.pictures.images import read_image, write_image
 from rig.messages.message import texts_of
 from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from server.cli.check import Checked, checked, lines
+from server.cli.reconstruct_local import reconstruct_locally
 from server.tasks.child import WorkerContext
 from server.tasks.ingest import ingest_archive
+from server.tasks.settings_file import settings_document
 from tests.server.cli.test_main import run
 from tests.server.http.test_hostile import SPOILT
 from tests.support.services import small_capture
@@ -116,6 +120,52 @@ def test_mirrored_pictures_are_refused_by_an_upload_in_the_same_words(
     with pytest.raises(InputError) as refusal:
         ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=10**8)
     assert texts_of(refusal.value.faults) == found_in(tmp_path / "shot")["faults"] != []
+
+
+HARMS = {
+    "is damaged and cannot be decoded: send it again": lambda path: path.write_bytes(path.read_bytes()[:-60]),
+    "is damaged or no PNG": lambda path: path.write_bytes(b"no picture"),
+    "is black all over": lambda path: write_image(path, 0 * read_image(path)),
+    "but its camera is": lambda path: write_image(path, read_image(path)[4:]),
+    "is missing": Path.unlink,
+}
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("words", HARMS)
+def test_one_bad_picture_costs_a_view_and_is_named(masked: tuple[Capture, Rig], words: str, tmp_path: Path) -> None:
+    """By check, upload and job alike; with ``--strict`` it costs the capture."""
+    folder, kept = tmp_path / "shot", tmp_path / "kept"
+    write_capture(folder, *masked)
+    HARMS[words](folder / "images" / "cam03.png")
+    found = found_in(folder)
+    (told,) = [warning["message"] for warning in found["warnings"] if warning["code"] == "picture-lost"]
+    assert told.startswith("images/cam03.png ")
+    assert words in told
+    assert told.endswith("; mend that, or go on without cam03, which takes no part")
+    assert (found["faults"], len(found["cameras"])) == ([], len(masked[1]) - 1)
+    pack_folder(folder, tmp_path / "shot.tar")
+    archive = {"archive": str(tmp_path / "shot.tar"), "folder": str(kept), "limits": ArchiveLimits()}
+    content = ingest_archive(WorkerContext(), lambda stage, share: None, **archive, image_pixels=10**8)
+    assert [warning["message"] for warning in found["warnings"]] == texts_of(content.warnings)
+    for root in (folder, kept):  # as eigenhead reconstruct, a batch and the service's job read it
+        capture, rig = read_capture(root)
+        assert set(capture.images) == set(capture.masks) == set(rig.names) == set(masked[1].names) - {"cam03"}
+        assert [remark.text for remark in capture.remarks if remark.code == "picture-lost"] == [told]
+    strict = settings_document(None, strict=True)
+    (fault,) = found_in(folder, **strict)["faults"]
+    assert told in fault
+    with pytest.raises(EigenheadError, match=re.escape(told)):
+        reconstruct_locally(folder, tmp_path / "out", model=None, settings=strict, report=lambda stage, share: None)
+
+
+def test_a_capture_of_too_few_good_pictures_is_refused(tmp_path: Path) -> None:
+    folder = small_capture(tmp_path / "shot", cameras=6)
+    for name in ("cam01", "cam04"):
+        HARMS["is black all over"](folder / "images" / f"{name}.png")
+    assert [fault[:34] for fault in found_in(folder)["faults"]] == [
+        f"images/{name}.png is black all over" for name in ("cam01", "cam04")
+    ]
 
 
 @pytest.mark.gl

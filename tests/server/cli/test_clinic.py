@@ -68,7 +68,7 @@ def test_a_folder_that_is_no_result_is_refused(tmp_path: Path) -> None:
 def test_axes_that_nobody_knows_are_wrong_usage(result: Path, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["export", str(result), "--as", "slicer", "--axes", "XYZ", "--out", str(tmp_path)])
     assert done.exit_code == 2
-    assert "none of LPS, RAS" in done.output
+    assert "not one of 'LPS', 'RAS'" in done.output
 
 
 def test_a_comparison_that_is_there_is_not_written_over(result: Path, tmp_path: Path) -> None:

@@ -7,31 +7,29 @@ import sys
 import time
 import tomllib
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 import typer
 
+from pipeline import settings
+from pipeline.settings import OutputSettings, Settings
+from rig.formats.cameras.cameras_file import FORMATS, write_rig_file
+from rig.formats.cameras.dataset_json import DATASET_FORMATS
+from server.cli import answers
 from server.cli.answers import service_settings
+from server.cli.cameras import CameraFormat
+from server.cli.export import ExportFormat
+from server.cli.main import ROOMS
 from tests.support.services import ROOT, small_capture
+from tests.support.small_captures import small_rig
 
 COMMANDS = [
-    *(
-        "serve",
-        "worker",
-        "check",
-        "reconstruct",
-        "verify",
-        "simulate",
-        "demo",
-        "prepare",
-        "doctor",
-        "board",
-        "calibrate",
-    ),
-    *("keys add", "keys list", "keys remove", "rig check", "rig preview", "rig capture", "rig plates"),
+    *("serve", "worker", "check", "reconstruct", "verify", "simulate", "demo", "prepare", "doctor", "board"),
+    *("calibrate", "keys add", "keys list", "keys remove", "rig check", "rig preview", "rig capture", "rig plates"),
     *("model list", "model info", "model import", "model remove"),
     *("template add", "template list", "template remove"),
-]
+]  # fmt: skip
 
 
 def run(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
@@ -53,6 +51,36 @@ def test_every_command_has_help_with_an_example(command: str) -> None:
     assert f"Example: eigenhead {command}" in done.stdout or "eigenhead worker" in done.stdout
 
 
+def test_commands_are_listed_in_rooms_and_choices_are_those_of_the_settings() -> None:
+    shown = run("--help").stdout
+    assert [line[:-1] for line in shown.splitlines() if line.endswith(":")][1:] == [
+        title for title, _ in ROOMS.values()
+    ]
+    shown = " ".join(run("reconstruct", "--help").stdout.split())
+    for name, kind in (("method", Settings), ("detail", Settings), ("device", Settings), ("surface", OutputSettings)):
+        types = get_type_hints(kind)[name]
+        values = [value for option in (types, *get_args(types)) for value in get_args(option) if isinstance(value, str)]
+        assert f"--{name} <{'|'.join(dict.fromkeys(values))}>" in shown
+    assert get_args(CameraFormat) == FORMATS
+    assert get_args(ExportFormat) == (*settings.FORMATS, "slicer", *DATASET_FORMATS)
+    assert "\n  One share of eight: eigenhead batch study.csv" in run("batch", "--help").stdout
+
+
+def test_quiet_leaves_errors_alone_and_a_log_gets_lines_of_progress(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(answers, "LINE_S", 0.0)
+    with answers.progress_bar() as report:
+        report("fit", 0.25)
+    assert capsys.readouterr().err == "eigenhead: fit 25%\n"
+    source = write_rig_file(small_rig(), tmp_path / "transforms.json", "nerfstudio") or tmp_path / "transforms.json"
+    source.write_text(source.read_text().replace("{", '{"of_nobody": 1, ', 1))
+    command = ("convert", str(source), "--threads", "2", "--out")
+    assert "of_nobody" in run(*command, str(tmp_path / "a.json")).stderr
+    assert run(*command, str(tmp_path / "b.json"), "--quiet").stderr == ""
+    assert run(*command, str(tmp_path / "no" / "\0"), "--quiet").returncode != 0
+
+
 @pytest.mark.usefixtures("real_exec")
 def test_help_is_quick() -> None:
     """CPU time, which a busy machine does not stretch."""
@@ -71,17 +99,6 @@ def test_wrong_usage_is_status_2(arguments: list[str], tmp_path: Path) -> None:
     done = run(*arguments, EIGENHEAD_DATA=str(tmp_path))
     assert done.returncode == 2
     assert done.stdout == ""
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [([], "NAME"), (["limit", "--subjects", "3", "--json"], "limit"), (["--json", "real"], "real")],
-)
-def test_experiments_are_in_the_laboratory(arguments: list[str], name: str) -> None:
-    done = run("experiments", *arguments)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert f"python -m tests.laboratory {name} [--json]" in done.stderr
-    assert done.stderr.count("\n") == 1
 
 
 def test_a_failure_is_one_clear_line_and_status_1(tmp_path: Path) -> None:

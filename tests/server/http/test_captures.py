@@ -199,3 +199,38 @@ def test_a_session_without_captures_is_asked_as_much(http: httpx.Client) -> None
     session = http.post("/v1/sessions", json={}).json()["id"]
     refused = http.post(f"/v1/sessions/{session}/jobs", json={"settings": {"detial": "fine"}})
     assert (refused.status_code, "did you mean 'detail'" in refused.text) == (422, True)
+
+
+def test_a_change_may_be_meant_for_one_state_alone_and_head_is_get_without_content(
+    http: httpx.Client, archive: bytes
+) -> None:
+    path = f"/v1/captures/{upload(http, archive).json()['id']}"
+    got = http.get(path)
+    known = {"If-Match": got.headers["ETag"]}
+    for address in (path, "/v1/captures", "/v1/info", "/readyz"):
+        head = http.head(address)
+        assert (head.status_code, head.content) == (http.get(address).status_code, b"")
+        assert head.headers["content-type"] == "application/json"
+    assert http.patch(path, json={"label": "anna"}, headers=known).status_code == 200
+    late = http.patch(path, json={"label": "ben"}, headers=known)
+    assert (late.status_code, late.json()["type"]) == (412, "urn:eigenhead:problem:changed-since")
+    assert http.delete(path, headers=known).status_code == 412
+    assert http.get(path).json()["label"] == "anna"
+    assert http.patch(path, json={"label": "ben"}, headers={"If-Match": '"x", *'}).status_code == 200
+    assert http.patch(path, json={"label": "cleo"}).status_code == 200
+    assert http.delete(path, headers={"If-Match": http.get(path).headers["ETag"]}).status_code == 204
+    assert http.delete(path, headers=known).status_code == 404
+    assert http.head(path).status_code == 404
+
+
+def test_the_description_names_the_server_and_what_changes_conditionally(http: httpx.Client) -> None:
+    document = http.get("/openapi.json").json()
+    assert document["servers"] == [{"url": "/"}]
+    calls = document["paths"]["/v1/captures/{capture_id}"]
+    assert "ETag" in calls["get"]["responses"]["200"]["headers"]
+    for method in ("patch", "delete"):
+        assert "If-Match" in [parameter["name"] for parameter in calls[method]["parameters"]]
+        assert "412" in calls[method]["responses"]
+    answer = http.patch("/v1/captures/x", content=b'{"label": ', headers={"content-type": "application/json"})
+    assert answer.status_code == 422
+    assert "is no JSON" in answer.json()["errors"][0]

@@ -71,7 +71,7 @@ def test_a_colmap_model_in_place_of_cameras_json(folder: Path) -> None:
             damage("images/b.png", b"no picture"),
             "images/b.png is damaged or no PNG, JPEG, TIFF, WebP, BMP, PPM, RAW or HEIC picture",
         ),
-        (damage("images/b.png", png(picture())[:-40]), "images/b.png is damaged: its pixels cannot be decoded"),
+        (damage("images/b.png", png(picture())[:-40]), "images/b.png is damaged and cannot be decoded: send"),
         (damage("images/b.png", png(picture()[:20])), "images/b.png is 64 x 20 pixels, but its camera is 64 x 48"),
         (damage("images/b.jpg", png(picture())), "images/ holds b.jpg, b.png: which one is meant?"),
         (damage("background/b/001.png", b""), "background/b/001.png is damaged"),
