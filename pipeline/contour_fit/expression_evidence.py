@@ -76,7 +76,7 @@ def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) ->
     weights = coefficients[model.posed.start : model.posed.stop]
     found = [np.flatnonzero(weights > BOUND)]
     strong = np.flatnonzero(weights > STRONG)
-    shapes = model.expressions.shapes[strong].reshape(len(strong), -1).astype(float)
+    shapes = model.expressions.shapes.reshape(len(weights), -1)[strong].astype(float)
     alike = shapes @ shapes.T / np.maximum(np.outer(*2 * (np.linalg.norm(shapes, axis=1),)), 1e-9)
     found.append(strong[(alike < OPPOSITE).any(axis=1)])
     return frozenset(int(row) for row in np.concatenate(found) if not is_of_eye(model.expressions.names[row]))

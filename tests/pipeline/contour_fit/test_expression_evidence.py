@@ -35,6 +35,7 @@ def found_in(model: HeadModel, weights: dict[str, float], renderer: Renderer) ->
     [
         ({"mouthPucker": 0.6, "mouth-retraction": 0.7, "mouthSmileLeft": 0.5}, {"mouthPucker", "mouth-retraction"}),
         ({"mouthPucker": 0.6, "mouth-retraction": 0.2}, set()),
+        ({}, set()),
         ({"jawOpen": 1.0, "eyeBlinkLeft": 1.0, "eyeWideLeft": 0.5}, {"jawOpen"}),  # lids are placed by other evidence
         ({"mouthSmileLeft": 0.9, "mouthSmileRight": 0.9, "browInnerUp": 0.6}, set()),
     ],
