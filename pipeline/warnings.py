@@ -16,6 +16,7 @@ WARNING_CODES = (
     "cap-not-found",
     "contour-implausible",
     "crown-low",
+    "expression-doubtful",
     "eyes-closed",
     "face-elsewhere",
     "face-unseen",

@@ -20,10 +20,10 @@ from pipeline.contour_fit.rim_term import observed_rim
 from pipeline.geometry.nearest import PointTree, nearest
 
 DEPTH_MM = 4.0  # inside the outline, where the pixel shows what makes it: blur and matting end before
-MIN_SKIN = 0.7  # probability there
+MIN_SKIN = 0.4  # probability there, in the median of views: of a bald, oily crown 0.55 to 0.9, of hair 0 to 0.08
 SMOOTH_MM = 3.0  # an outline is compared with itself, smoothed over this
-ROUGH_MM = 0.11  # RMS of what stands out of it: of skulls 0.05 to 0.08, of short hair 0.16 to 0.30
-BARE_SHARE = 0.7  # of the crown's outline: less is smooth and like skin by chance
+ROUGH_MM = 0.16  # RMS of what stands out of it: of skulls 0.05 to 0.15, of short hair 0.16 to 0.30
+BARE_SHARE = 0.5  # of the crown's outline: less is smooth and like skin by chance
 STRETCH_MM = 12.0  # along the outline over which both are pooled
 REACH_MM = 30.0  # from the outline to a rim that belongs to it
 MISSED_PX = 1.0  # a crown whose outline is farther off is fitted once more

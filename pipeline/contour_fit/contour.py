@@ -30,7 +30,7 @@ from pipeline.contour_fit.problem import (
 from pipeline.contour_fit.rim_term import observed_rim
 from pipeline.estimation.levenberg_marquardt import Limits, minimise
 from pipeline.estimation.positive_definite import inverse
-from pipeline.estimation.terms import NormalEquations
+from pipeline.estimation.terms import Linearised, NormalEquations, Problem
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.settings import FittingSettings
@@ -179,10 +179,15 @@ def coarse_unit(scale_px: float) -> float:
     return FIRST_CORRELATION_PX * (0.5 * scale_px) ** 2
 
 
+def last_problem(solved: ContourSolution) -> tuple[Problem[State], Linearised]:
+    """Returns the problem of the last stage, and its linearisation at the solution."""
+    scale = max(solved.stage.scales_px[-1], solved.evidence.noise.floor_px)
+    return started_problem(solved.problem, solved.evidence, solved.stage, scale, solved.state)
+
+
 def normal_equations(solved: ContourSolution) -> NormalEquations:
     """Returns the normal equations of the last stage, evaluated at the solution."""
-    scale = max(solved.stage.scales_px[-1], solved.evidence.noise.floor_px)
-    whole, there = started_problem(solved.problem, solved.evidence, solved.stage, scale, solved.state)
+    whole, there = last_problem(solved)
     return whole.equations(there)
 
 

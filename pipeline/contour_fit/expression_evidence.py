@@ -17,10 +17,15 @@ from pipeline.contour_fit.head_problem import apply_step, weight_bounds
 from pipeline.contour_fit.prior_term import weight_slope
 from pipeline.estimation.bounded import least_within
 from pipeline.estimation.positive_definite import inverse_diagonal
+from pipeline.head_model.expressions import is_of_eye
+from pipeline.head_model.model import HeadModel
 
 ROUNDS = 6
 NEUTRAL = 0.2  # sum of weights below which a head makes no face: neutral ones have 0 to 0.13 (laboratory's expressions)
 VARIANCE_RANGE = (0.02, 4.0)
+STRONG = 0.3  # weight above which two opposites contradict each other
+OPPOSITE = -0.5  # cosine of two displacements below which they cancel: a pucker and a retraction have -0.8
+BOUND = 0.99  # weight that would be larger if it could
 
 
 def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> ContourSolution:
@@ -44,7 +49,7 @@ def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> Contou
     gradient[weights] -= weight_slope(np.maximum(state.coefficients[weights], 0.0))
     groups = (diagonal[:eigenheads], diagonal[eigenheads : posed.start], diagonal[posed.stop :])
     variance, now, step = np.ones(count), state.coefficients, np.zeros(unknowns)
-    room = weight_bounds(state, posed, unknowns)
+    room = weight_bounds(state, solved.problem, unknowns)
     for _ in range(ROUNDS):
         whole, slope = matrix.copy(), gradient.copy()
         whole[diagonal, diagonal] += 1.0 / variance
@@ -62,6 +67,19 @@ def makes_face(coefficients: Float[np.ndarray, " m"], posed: range) -> bool:
     """Tells whether the face has an expression: whether the expression weights, ``coefficients[posed]``, sum to at
     least ``NEUTRAL``."""
     return len(posed) > 0 and bool(coefficients[posed.start : posed.stop].sum() >= NEUTRAL)
+
+
+def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) -> frozenset[int]:
+    """Returns the expressions, by their place among the model's, that explain noise or another head's shape rather than
+    a face: opposites that are both strong, and weights at their upper bound. Lids, which other evidence places, are
+    none."""
+    weights = coefficients[model.posed.start : model.posed.stop]
+    found = [np.flatnonzero(weights > BOUND)]
+    strong = np.flatnonzero(weights > STRONG)
+    shapes = model.expressions.shapes.reshape(len(weights), -1)[strong].astype(float)
+    alike = shapes @ shapes.T / np.maximum(np.outer(*2 * (np.linalg.norm(shapes, axis=1),)), 1e-9)
+    found.append(strong[(alike < OPPOSITE).any(axis=1)])
+    return frozenset(int(row) for row in np.concatenate(found) if not is_of_eye(model.expressions.names[row]))
 
 
 def _variance(

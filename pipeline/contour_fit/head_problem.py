@@ -99,17 +99,22 @@ def head_problem(
         terms,
         stage.modes + POSE + cameras,
         lambda state, step: apply_step(state, step, stage),
-        room=(lambda state: weight_bounds(state, posed, stage.modes + POSE + cameras)) if poses else None,
+        room=(lambda state: weight_bounds(state, problem, stage.modes + POSE + cameras)) if poses else None,
     )
 
 
-def weight_bounds(state: State, posed: range, unknowns: int) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Returns the smallest and the largest step of every unknown that keep the expression weights between 0 and 1. All
-    other unknowns are unbounded."""
+def weight_bounds(
+    state: State, problem: ContourProblem, unknowns: int
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Returns the smallest and the largest step of every unknown that keep the expression weights between 0 and 1, and
+    those that are held at 0. All other unknowns are unbounded."""
+    posed = problem.model.posed
     least, most = np.full(unknowns, -np.inf), np.full(unknowns, np.inf)
     weights = state.coefficients[posed.start : posed.stop]
     weights = np.clip(weights, 0.0, 1.0)
     least[posed.start : posed.stop], most[posed.start : posed.stop] = -weights, 1.0 - weights
+    held = [posed.start + row for row in problem.held]
+    most[held] = least[held]
     return least, most
 
 

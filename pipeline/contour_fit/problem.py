@@ -113,6 +113,7 @@ class ContourProblem:
     features: Observed | None
     settings: FittingSettings
     landmarks: LandmarkObservations | None = None
+    held: frozenset[int] = frozenset()  # expressions, by their place among the model's, whose weights stay 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,8 +20,10 @@ from pipeline.warnings import ReportWarning
 from rig.errors import EigenheadError
 from rig.messages.message import compose
 
-MAX_COEFFICIENT = 4.6  # standard deviations of the largest; the same rig scaled by 0.88 gives 4.6, by 1.12 gives 6.8
-MIN_CHANCE = 1e-9  # of a sum of squares this large; a posterior mean is shrunk, so that good heads stay far below
+MAX_COEFFICIENT = (
+    6.0  # standard deviations of the largest: at most 5.3 in thirteen good heads; a rig scaled by 1.12: 6.8
+)
+MIN_CHANCE = 1e-16  # of a sum of squares this large: at least 7e-14 in thirteen good heads, some of another population
 MAX_SIZE = 2.9  # standard deviations of the heads' own size, which good heads exceed once in 268
 MAX_SCALE_OFF = 0.07  # of size; 0.053 of a head from another population, more of a rig whose unit is wrong
 MAX_UNSEEN = 0.12  # share of the face's vertices: 0.14 to 0.24 where three or four cameras stand on one side, 0.10 at

@@ -1,12 +1,12 @@
 """Judges the delivered head: how well it explains every camera, its measurements, and its expression."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.contour_fit.expression_evidence import makes_face
+from pipeline.contour_fit.expression_evidence import doubtful_weights, makes_face
 from pipeline.contour_fit.fit import Fit
 from pipeline.detail.blink import blinks_of, with_lids
 from pipeline.detail.expression_reading import with_read_expression
@@ -27,6 +27,7 @@ from pipeline.evidence.plausibility import UnexplainedOutlines, plausibility_war
 from pipeline.evidence.pose import PoseEvidence, judge_pose
 from pipeline.faces.eyes import MAX_CLOSED_OPENING, closed_by_openings, eye_warnings
 from pipeline.faces.landmark_map import landmark_map
+from pipeline.head_model.expressions import words
 from pipeline.multiview.tangency import pixel_mm
 from pipeline.stages.alignment import Alignment
 from pipeline.stages.context import ReconstructionContext
@@ -36,6 +37,7 @@ from pipeline.stages.recorder import Staged
 from pipeline.stages.refined_head import RefinedHead
 from pipeline.stages.texturing import Texturing
 from pipeline.stages.views import Views
+from rig.messages.message import compose
 
 MIN_LIDS = 0.4  # of the way down: of 26 eyes with smaller weights 12 were open, 9 half closed and 5 closed
 Masks = Mapping[str, Bool[np.ndarray, "h w"]]
@@ -75,9 +77,9 @@ def judge_head(
     fitted = {name: np.isfinite(depth) for name, depth in texturing.depths.items()}
     cameras = camera_figures(model, fit, views.silhouettes, rig, fitted, before)
     widths_px = {camera.name: camera.intrinsics.width for camera in rig}
-    made, min_sigma, closed_eyes = fit, MIN_SIGMA, frozenset[str]()
+    made, min_sigma, closed_eyes, doubtful = fit, MIN_SIGMA, frozenset[str](), head.doubtful
     if refined.displaced is not None:
-        made, min_sigma = fit_with_read_face(context, head, refined.displaced)
+        made, min_sigma, doubtful = fit_with_read_face(context, head, refined.displaced)
         closed_eyes = refined.displaced.closed_eyes
     expression = found_expressions(model, made, min_sigma)
     posed = outputs.neutral or outputs.morphs
@@ -98,12 +100,17 @@ def judge_head(
     unseen = unseen_face(texturing.vertices.views, model.levels["full"].face_region)
     warnings += [warning for warning in (unexplained, unseen) if warning is not None]
     closed_eyes = confirmed_closed(shut_eyes(model, made) | closed_eyes, faces.eye_openings)
+    if doubtful:
+        names = [words(model.expressions.names[row]) for row in sorted(doubtful)]
+        warnings.append(compose("expression-doubtful", expressions=names))
     return Staged(evidence, [*warnings, *eye_warnings(closed_eyes)])
 
 
-def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced: DeformedSurface) -> tuple[Fit, float]:
-    """Returns the fit with its expression read from the deformed head, and how many standard deviations a weight must
-    have to be reported.
+def fit_with_read_face(
+    context: ReconstructionContext, head: HeadFit, displaced: DeformedSurface
+) -> tuple[Fit, float, frozenset[int]]:
+    """Returns the fit with its expression read from the deformed head, how many standard deviations a weight must have
+    to be reported, and the expressions, by their place among the model's, that are doubtful and left out.
 
     The expression is read only if that of the fit is not neutral. The lids are always taken over if points around the
     eye determined them, as ``told_lids`` tells them.
@@ -114,16 +121,21 @@ def fit_with_read_face(context: ReconstructionContext, head: HeadFit, displaced:
         {side: share for side, share in displaced.lids.items() if share != float(fit.coefficients[rows[side]])}
     )
     if not makes_face(fit.coefficients, model.posed):
-        return with_lids(fit, model, lids), MIN_SIGMA
-    read = with_read_expression(
-        fit,
-        model,
-        context.model,
-        displaced.vertices,
-        displaced.observed,
-        eigenheads=min(context.settings.fitting.modes, len(context.model.modes)),
-    )
-    return with_lids(read, model, lids), MIN_SIGMA if read is fit else READ_SIGMA
+        return with_lids(fit, model, lids), MIN_SIGMA, head.doubtful
+    eigenheads = min(context.settings.fitting.modes, len(context.model.modes))
+
+    def read_without(held: frozenset[int]) -> Fit:
+        seen = displaced.vertices, displaced.observed
+        return with_read_expression(fit, model, context.model, *seen, eigenheads=eigenheads, held=held)
+
+    read = read_without(head.doubtful)
+    doubtful = head.doubtful | doubtful_weights(model, read.coefficients)
+    if doubtful != head.doubtful:
+        read = read_without(doubtful)
+    coefficients = read.coefficients.copy()
+    coefficients[[model.posed.start + row for row in doubtful]] = 0.0
+    least_sigma = MIN_SIGMA if read is fit else READ_SIGMA
+    return with_lids(replace(read, coefficients=coefficients), model, lids), least_sigma, doubtful
 
 
 def told_lids(lids: Mapping[str, float]) -> dict[str, float]:

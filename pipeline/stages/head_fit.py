@@ -3,13 +3,14 @@
 These are two stages, ``fit_outlines`` and ``fit_head``, since the parts that pixels show are labelled in between.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pipeline.contour_fit.bare_outline import with_bare_outline, with_counted_crown
 from pipeline.contour_fit.cap_outline import CapOutline, cells_of_views, without_cap
-from pipeline.contour_fit.contour import ContourSolution, finish, solve_contour
-from pipeline.contour_fit.expression_evidence import with_expression_evidence
+from pipeline.contour_fit.contour import ContourSolution, finish, last_problem, solve_contour
+from pipeline.contour_fit.expression_evidence import doubtful_weights, with_expression_evidence
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.posterior import RELIEF_OF_OUTLINES, with_estimated_prior
 from pipeline.contour_fit.span_misfit import with_span_misfit
@@ -17,6 +18,7 @@ from pipeline.head_model.model import HeadModel
 from pipeline.head_model.model_basis import basis_of, model_basis
 from pipeline.imaging.highlights import without_highlights
 from pipeline.part_labels.cap import Cap
+from pipeline.photometric_fit.hair_mask import HairProbability
 from pipeline.photometric_fit.refine import FINE_AMPLITUDE_MM, refine_with_photographs
 from pipeline.settings import PHOTO_LEVELS
 from pipeline.simplex.hierarchy import fit_simplex
@@ -26,10 +28,12 @@ from pipeline.stages.part_labels import PartLabels
 from pipeline.stages.recorder import Staged
 from pipeline.stages.views import Views
 from pipeline.warnings import Detail
+from rig.image import ImageRgb
 from rig.mesh import Mesh
 from rig.messages.message import compose
 
 Cranium = Literal["hair", "cap", "bald"]
+MAX_COST_RISE = 1.1  # of a fit without its doubtful expressions: those that explain noise leave 0.84 of the cost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +58,7 @@ class HeadFit:
     model: HeadModel
     detail: Detail
     cranium: Cranium | None = None
+    doubtful: frozenset[int] = frozenset()  # expressions, by their place among the model's, that the fit left out
 
     @property
     def mesh_world(self) -> Mesh:
@@ -105,6 +110,22 @@ def fit_outlines(
     return Staged(OutlineFit(solved, model, Mesh(vertices_world, model.levels["full"].faces)))
 
 
+def refine_with_likely_face(
+    outlines: ContourSolution, images: Mapping[str, ImageRgb], hair: HairProbability
+) -> tuple[ContourSolution, Detail, frozenset[int]]:
+    """Refines the fit with the photographs. If its expression contradicts itself, refines it again without the doubtful
+    expressions, and takes that if it explains the photographs about as well. Returns the doubtful expressions, too."""
+    solved, detail = refine_with_photographs(outlines, images, hair=hair)
+    doubtful = doubtful_weights(solved.problem.model, solved.state.coefficients)
+    if not doubtful:
+        return solved, detail, doubtful
+    plain = replace(outlines, problem=replace(outlines.problem, held=doubtful))
+    again, detail_again = refine_with_photographs(plain, images, hair=hair)
+    if last_problem(again)[1].cost > MAX_COST_RISE * last_problem(solved)[1].cost:
+        return solved, detail, doubtful
+    return again, detail_again, doubtful
+
+
 def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit, labels: PartLabels) -> Staged[HeadFit]:
     """Refines the fit with the photographs inside the outlines, to the level of detail that settings and photographs
     allow."""
@@ -112,6 +133,7 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
     if isinstance(solved, Fit):
         return Staged(HeadFit(solved, model, Detail("span", compose("level-simplex"))))
     cranium: Cranium | None = None if labels.cap is None else "cap"
+    doubtful = frozenset[int]()
     detail = Detail("span" if settings.detail == "span" else "kernel", compose("level-asked"))
     if settings.detail in PHOTO_LEVELS:
         hair = labels.hiding_probability()
@@ -119,15 +141,15 @@ def fit_head(context: ReconstructionContext, views: Views, outlines: OutlineFit,
             solved = with_bare_outline(solved, labels.skin_probability())
             cranium = "hair" if solved.evidence.noise.bare is None else "bald"
         images = without_highlights(views.capture.images, views.silhouettes, context.rig, outlines.mesh_world)
-        solved, detail = refine_with_photographs(solved, images, hair=hair)
+        solved, detail, doubtful = refine_with_likely_face(solved, images, hair)
     eigenheads, model = min(settings.fitting.modes, len(model.modes)), solved.problem.model
     relief_mm = FINE_AMPLITUDE_MM
     if detail.level == "photo":
         solved = with_expression_evidence(solved, eigenheads)
     if detail.level == "span":
         wider = basis_of(model, eigenheads, kernel=True)
-        return Staged(HeadFit(with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail, cranium))
+        return Staged(HeadFit(with_span_misfit(solved, wider, relief_mm=relief_mm), model, detail, cranium, doubtful))
     if detail.level == "kernel":
         relief_mm *= RELIEF_OF_OUTLINES
     fit = with_estimated_prior(model, finish(solved), eigenheads, relief_mm=relief_mm)
-    return Staged(HeadFit(fit, model, detail, cranium))
+    return Staged(HeadFit(fit, model, detail, cranium, doubtful))

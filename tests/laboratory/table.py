@@ -50,6 +50,9 @@ EXPERIMENTS = {
         {"captures": inputs.requested_captures, "realism": inputs.realism},
     ),
     "capped": Record("experiments.surface.capped:capped", "Measures the cranium under a swim or wig cap."),
+    "skulls": Record(
+        "experiments.surface.capped:skulls", "Counts heads called bald, and measures craniums under hair."
+    ),
     "expressions": Record("experiments.people.expressions:expressions", "Measures heads with an expression."),
     "people": Record(
         "experiments.people.people:people",

@@ -16,6 +16,7 @@ TEMPLATES = {
     "texture-sets-unused": "the texture sets {sets} colour nothing: the head has no texture",
     "no-pores": "there are no maps of the pores: they need a texture, and the pictures' files",
     "view-unused": "{remark}; the view is left out",
+    "expression-doubtful": "the expression is doubtful: {expressions} contradict each other or reach their limit, and are left out; look at the mouth, and add cameras at the sides",
     "eyes-closed": "{eyes} closed: no white and no iris in the photographs, or lids that meet",
     "both-eyes-are": "both eyes are",
     "one-eye-is": "the {side:word} eye is",

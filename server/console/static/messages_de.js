@@ -386,6 +386,7 @@ export default {
   "old-setting": "{setting}: Die Zahlen stehen seit 0.4.0 fest, und die in den Einstellungen wurden übergangen; dort entfernen",
   "setting-renamed": "{setting} wird bis 0.5.0 als {new} gelesen; an seiner Stelle {new} schreiben",
   "view-unused": "{remark}; die Ansicht wird weggelassen",
+  "expression-doubtful": "der Ausdruck ist zweifelhaft: {expressions} widersprechen einander oder sind an ihrer Grenze, und sind weggelassen; den Mund ansehen, und Kameras an den Seiten aufstellen",
   "eyes-closed": "{eyes} geschlossen: kein Weiß und keine Iris in den Fotos, oder Lider, die sich berühren",
   "both-eyes-are": "beide Augen sind",
   "one-eye-is": "das Auge ({side:word}) ist",

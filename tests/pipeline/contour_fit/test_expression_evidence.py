@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.contour_fit.expression_evidence import doubtful_weights
 from pipeline.evidence.expression import Found
-from pipeline.head_model.model import HeadModel, load_model
+from pipeline.head_model.model import HeadModel, load_model, with_expressions, with_modes
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
 from pipeline.stages.context import ReconstructionContext
@@ -27,6 +28,23 @@ def found_in(model: HeadModel, weights: dict[str, float], renderer: Renderer) ->
     shot = simulate(subject, default_layout(), PRESET, rng, renderer=renderer)
     settings = replace(Settings(), detail="photo", outputs=OutputSettings(surface="head"))
     return reconstruct(ReconstructionContext(shot.capture, shot.rig, model, settings, renderer)).evidence.expression
+
+
+@pytest.mark.parametrize(
+    ("weights", "doubtful"),
+    [
+        ({"mouthPucker": 0.6, "mouth-retraction": 0.7, "mouthSmileLeft": 0.5}, {"mouthPucker", "mouth-retraction"}),
+        ({"mouthPucker": 0.6, "mouth-retraction": 0.2}, set()),
+        ({}, set()),
+        ({"jawOpen": 1.0, "eyeBlinkLeft": 1.0, "eyeWideLeft": 0.5}, {"jawOpen"}),  # lids are placed by other evidence
+        ({"mouthSmileLeft": 0.9, "mouthSmileRight": 0.9, "browInnerUp": 0.6}, set()),
+    ],
+)
+def test_opposites_and_weights_at_their_limit_are_doubtful(weights: dict[str, float], doubtful: set[str]) -> None:
+    model = with_expressions(with_modes(load_model(), 2))
+    names = model.expressions.names
+    coefficients = np.array([3.0, -3.0, *(weights.get(name, 0.0) for name in names)])
+    assert {names[row] for row in doubtful_weights(model, coefficients)} == doubtful
 
 
 @pytest.mark.slow

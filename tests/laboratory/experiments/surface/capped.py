@@ -6,9 +6,10 @@ Distances are from the true scalp under the cap to the delivered head; the girth
 takes it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float
 from pipeline.applications.clinic.anatomical_frame import frankfurt_axes
 from pipeline.applications.clinic.fitting import UprightHead, head_circumference
 from pipeline.applications.verification.measured import Measured
-from pipeline.contour_fit import bare_outline, cap_outline
+from pipeline.contour_fit import bare_outline, cap_outline, noise_model
 from pipeline.detail import cap_points
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel
@@ -33,15 +34,16 @@ from rig.mesh import Mesh
 from rig.progress import discard_progress
 from rig.render.renderer import Renderer
 from rig.studio.scene.anatomy import anatomy
+from rig.studio.scene.hairstyles import restyled
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.simulate import SimulatedCapture, simulate
-from rig.studio.scene.subject import Subject, random_look
+from rig.studio.scene.subject import Look, Subject, random_look
 from rig.studio.scene.tight_cap import TightCap, above_edge_mm
 from rig.studio.sensor.preset import PRESET
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.detail import IN_SPAN_MODES, IN_SPAN_SPREAD
 from tests.laboratory.experiments.paper.span import weighted_quantile
-from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of
+from tests.laboratory.experiments.records import Bench, Outcome, Row, key_of, means_by
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,7 @@ CAPS = (
     _cap("#3f8f4a", "green", 1.5, folds_mm=2.0),
 )
 SEED = 11
+STYLES = ("bald", "short", "over-ears", "long", "curly")
 
 
 def capped(
@@ -96,14 +99,9 @@ def _row(
     model: HeadModel, population: HeadModel, modes: int, spread: float, number: int, worn: Worn, *, renderer: Renderer
 ) -> Row:
     """Returns one head's figures: ``{without|with: {quantity: value}}``."""
-    rng = np.random.default_rng((SEED, number))
-    level = population.levels["full"]
-    head = Mesh(population.vertices(spread * rng.standard_normal(modes)), level.faces)
-    marks = {name: head.vertices[row] for name, row in population.landmarks.items()}
-    look = replace(random_look(rng), hair=None, tight_cap=worn.cap)
-    subject = Subject(head, marks, level.face_region, f"head-{number}")
-    shot = simulate(subject, default_layout(), PRESET, rng, renderer=renderer, look=look)
-    scalp = above_edge_mm(head.vertices, anatomy(head.vertices, marks)) > 0.0
+    shot, scalp = photograph_scalp(
+        population, modes, spread, number, lambda look: replace(look, hair=None, tight_cap=worn.cap), renderer
+    )
     silhouettes = segment(shot.capture, shot.rig, report=discard_progress)
     ways = {"without": CapSettings(), "with": CapSettings(worn.stated, worn.cap.thickness_mm)}
     ears = head_regions(population)["ears"]
@@ -124,6 +122,52 @@ def _row(
             "girth_error_mm": girth - _true_girth(shot, ears),
         }
     return found
+
+
+def photograph_scalp(
+    population: HeadModel, modes: int, spread: float, number: int, dress: Callable[[Look], Look], renderer: Renderer
+) -> tuple[SimulatedCapture, Bool[np.ndarray, " v"]]:
+    """Photographs head ``number`` of a population with a look that ``dress`` changes. Returns which of its vertices
+    are scalp, where a cap sits, too."""
+    rng = np.random.default_rng((SEED, number))
+    level = population.levels["full"]
+    head = Mesh(population.vertices(spread * rng.standard_normal(modes)), level.faces)
+    marks = {name: head.vertices[row] for name, row in population.landmarks.items()}
+    subject = Subject(head, marks, level.face_region, f"head-{number}")
+    shot = simulate(subject, default_layout(), PRESET, rng, renderer=renderer, look=dress(random_look(rng)))
+    return shot, above_edge_mm(head.vertices, anatomy(head.vertices, marks)) > 0.0
+
+
+def skulls(
+    model: HeadModel, *, renderer: Renderer, bench: Bench, others: HeadModel | None = None, subjects: int = 10
+) -> Outcome:
+    """Counts which of ``subjects`` heads with each of ``STYLES`` are called bald, and measures the cranium of all, seen
+    or under hair. Heads come from the model's span and from ``others`` in turn. Figures are means over each style,
+    ``<style>_called_bald`` and ``<style>_within_2_mm`` shares of heads."""
+    records, rows = bench.records("skulls", key_of(model.sha256, Settings(), bare_outline, noise_model)), list[Row]()
+    populations = [(model, IN_SPAN_MODES, IN_SPAN_SPREAD)]
+    if others is not None:
+        populations.append((others, len(others.modes), 1.0))
+    for number, style in product(range(subjects), STYLES):
+        bench.report(style, number / subjects)
+        drawn, name = populations[number % len(populations)], f"{style}-{number:02}"
+        made = partial(_skull, model, *drawn, number, style, renderer=renderer)
+        rows.append({"name": name, "style": style, **records.row(name, made)})
+    header = ("called_bald", "within_2_mm", "cranium_mm", "cranium_90_mm", "stated_mm", "within_95")
+    text = markdown.table(("head", *header), [[row["name"], *(row[key] for key in header)] for row in rows])
+    return {"figures": means_by(rows, "style"), "rows": rows, "markdown": text}
+
+
+def _skull(
+    model: HeadModel, population: HeadModel, modes: int, spread: float, number: int, style: str, *, renderer: Renderer
+) -> Row:
+    """Returns the figures of one head's cranium, and whether it is called bald."""
+    shot, scalp = photograph_scalp(population, modes, spread, number, lambda look: restyled(look, [style]), renderer)
+    settings = Settings(detail="photo", outputs=OutputSettings(surface="head"))
+    done = reconstruct(ReconstructionContext(shot.capture, shot.rig, model, settings, renderer))
+    found = cranium_figures(shot, scalp, done.mesh_world, done.refined.deviation_mm)
+    bald = float(done.head.cranium == "bald")
+    return found | {"called_bald": bald, "within_2_mm": float(found["cranium_mm"] < 2.0)}
 
 
 def cranium_figures(
