@@ -22,6 +22,8 @@ def crossing_faces(
     faces = faces.astype(np.int32)  # a copy: a model's own are read-only, which is another type
     if active is None:
         return _crossing_by_size(vertices, faces)
+    if not active.any():
+        return np.zeros(len(faces), bool)
     boxes, crossing = triangle_boxes(vertices, faces), np.zeros(len(faces), bool)
     near = np.flatnonzero(_near(boxes, active))
     crossing[near] = _crossing(vertices, faces[near], boxes[near], active[near])

@@ -48,9 +48,22 @@ class Cut:
 
         shape = self.box.shape
         beyond, base = (doubled(each.astype(np.float32).reshape(shape)) for each in (self.beyond_mm, self.base))
-        core = np.asarray(distance_transform_edt(field < 0.0)) > THIN_MM / box.step_mm
+        core = eroded(field < 0.0, THIN_MM / box.step_mm)
         thin = gaussian_filter(box.step_mm * np.asarray(distance_transform_edt(~core)), 1.0) - THIN_MM - SPARED_MM
         return Cut(box, np.where(base > 0.5, np.maximum(beyond, thin), beyond).ravel(), base.ravel() > 0.5)
+
+
+def eroded(solid: Bool[np.ndarray, "nx ny nz"], radius: float) -> Bool[np.ndarray, "nx ny nz"]:
+    """Returns the nodes that have none outside the solid within ``radius`` (in steps). The box's own end is no
+    outside."""
+    out, reach = solid.copy(), int(radius)
+    for steps in np.ndindex((2 * reach + 1,) * 3):
+        step = np.array(steps) - reach
+        if 0 < step @ step <= radius**2:
+            here = tuple(slice(max(-n, 0), size - max(n, 0)) for n, size in zip(step, solid.shape, strict=True))
+            there = tuple(slice(max(n, 0), size - max(-n, 0)) for n, size in zip(step, solid.shape, strict=True))
+            out[here] &= solid[there]
+    return out
 
 
 @traced

@@ -170,7 +170,8 @@ def finished(
     if surface.shell_deviation_mm is None:
         mesh, moved_mm = grown_to_outlines(mesh, strands, silhouettes, rig)
     topology = topology_of(mesh.faces, len(seen))
-    clean = without_coincidences(Mesh(smooth_spots(mesh.vertices, topology, surface.safe_world), mesh.faces))
+    smooth = smooth_spots(mesh.vertices, topology, surface.safe_world)  # no triangles cross
+    clean = without_coincidences(Mesh(smooth, mesh.faces))
     mended_mm = np.linalg.norm(clean.vertices - mesh.vertices, axis=1)
     mesh = clean
     part = np.where(seen, shown, Part.UNSEEN).astype(np.uint8)
@@ -179,7 +180,8 @@ def finished(
         guessed = ~seen & facing_a_camera(mesh, rig)
         deviation[guessed] = np.minimum(deviation[guessed], surface.shell_deviation_mm)
     deviation[surface.capped] = MAX_MM
-    faults = mesh_faults(mesh.vertices.astype(np.float32).astype(float), topology)
+    moved = (mesh.vertices != smooth).any(axis=1)
+    faults = mesh_faults(mesh.vertices.astype(np.float32).astype(float), topology, moved)
     return BustSurface(mesh, deviation, part, measured.views, surface.warnings, faults)
 
 

@@ -68,13 +68,11 @@ def marked_box(grid: Grid, chosen: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, "
 
 def at_points(box: Grid, values: Float[np.ndarray, " n"], points: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
     """Returns the values of a whole box's nodes, interpolated linearly at points."""
-    at = np.clip((points - box.corner) / box.step_mm, 0.0, np.array(box.shape) - 1.001)
-    low = at.astype(int)
-    share, total, volume = at - low, np.zeros(len(points)), values.reshape(box.shape)
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, share, 1.0 - share).prod(axis=1)
-        total += weight * volume[tuple((low + corner).T)]
-    return total
+    from scipy.ndimage import map_coordinates  # 0.3 s, and only a bust needs it
+
+    at = ((points - box.corner) / box.step_mm).T
+    return map_coordinates(values.reshape(box.shape), at, output=np.float64, order=1, mode="nearest")
+
 
 
 def _linked(

@@ -135,14 +135,19 @@ def smooth_offsets(
 def blurred_over_mesh(values: np.ndarray, starts: np.ndarray, indices: np.ndarray, steps: int) -> np.ndarray:
     """Returns values (n, k) at vertices after ``steps`` in each of which a vertex takes the mean of its own and its
     neighbours' mean. The neighbours of vertex v are ``indices[starts[v]:starts[v + 1]]``."""
-    one, other = values.copy(), np.empty_like(values)
+    one, other, last = values.copy(), np.empty_like(values), values.shape[1] - 1
     for _ in range(steps):
         for v in range(len(values)):
-            count = max(starts[v + 1] - starts[v], 1)
-            for c in range(values.shape[1]):
-                total = 0.0
-                for k in range(starts[v], starts[v + 1]):
-                    total += one[indices[k], c]
-                other[v, c] = 0.5 * (one[v, c] + total / count)
+            first, end = np.uint32(starts[v]), np.uint32(starts[v + 1])
+            share = 0.5 / max(end - first, 1)
+            for c in range(0, last + 1, 2):  # two columns at a time; an odd last one twice
+                d = min(c + 1, last)
+                total, beside = 0.0, 0.0
+                for k in range(first, end):
+                    at = np.uint32(indices[k])
+                    total += one[at, c]
+                    beside += one[at, d]
+                other[v, c] = 0.5 * one[v, c] + share * total
+                other[v, d] = 0.5 * one[v, d] + share * beside
         one, other = other, one
     return one

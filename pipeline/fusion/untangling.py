@@ -200,10 +200,14 @@ def turned_faces(
     return turned if active is None else turned & _around(active, faces, count)
 
 
-def mesh_faults(vertices: Float[np.ndarray, "v 3"], topology: Topology) -> MeshFaults:
-    """Counts what is wrong with a mesh. Nothing that the model's own mean head has is excepted."""
+def mesh_faults(
+    vertices: Float[np.ndarray, "v 3"], topology: Topology, moved: Bool[np.ndarray, " v"] | None = None
+) -> MeshFaults:
+    """Counts what is wrong with a mesh. Nothing that the model's own mean head has is excepted. If ``moved`` is not
+    None, no triangles crossed before those vertices moved, and only theirs are tested for it."""
+    active = None if moved is None else _any_corner(moved, topology.faces)
     turned, folded = _turned_and_folded(vertices, topology, np.ones(len(topology.faces), bool))
-    return MeshFaults(int(turned.sum()), len(folded), int(crossing_faces(vertices, topology.faces).sum()))
+    return MeshFaults(int(turned.sum()), len(folded), int(crossing_faces(vertices, topology.faces, active).sum()))
 
 
 def _turned_and_folded(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import Delaunay, KDTree
 
+from pipeline.compute.array_cache import cached_arrays
 from pipeline.head_model.model import HeadModel
 
 REGIONS = ("face", "eyes", "nose", "mouth", "ears", "neck", "cranium")
@@ -59,6 +60,11 @@ def pinnae(model: HeadModel) -> Bool[np.ndarray, " v"]:
     """Returns which vertices of the full level belong to what stands off the head at the ears, seen from the side: the
     region ``ears`` has the scalp about it, too."""
     vertices, ears = model.vertices(np.zeros(0)), head_regions(model)["ears"]
+    inputs = (vertices, ears, PINNA_OFF_MM, PINNA_REACH_MM)
+    return cached_arrays("pinnae", inputs, lambda: {"pinnae": _standing(vertices, ears)}, made_by=())["pinnae"]
+
+
+def _standing(vertices: Float[np.ndarray, "v 3"], ears: Bool[np.ndarray, " v"]) -> Bool[np.ndarray, " v"]:
     found = np.zeros(len(vertices), bool)
     for side in (-1.0, 1.0):
         rows = np.flatnonzero(ears & (side * vertices[:, 0] > 0.0))

@@ -201,9 +201,17 @@ def _lowered(
     np.nan_to_num(shown, copy=False)
     pixel_mm = float(np.median(sight.depths)) / camera.intrinsics.fx
     smooth = cv2.GaussianBlur(shown, (0, 0), SPREAD_MM / pixel_mm)
-    about = cv2.GaussianBlur(shown[:, :, 1:], (0, 0), LOBE_MM / pixel_mm)
+    about = _blurred_widely(np.ascontiguousarray(shown[:, :, 1:]), LOBE_MM / pixel_mm)
     levels = smooth[:, :, 0] / np.maximum(smooth[:, :, 2], MIN_COVERAGE)
     levels *= np.minimum(LOBE_FACTOR * about[:, :, 0] / np.maximum(about[:, :, 1], MIN_COVERAGE), 1.0)
     out = image.copy()
     out[sight.box] = np.clip(np.rint(image[sight.box] - levels[:, :, None]), 0.0, 255.0)
     return out
+
+
+def _blurred_widely(values: Float32[np.ndarray, "h w c"], sigma: float) -> Float32[np.ndarray, "h w c"]:
+    """Returns a Gaussian blur of ``sigma`` pixels, computed on pixels of a quarter of that."""
+    height, width = values.shape[:2]
+    scale = max(int(sigma / 4.0), 1)
+    small = cv2.resize(values, (max(width // scale, 1), max(height // scale, 1)), interpolation=cv2.INTER_AREA)
+    return cv2.resize(cv2.GaussianBlur(small, (0, 0), sigma / scale), (width, height), interpolation=cv2.INTER_LINEAR)

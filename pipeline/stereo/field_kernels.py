@@ -42,38 +42,48 @@ def fit_planes(depth, slopes, information, radius, tolerance_mm, steepest, depth
     ``steepest``), and ``relief_mm``, the RMS deviation of the depths from the plane. Empty pixels stay empty.
     """
     height, width = depth.shape
-    falloff = 1.0 / (tolerance_mm * tolerance_mm)
-    near = 1.0 / (radius * radius)
+    zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(1e-9)
+    falloff, near = np.float32(1.0 / (tolerance_mm * tolerance_mm)), np.float32(1.0 / (radius * radius))
+    # Eight neighbours at once: neither borders nor empty pixels branch, since what is beside them weighs nothing.
+    side, stride = 2 * radius + 1, width + 2 * radius
+    places, weights = np.zeros((2, (height + 2 * radius) * stride), np.float32)
     for row in range(height):
         for column in range(width):
-            depth_out[row, column] = depth[row, column]
-            slopes_out[row, column, 0] = slopes[row, column, 0]
-            slopes_out[row, column, 1] = slopes[row, column, 1]
-            relief_mm[row, column] = 0.0
-            here = depth[row, column]
-            if here <= 0.0:
+            if depth[row, column] > zero:
+                at = (row + radius) * stride + radius + column
+                places[at], weights[at] = depth[row, column], information[row, column]
+    steps, (across, down, apart_px) = np.empty(side * side, np.int32), np.empty((3, side * side), np.float32)
+    for k in range(side * side):
+        j, i = k // side - radius, k % side - radius
+        steps[k], across[k], down[k], apart_px[k] = j * stride + i, i, j, one + np.float32(i * i + j * j) * near
+    for row in range(height):
+        for column in range(width):
+            here, z_x, z_y = depth[row, column], slopes[row, column, 0], slopes[row, column, 1]
+            depth_out[row, column] = here
+            slopes_out[row, column, 0] = z_x
+            slopes_out[row, column, 1] = z_y
+            relief_mm[row, column] = zero
+            if here <= zero:
                 continue
-            s, s_x, s_y, s_xx, s_xy, s_yy = 1e-9, 0.0, 0.0, 1e-9, 0.0, 1e-9
-            s_z, s_xz, s_yz, s_zz = 0.0, 0.0, 0.0, 0.0
-            for j in range(max(-radius, -row), min(radius + 1, height - row)):
-                for i in range(max(-radius, -column), min(radius + 1, width - column)):
-                    there = depth[row + j, column + i]
-                    if there <= 0.0:
-                        continue
-                    z = there - here
-                    off = z - i * slopes[row, column, 0] - j * slopes[row, column, 1]
-                    apart = 1.0 + off * off * falloff
-                    w = information[row + j, column + i] / (apart * apart * (1.0 + (i * i + j * j) * near))
-                    s += w
-                    s_x += w * i
-                    s_y += w * j
-                    s_xx += w * i * i
-                    s_xy += w * i * j
-                    s_yy += w * j * j
-                    s_z += w * z
-                    s_xz += w * i * z
-                    s_yz += w * j * z
-                    s_zz += w * z * z
+            middle = np.int32((row + radius) * stride + radius + column)
+            s, s_x, s_y, s_xx, s_xy, s_yy = tiny, zero, zero, tiny, zero, tiny
+            s_z, s_xz, s_yz, s_zz = zero, zero, zero, zero
+            for k in range(side * side):
+                at = np.uint64(np.uint32(middle + steps[k]))
+                x, y, z = across[k], down[k], places[at] - here
+                off = z - x * z_x - y * z_y
+                apart = one + off * off * falloff
+                w = weights[at] / (apart * apart * apart_px[k])
+                s += w
+                s_x += w * x
+                s_y += w * y
+                s_xx += w * x * x
+                s_xy += w * x * y
+                s_yy += w * y * y
+                s_z += w * z
+                s_xz += w * x * z
+                s_yz += w * y * z
+                s_zz += w * z * z
             x, y, z = s_x / s, s_y / s, s_z / s
             xx, xy, yy = s_xx / s - x * x, s_xy / s - x * y, s_yy / s - y * y
             xz, yz = s_xz / s - x * z, s_yz / s - y * z
