@@ -43,7 +43,7 @@ def test_found_faces_lie_over_the_pictures(
     browser: Browser, service: RunningService, screenshots: Path, tmp_path: Path
 ) -> None:
     capture = uploaded(service, tmp_path, "beard-smile")
-    assert capture["warnings"] == []
+    assert not any(warning["code"].startswith("face-") for warning in capture["warnings"])
     v = visit(browser, service.url)
     page = v.go(f"/captures?capture={capture['id']}")
     expect(page.locator(".thumb img").first).to_be_visible(timeout=SLOW_MS)
@@ -76,7 +76,7 @@ def test_the_verdict_says_who_lacks_the_face(
     v = visit(browser, service.url)
     page = v.go(f"/captures?capture={capture['id']}")
     expect(page.locator("[data-warning=face-missing]")).to_contain_text(f"no face in {HIDDEN}", timeout=SLOW_MS)
-    expect(page.locator("[data-warning]")).to_have_count(1)
+    expect(page.locator("[data-warning^=face-]")).to_have_count(1)
     keep_screenshots(page, screenshots, "captures-face-missing")
     page.locator("button.language").click()  # in German
     expect(page.locator("[data-warning=face-missing]")).to_contain_text(
