@@ -74,7 +74,6 @@ def at_points(box: Grid, values: Float[np.ndarray, " n"], points: Float[np.ndarr
     return map_coordinates(values.reshape(box.shape), at, output=np.float64, order=1, mode="nearest")
 
 
-
 def _linked(
     corner: Float[np.ndarray, " 3"], step_mm: float, shape: tuple[int, int, int], index: Int32[np.ndarray, "n 3"]
 ) -> Grid:
