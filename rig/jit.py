@@ -12,8 +12,8 @@ runs on the next: in a container, from a wheel, out of a CI's cache. Code for th
 with AVX-512 a job took as many processor seconds.
 
 Numba has no public interface for that. What is used of its inside: ``Dispatcher._cache`` (an object with
-``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``, a library's
-``_get_module_for_linking``, its engine's ``_defined_symbols``, the option ``_nrt``.
+``load_overload`` and ``save_overload``), ``CompileResult._reduce`` and ``_rebuild``, ``serialize.dumps``, the option
+``_nrt``.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ import logging
 import pickle
 import sys
 from collections.abc import Callable, Iterator
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
@@ -40,7 +40,6 @@ from rig.cache_folder import cache_folder
 
 CARRIED = Path(__file__).with_name("compiled_loops")  # beside the code, where a wheel was built with them
 DIGEST_BYTES = 32
-FORMAT = 2  # of a file, behind the digest: names of what is defined, then what Numba needs to build it again
 PORTABLE_CPU = "x86-64-v3"
 PORTABLE_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")  # what that level adds
 # Eight pixels are fetched by one instruction where LLVM would otherwise leave the loop unvectorised: the dense stage's
@@ -105,7 +104,7 @@ class KeptFunction:
         """Returns the path of the file for the function compiled for these argument types, whether it exists or not."""
         if not self._digest:  # late: a function may call one that its module defines further down
             self._digest = function_digest(self._dispatcher)
-        key = f"{FORMAT} {self._digest} {signature!r} {machine()}"
+        key = f"{self._digest} {signature!r} {machine()}"
         function = self._dispatcher.py_func
         name = f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
         return Path(self.cache_path) / f"{name}-{hashlib.sha256(key.encode()).hexdigest()}"
@@ -119,8 +118,7 @@ class KeptFunction:
             return False
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Returns the compiled function from its file, or None if there is none or it is damaged. What only a compiler
-        needs, the code as LLVM reads it, is left until one asks."""
+        """Returns the compiled function from its file, or None if there is none or it is damaged."""
         target_context.refresh()
         file = self.file(signature)
         for path in (CARRIED / file.name, file):
@@ -129,21 +127,14 @@ class KeptFunction:
             except OSError:
                 continue
             if hashlib.sha256(data[DIGEST_BYTES:]).digest() == data[:DIGEST_BYTES]:
-                symbols, (name, kind, (machine_code, bitcode)), *others = pickle.loads(data[DIGEST_BYTES:])
-                target_context.codegen()._engine._defined_symbols.update(symbols)
-                result = CompileResult._rebuild(target_context, (name, kind, (machine_code, _no_bitcode())), *others)
-                result.library._get_module_for_linking = cache(partial(llvmlite.binding.parse_bitcode, bitcode))
-                return result
+                return CompileResult._rebuild(target_context, *pickle.loads(data[DIGEST_BYTES:]))
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Writes a compiled function to its file. If that fails, logs it once for each process and goes on."""
         if any(not lifted.can_cache for lifted in result.lifted) or result.library.has_dynamic_globals:
             return
-        module = result.library._get_module_for_linking()
-        defined = (each for kind in (module.functions, module.global_variables) for each in kind)
-        symbols = sorted(each.name for each in defined if not each.is_declaration)
-        data = serialize.dumps((symbols, *result._reduce()))
+        data = serialize.dumps(result._reduce())
         try:
             write_atomically(self.file(signature), hashlib.sha256(data).digest() + data)
         except OSError as error:
@@ -152,11 +143,6 @@ class KeptFunction:
     def flush(self) -> None:
         """Does nothing; Numba requires it. Files of older code are never found, since their names contain a digest of
         the code."""
-
-
-@cache
-def _no_bitcode() -> bytes:
-    return llvmlite.binding.parse_assembly("").as_bitcode()
 
 
 @cache

@@ -27,9 +27,6 @@ USES = {
     ("rig/jit.py", "dispatcher._cache"),  # used in tests/rig/test_jit.py
     ("rig/jit.py", "result._reduce"),
     ("rig/jit.py", "CompileResult._rebuild"),
-    ("rig/jit.py", "result.library._get_module_for_linking"),
-    ("rig/jit.py", "target_context.codegen()._engine"),
-    ("rig/jit.py", "target_context.codegen()._engine._defined_symbols"),
     ("server/services/failures.py", "dbos._serialization: _serialization"),  # tests/server/services/test_failures.py
 }
 
