@@ -112,7 +112,9 @@ fi
 # Once, not at every start and in the first job. uv installs sources alone, and where PYTHONDONTWRITEBYTECODE is set each
 # start would translate them again: 1.1 of the 1.4 s in which Numba is imported.
 say "compiling what a start loads, once for this machine"
-env -u PYTHONDONTWRITEBYTECODE .venv/bin/python -c 'from server.cli import demo; from server.http import serve; from server.worker import worker' ||
+env -u PYTHONDONTWRITEBYTECODE .venv/bin/python -m compileall -q rig pipeline calibration server || true
+env -u PYTHONDONTWRITEBYTECODE .venv/bin/python -c 'from server.cli import demo, reconstruct_local; from server.http import serve; from server.worker import worker
+from scipy import linalg, ndimage, optimize, signal, sparse, spatial, special; import scipy.sparse.linalg, scipy.sparse.csgraph' ||
   say "the service's modules cannot be imported; \`eigenhead doctor\` may say why"
 if [ -n "$quick" ]; then
   echo "$wanted" >.venv/.ready-quick
