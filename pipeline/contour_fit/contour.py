@@ -60,25 +60,6 @@ class ContourSolution:
     misfit_mm: Float[np.ndarray, " v0"] | None = None  # of ``Fit``
 
 
-def fit_contour(
-    model: HeadModel,
-    world_from_head: Similarity,
-    silhouettes: Mapping[str, Silhouette],
-    rig: Rig,
-    settings: FittingSettings,
-    *,
-    features: Mapping[str, Mapping[str, np.ndarray]] | None = None,
-    report: Progress = lambda stage, fraction: None,
-) -> Fit:
-    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes, from a start
-    pose.
-
-    ``features`` are feature points in pixels, by camera and landmark name. All modes of ``model`` are fitted: the first
-    ``settings.modes`` first, and the rest once those have converged. Raises ValueError if no silhouette is usable.
-    """
-    return finish(solve_contour(model, world_from_head, silhouettes, rig, settings, features=features, report=report))
-
-
 @traced
 def solve_contour(
     model: HeadModel,
@@ -91,8 +72,9 @@ def solve_contour(
     landmarks: LandmarkObservations | None = None,
     report: Progress = lambda stage, fraction: None,
 ) -> ContourSolution:
-    """Solves the problem of ``fit_contour`` and returns its solution without the covariance, which takes longer.
-    ``landmarks`` are triangulated landmarks of the face, if there are any."""
+    """Fits the head's shape and pose, and small corrections of the cameras, to the usable silhouettes, from a start
+    pose: the first ``settings.modes`` modes first, the rest once those have converged. ``features`` are pixels by camera
+    and landmark, ``landmarks`` the face's. ``finish`` adds the covariance, which takes longer."""
     problem = make_problem(model, world_from_head, silhouettes, rig, settings, features or {}, landmarks=landmarks)
     few, span, whole, *rest = schedule(settings, len(model.modes))
     evidence, state = first_evidence(settings), start_state(problem, world_from_head)

@@ -7,6 +7,7 @@ become stiff, and the expression has to explain the smile. Expression weights ke
 images are not read again: the problem is the quadratic one of the last stage, and the surface hardly moves.
 """
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,6 @@ from pipeline.contour_fit.head_problem import apply_step, weight_bounds
 from pipeline.contour_fit.prior_term import weight_slope
 from pipeline.estimation.bounded import least_within
 from pipeline.estimation.positive_definite import inverse_diagonal
-from pipeline.head_model.expressions import is_of_eye
 from pipeline.head_model.model import HeadModel
 
 ROUNDS = 6
@@ -26,6 +26,7 @@ VARIANCE_RANGE = (0.02, 4.0)
 STRONG = 0.3  # weight above which two opposites contradict each other
 OPPOSITE = -0.5  # cosine of two displacements below which they cancel: a pucker and a retraction have -0.8
 BOUND = 0.99  # weight that would be larger if it could
+LIDS = re.compile("eye(?!brow)")  # names of expressions that move lids or gaze
 
 
 def with_expression_evidence(solved: ContourSolution, eigenheads: int) -> ContourSolution:
@@ -79,7 +80,7 @@ def doubtful_weights(model: HeadModel, coefficients: Float[np.ndarray, " m"]) ->
     shapes = model.expressions.shapes.reshape(len(weights), -1)[strong].astype(float)
     alike = shapes @ shapes.T / np.maximum(np.outer(*2 * (np.linalg.norm(shapes, axis=1),)), 1e-9)
     found.append(strong[(alike < OPPOSITE).any(axis=1)])
-    return frozenset(int(row) for row in np.concatenate(found) if not is_of_eye(model.expressions.names[row]))
+    return frozenset(int(row) for row in np.concatenate(found) if not LIDS.match(model.expressions.names[row]))
 
 
 def _variance(

@@ -83,7 +83,6 @@ def with_read_expression(
     observed: Bool[np.ndarray, " v"],
     *,
     eigenheads: int,
-    held: frozenset[int] = frozenset(),
 ) -> Fit:
     """Returns the fit with expression weights, and their deviations, estimated anew from the deformed head. Returns the
     fit unchanged if the model has no expressions, or if the population does not explain the head.
@@ -95,7 +94,6 @@ def with_read_expression(
         vertices_world: the deformed head, full level, mm.
         observed: which of its vertices a point of skin shows.
         eigenheads: how many of the fit's modes are eigenheads.
-        held: expressions, by their place among the model's, whose weights stay 0.
     """
     if not len(model.posed):
         return fit
@@ -109,7 +107,7 @@ def with_read_expression(
     for k in range(ROUNDS):
         off = ((here - place) * normal).sum(axis=1)
         information = there * trust / (1.0 + (off / ROBUST_MM) ** 2) ** 2
-        weights, deviation, here, strays = _solved(basis, place, normal, information, len(weights), held)
+        weights, deviation, here, strays = _solved(basis, place, normal, information, len(weights))
         if strays > STRAYS:
             return fit
         if k < ROUNDS - 1:
@@ -128,7 +126,6 @@ def _solved(
     normal: Float[np.ndarray, "n 3"],
     information: Float[np.ndarray, " n"],
     expressions: int,
-    held: frozenset[int],
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"], Float[np.ndarray, "n 3"], float]:
     """Estimates the expression weights. Returns the weights, their deviations, the modelled places under them (head
     frame, mm) and the variance of the kernel's modes (MacKay 1992, as in ``posterior``)."""
@@ -148,7 +145,6 @@ def _solved(
     matrix[diagonal[count:], diagonal[count:]] += POSE_INFORMATION
     least, most = np.full(len(matrix), -np.inf), np.full(len(matrix), np.inf)
     least[weights], most[weights] = 0.0, 1.0
-    most[[first + row for row in held]] = 0.0
     found, now, variance = np.zeros(len(matrix)), np.full(expressions, FIRST), 1.0 if len(smooth) else 0.0
     covariance = matrix
     for k in range(REWEIGHTED):
@@ -157,10 +153,10 @@ def _solved(
         found = least_within(matrix, slope, least, most)
         now = np.maximum(found[weights], 0.0)
         if k < EVIDENCE or k == REWEIGHTED - 1:
-            stiff = matrix.copy()
+            held = matrix.copy()
             bound = diagonal[first:count][now <= 0.0]
-            stiff[bound, bound] += HELD  # what stays at its bound explains nothing of the others
-            covariance = np.linalg.inv(stiff)
+            held[bound, bound] += HELD  # what stays at its bound explains nothing of the others
+            covariance = np.linalg.inv(held)
         if k < EVIDENCE and len(smooth):
             determined = np.clip(1.0 - np.diag(covariance)[smooth] / variance, 0.0, 1.0).sum()
             new = float(np.clip((found[smooth] ** 2).sum() / max(float(determined), 1e-9), *VARIANCE_RANGE))

@@ -30,8 +30,6 @@ MAX_UNSEEN = 0.12  # share of the face's vertices: 0.14 to 0.24 where three or f
 # most with a camera in front and one at each side, 0.01 before eleven
 MAX_OUTSIDE_PX_PER_WIDTH = 0.003  # 3 px of 1024; at most 0.6 in 66 cameras of six good captures
 OUTSIDE_TIMES_MEDIAN = 6.0  # and this many times what the other cameras have
-
-
 UNEXPLAINED_SHARE = 0.9  # median over the views of the rim that the fit did not believe: 0.15 to 0.45 of nine captures
 # with hair and beards, and of one whose face is turned by 90 degrees; 1.0 of a head three times too small
 UNEXPLAINED_MM = 5.0  # and median over the views of the rim's RMS distance from its outline: 1 to 4 there, 40 here

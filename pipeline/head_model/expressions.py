@@ -90,11 +90,6 @@ def arkit_parts(names: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
     return found
 
 
-def is_of_eye(name: str) -> bool:
-    """Tells whether an expression moves lids or gaze."""
-    return name.startswith("eye") and not name.startswith("eyebrow")
-
-
 def weights_from_text(texts: Sequence[str], names: tuple[str, ...]) -> dict[str, float]:
     """Reads texts such as ``mouthSmile_L=0.5``, and returns the weights by the model's name of the expression. Apple's
     names are accepted, too. Raises InputError that names every fault."""

@@ -122,16 +122,15 @@ def fit_with_read_face(
     )
     if not makes_face(fit.coefficients, model.posed):
         return with_lids(fit, model, lids), MIN_SIGMA, head.doubtful
-    eigenheads = min(context.settings.fitting.modes, len(context.model.modes))
-
-    def read_without(held: frozenset[int]) -> Fit:
-        seen = displaced.vertices, displaced.observed
-        return with_read_expression(fit, model, context.model, *seen, eigenheads=eigenheads, held=held)
-
-    read = read_without(head.doubtful)
+    read = with_read_expression(
+        fit,
+        model,
+        context.model,
+        displaced.vertices,
+        displaced.observed,
+        eigenheads=min(context.settings.fitting.modes, len(context.model.modes)),
+    )
     doubtful = head.doubtful | doubtful_weights(model, read.coefficients)
-    if doubtful != head.doubtful:
-        read = read_without(doubtful)
     coefficients = read.coefficients.copy()
     coefficients[[model.posed.start + row for row in doubtful]] = 0.0
     least_sigma = MIN_SIGMA if read is fit else READ_SIGMA

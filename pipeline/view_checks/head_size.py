@@ -39,11 +39,7 @@ MIN_VIEWS = 3  # whose crown is in the picture
 MIN_MEETING = 0.5  # of these views: where most do not meet in one head, they measure none
 
 BESIDE_MM = 110.0  # from the middle of the head: what is farther is a hand or a shoulder
-SKULL_MM = (
-    0.0,
-    60.0,
-    -90.0,
-)  # the middle of the skull from that of the face: leftwards, up, ahead; crowns of 8 captures
+SKULL_MM = (0.0, 60.0, -90.0)  # the skull's middle from the face's: leftwards, up, ahead; crowns of 8 captures
 MAX_LOW_MM = 18.0  # below the others; 12 in whole masks of 8 captures, long hair among them
 
 Discs = Mapping[str, tuple[Float[np.ndarray, " 2"], float]]  # by camera: middle and diameter (px)

@@ -216,18 +216,19 @@ def with_picture_faults(
     return found
 
 
+def _turns(image: np.ndarray) -> dict[Message, np.ndarray]:
+    """Returns a picture or a mask turned by 180 degrees and flipped, by what was done to it."""
+    turned = {"turned-half": image[::-1, ::-1], "flip-across": image[:, ::-1], "flip-down": image[::-1]}
+    return {compose(code): np.ascontiguousarray(pixels) for code, pixels in turned.items()}
+
+
 def turned_against_plate(capture: Capture, name: str) -> Message | None:
     """Returns the fault of a picture that shows its clean plate only once it is turned by 180 degrees or flipped."""
     plates = capture.backgrounds.get(name, ())
     if name not in capture.images or not plates:
         return None
     picture, plate = thumbnail(capture.images[name]), thumbnail(plates[0])
-    turns = {
-        compose("turned-half"): picture[::-1, ::-1],
-        compose("flip-across"): picture[:, ::-1],
-        compose("flip-down"): picture[::-1],
-    }
-    shares = {turn: common_share(np.ascontiguousarray(turned), plate) for turn, turned in turns.items()}
+    shares = {turn: common_share(turned, plate) for turn, turned in _turns(picture).items()}
     turn, share = max(shares.items(), key=lambda one: one[1])
     if share < max(MIN_TURNED, TURNED_GAIN * common_share(picture, plate)):
         return None
@@ -242,15 +243,10 @@ def turned_against_others(silhouettes: Mapping[str, Silhouette], name: str, rig:
         return None
 
     def misfit(mask: np.ndarray) -> float:
-        return own_misfit({**others, name: silhouette_from_mask(np.ascontiguousarray(mask))}, rig)[name]
+        return own_misfit({**others, name: silhouette_from_mask(mask)}, rig)[name]
 
     mask = silhouettes[name].mask
-    turns = {
-        compose("turned-half"): mask[::-1, ::-1],
-        compose("flip-across"): mask[:, ::-1],
-        compose("flip-down"): mask[::-1],
-    }
-    misfits = {turn: misfit(turned) for turn, turned in turns.items()}
+    misfits = {turn: misfit(turned) for turn, turned in _turns(mask).items()}
     turn, least = min(misfits.items(), key=lambda one: one[1])
     if not least < FITTING_MISFIT < misfit(mask) or misfit(mask) < MISFIT_GAIN * least:
         return None

@@ -4,16 +4,19 @@ Every error is the mean distance of corresponding face-region vertices in the wo
 experiment says otherwise.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.contour_fit.contour import finish, solve_contour
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.problem import camera_information
 from pipeline.head_model.model import HeadModel
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
+from pipeline.settings import FittingSettings
 from rig.geometry import RigidTransform, Similarity, rotation_from_vector
 from rig.mesh import Mesh
 from rig.render.renderer import Renderer
@@ -172,3 +175,8 @@ def face_rows(
         shape = pose.scale * np.einsum("c,mvc->vm", pose.rotation[axis], basis)
         rows.append(np.concatenate([shape, np.cross(arms, unit), unit, arms[:, [axis]]], axis=1))
     return np.concatenate(rows)
+
+
+def fit_contour(model: HeadModel, start: Similarity, silhouettes: Mapping, rig: Rig, settings: FittingSettings) -> Fit:
+    """Fits all modes of a head to outlines alone."""
+    return finish(solve_contour(model, start, silhouettes, rig, settings))

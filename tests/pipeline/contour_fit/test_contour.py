@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.contour_fit.contour import fit_contour, schedule
+from pipeline.contour_fit.contour import schedule
 from pipeline.contour_fit.head_problem import apply_step, head_problem
 from pipeline.contour_fit.posterior import vertex_deviation_mm
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, State, first_evidence, make_problem, widened
@@ -18,7 +18,14 @@ from rig.geometry import Similarity, rotation_from_vector
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.support.spoilt_captures import OVER_EARS, spoiled
-from tests.support.subjects import binary_silhouettes, exact, mean_error_mm, random_subjects, worn_silhouettes
+from tests.support.subjects import (
+    binary_silhouettes,
+    exact,
+    fit_contour,
+    mean_error_mm,
+    random_subjects,
+    worn_silhouettes,
+)
 
 SETTINGS = FittingSettings()
 

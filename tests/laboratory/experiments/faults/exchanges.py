@@ -15,7 +15,6 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import Silhouette
 from pipeline.multiview import tangency
@@ -33,7 +32,15 @@ from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Records, Row, key_of
-from tests.support.subjects import Planted, binary_silhouettes, mean_error_mm, off_by, random_subjects, worn_silhouettes
+from tests.support.subjects import (
+    Planted,
+    binary_silhouettes,
+    fit_contour,
+    mean_error_mm,
+    off_by,
+    random_subjects,
+    worn_silhouettes,
+)
 
 CALIBRATION_PX = 0.11  # prior of ``off_by``: a head moves by 0.2 px (2D RMS) in each image
 WORST_RATIO = 1.1  # of the fit's error after an exchange to that without

@@ -13,7 +13,6 @@ import numpy as np
 
 from pipeline.alignment import silhouette_search
 from pipeline.alignment.silhouette_search import search_alignment
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.settings import Settings
 from rig.errors import EigenheadError
@@ -23,7 +22,7 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from rig.studio.scene.subject import random_look
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
-from tests.support.subjects import Planted, worn_silhouettes
+from tests.support.subjects import Planted, fit_contour, worn_silhouettes
 
 TURN_DEG, OFF_MM = (30.0, 15.0, 15.0), 60.0  # yaw, pitch, roll; any direction
 RIGHT_DEG, RIGHT_MM = 2.0, 3.0

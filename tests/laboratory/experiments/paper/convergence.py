@@ -8,7 +8,6 @@ off.
 
 import numpy as np
 
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.settings import FittingSettings
 from rig.render.renderer import Renderer
@@ -16,7 +15,7 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
-from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
+from tests.support.subjects import Planted, binary_silhouettes, exact, fit_contour, mean_error_mm, random_subjects
 
 ARRIVED_MM = 0.3
 KINDS = {"section52": 0.8, "normal": None}  # coefficients within this, or not bounded

@@ -11,7 +11,6 @@ from typing import Literal, TypedDict
 
 import numpy as np
 
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.contour_fit.fit import Fit
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import Silhouette
@@ -26,7 +25,7 @@ from rig.studio.scene.hair import HairStyle
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
-from tests.support.subjects import Planted, exact, mean_error_mm, random_subjects, worn_silhouettes
+from tests.support.subjects import Planted, exact, fit_contour, mean_error_mm, random_subjects, worn_silhouettes
 
 
 class SimplexCost(TypedDict):

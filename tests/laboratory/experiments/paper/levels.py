@@ -11,7 +11,6 @@ import time
 
 import numpy as np
 
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.settings import FittingSettings
 from pipeline.simplex import hierarchy as schedule
@@ -23,7 +22,7 @@ from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
-from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, random_subjects
+from tests.support.subjects import Planted, binary_silhouettes, exact, fit_contour, mean_error_mm, random_subjects
 
 FULL, MIDDLE, COARSE = HierarchyLevel("full", 1.0), HierarchyLevel("p95", 0.5), HierarchyLevel("p99", 0.25)
 HIERARCHIES = {

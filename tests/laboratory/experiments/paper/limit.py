@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
-from pipeline.contour_fit.contour import fit_contour, schedule
+from pipeline.contour_fit.contour import schedule
 from pipeline.contour_fit.fit import Fit
 from pipeline.contour_fit.head_problem import head_problem
 from pipeline.contour_fit.posterior import vertex_deviation_mm
@@ -29,7 +29,7 @@ from rig.render.renderer import Renderer
 from rig.rig import Rig
 from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments.records import Outcome, Row
-from tests.support.subjects import Planted, exact, exact_silhouettes, face_errors, random_subjects
+from tests.support.subjects import Planted, exact, exact_silhouettes, face_errors, fit_contour, random_subjects
 
 NOISES_PX, CORRELATION_PX = (0.3, 1.0), 2.0
 BAND_PX = 12.0  # the noise reaches this far: no rim sample is farther off at the end

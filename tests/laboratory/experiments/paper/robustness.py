@@ -24,7 +24,6 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import Silhouette, silhouette_from_mask
 from pipeline.segmentation import view_consistency as agreement
@@ -47,6 +46,7 @@ from tests.support.subjects import (
     exact,
     exact_silhouettes,
     face_errors,
+    fit_contour,
     mean_error_mm,
     off_by,
     random_subjects,

@@ -13,7 +13,6 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial import KDTree
 
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.contour_fit.fit import Fit
 from pipeline.head_model.model import HeadModel, with_modes
 from pipeline.imaging.silhouette import xor_cost
@@ -30,7 +29,7 @@ from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown, pictures
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
 from tests.support.layouts import arrangement
-from tests.support.subjects import Planted, binary_silhouettes, exact, subjects_of_section_5_2
+from tests.support.subjects import Planted, binary_silhouettes, exact, fit_contour, subjects_of_section_5_2
 
 STATISTICS = {"min": np.min, "max": np.max, "mean": np.mean, "median": np.median, "std": np.std}
 METHODS = {  # as rows name them: as tables do

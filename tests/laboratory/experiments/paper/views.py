@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.contour_fit.head_problem import head_problem
 from pipeline.contour_fit.prior_term import SCALE_SPREAD
 from pipeline.contour_fit.problem import PER_CAMERA, POSE, Stage, State, first_evidence, make_problem
@@ -27,7 +26,15 @@ from rig.studio.scene.layout import ARRANGEMENTS_DEG, rig_from_directions
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.paper.limit import UNROBUST_PX, settings_for
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
-from tests.support.subjects import Planted, exact, face_rows, mean_error_mm, random_subjects, worn_silhouettes
+from tests.support.subjects import (
+    Planted,
+    exact,
+    face_rows,
+    fit_contour,
+    mean_error_mm,
+    random_subjects,
+    worn_silhouettes,
+)
 
 CANDIDATES_DEG = tuple((a, e) for e in range(-40, 41, 20) for a in range(-90, 91, 15))
 VIEWS = 11

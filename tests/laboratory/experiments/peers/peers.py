@@ -35,7 +35,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from pipeline.contour_fit.contour import fit_contour
 from pipeline.contour_fit.fit import Fit
 from pipeline.geometry.surface_index import SurfaceIndex
 from pipeline.head_model.model import HeadModel, with_modes
@@ -52,7 +51,14 @@ from rig.studio.scene.layout import default_layout
 from tests.laboratory.experiments import markdown
 from tests.laboratory.experiments.peers import soft_rasteriser
 from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, key_of
-from tests.support.subjects import Planted, binary_silhouettes, exact, mean_error_mm, subjects_of_section_5_2
+from tests.support.subjects import (
+    Planted,
+    binary_silhouettes,
+    exact,
+    fit_contour,
+    mean_error_mm,
+    subjects_of_section_5_2,
+)
 
 MODES = 60
 CHECKED_EVERY = 10  # moves of scipy's simplex after which its spread is looked at

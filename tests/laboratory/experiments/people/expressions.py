@@ -2,12 +2,11 @@
 reported.
 
 Heads of a model's own population (all modes) in the simulated studio are photographed with a random expression and
-neutral. They are reconstructed with the model and, *before*, with the same model without its expressions. Distances are
-as in ``detail`` (from the true face to the delivered surface, by area). ``vertex`` is how far a vertex of the face is
-from its true position, sliding along the surface included. Weights are compared over the ten largest of each head.
+neutral. Distances are as in ``detail`` (from the true face to the delivered surface, by area). ``vertex`` is how far a
+vertex of the face is from its true position, sliding along the surface included.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -16,7 +15,6 @@ import numpy as np
 
 from pipeline.contour_fit import expression_evidence
 from pipeline.detail import expression_reading
-from pipeline.head_model.expressions import no_expressions
 from pipeline.head_model.model import HeadModel
 from pipeline.reconstruct import reconstruct
 from pipeline.settings import OutputSettings, Settings
@@ -33,18 +31,16 @@ from tests.laboratory.experiments.records import CONTOUR, Bench, Outcome, Row, k
 from tests.support.drawn_expressions import drawn_weights
 
 SEED = 22
-LARGEST = 10
 
 
 def expressions(models: Mapping[str, HeadModel], *, renderer: Renderer, bench: Bench, subjects: int = 4) -> Outcome:
-    """Runs this module's experiment. Returns distances by model: ``<model>_posed_median_mm``,
-    ``<model>_neutral_before_median_mm`` and so on.
+    """Runs this module's experiment. Returns distances by model: ``<model>_posed_median_mm``
+    and so on.
 
-    Of the expression weights there are the correlation with the true ones (``<model>_weights_correlation`` over the ten
-    largest of each head; ``..._but_eyes`` without lids and gaze; ``..._true`` over those that are not 0; ``..._all``
-    over all that are not 0 or reported for any head), the mean error of the true ones (``<model>_weights_off``;
-    ``<model>_off_<expression>`` of one), and the sum of weights reported for expressions that a head does not have
-    (``<model>_weights_told_of_none``).
+    Of the expression weights there are the correlation with the true ones (``<model>_weights_correlation_true`` over
+    those that are not 0; ``..._all`` over all that are not 0 or reported for any head), the mean error of the true ones
+    (``<model>_weights_off``; ``<model>_off_<expression>`` of one), and the sum of weights reported for expressions that
+    a head does not have (``<model>_weights_told_of_none``).
     """
     code = (*CONTOUR, expression_evidence, expression_reading)
     kept = {
@@ -67,8 +63,7 @@ def _subject(model: HeadModel, number: int, posed: bool, renderer: Renderer) -> 
     marks = {name: head[row] for name, row in model.landmarks.items()}
     sitter = Subject(Mesh(head, full.faces), marks, full.face_region, f"seed-{number}")
     shot = simulate(sitter, default_layout(), PRESET, np.random.default_rng((SEED, number, 1)), renderer=renderer)
-    bare = replace(model, expressions=no_expressions(len(model.mean)), _bases={})
-    return {"truth": weights, "after": _delivered(model, shot, renderer), "before": _delivered(bare, shot, renderer)}
+    return {"truth": weights, **_delivered(model, shot, renderer)}
 
 
 def _delivered(model: HeadModel, shot: SimulatedCapture, renderer: Renderer) -> Row:
@@ -90,44 +85,20 @@ def _figures(rows: list[Row], labels: tuple[str, ...]) -> dict[str, float]:
     for label in labels:
         for kind in ("posed", "neutral"):
             of = [row for row in rows if (row["model"], row["kind"]) == (label, kind)]
-            for when, infix in (("after", ""), ("before", "before_")):
-                for quantity in ("median_mm", "mean_mm", "p95_mm", "vertex_mm", "fit_s"):
-                    found[f"{label}_{kind}_{infix}{quantity}"] = float(np.mean([row[when][quantity] for row in of]))
-            found[f"{label}_{kind}_weights"] = float(np.mean([sum(row["after"]["weights"].values()) for row in of]))
-        found[f"{label}_weights_correlation"] = _correlation(rows, label)
-        found[f"{label}_weights_correlation_but_eyes"] = _correlation(rows, label, _is_no_eye)
+            for quantity in ("median_mm", "mean_mm", "p95_mm", "vertex_mm", "fit_s"):
+                found[f"{label}_{kind}_{quantity}"] = float(np.mean([row[quantity] for row in of]))
+            found[f"{label}_{kind}_weights"] = float(np.mean([sum(row["weights"].values()) for row in of]))
         found |= {f"{label}_{name}": value for name, value in _weights(rows, label).items()}
     return {name: round(value, 4) for name, value in found.items()}
-
-
-def _correlation(rows: list[Row], label: str, counts: Callable[[str], bool] = lambda name: True) -> float:
-    """Of found and true weights, the ten largest true ones of every posed head; where it has fewer, the
-    largest others that it is told to have, as far as there are any."""
-    true, ours = [], []
-    for row in rows:
-        if row["model"] == label and row["kind"] == "posed":
-            estimated = {name: weight for name, weight in row["after"]["weights"].items() if counts(name)}
-            names = sorted(filter(counts, row["truth"]), key=lambda name, of=row["truth"]: -of[name])[:LARGEST]
-            others = sorted(set(estimated) - set(names), key=lambda name, of=estimated: -of[name])[
-                : LARGEST - len(names)
-            ]
-            true += [row["truth"].get(name, 0.0) for name in [*names, *others]]
-            ours += [estimated.get(name, 0.0) for name in [*names, *others]]
-    return float(np.corrcoef(true, ours)[0, 1]) if len(true) > 1 else float("nan")
-
-
-def _is_no_eye(name: str) -> bool:
-    """Whether an expression is none of lids and looks, which move the surface least and are told worst."""
-    return not name.startswith("eye") or name.startswith("eyebrow")
 
 
 def _weights(rows: list[Row], label: str) -> dict[str, float]:
     """Correlation over the true weights and over all that were drawn or told in any head; how far off the true ones
     are told, all and each. A weight that is not told is 0."""
     posed = [row for row in rows if (row["model"], row["kind"]) == (label, "posed")]
-    names = sorted({name for row in posed for name in (*row["truth"], *row["after"]["weights"])})
+    names = sorted({name for row in posed for name in (*row["truth"], *row["weights"])})
     true = np.array([[row["truth"].get(name, 0.0) for name in names] for row in posed])
-    estimated = np.array([[row["after"]["weights"].get(name, 0.0) for name in names] for row in posed])
+    estimated = np.array([[row["weights"].get(name, 0.0) for name in names] for row in posed])
     there = true > 0.0
     if np.count_nonzero(there) < 2:
         return {}
@@ -144,16 +115,11 @@ def _weights(rows: list[Row], label: str) -> dict[str, float]:
 
 
 def _table(rows: list[Row], labels: tuple[str, ...]) -> str:
-    header = ("heads", "subjects", "median, mm", "before", "vertices, mm", "before", "fit, s", "before", "weights")
+    header = ("heads", "subjects", "median, mm", "vertices, mm", "fit, s", "weights")
     figures, lines = _figures(rows, labels), []
-    for label in labels:
-        for kind in ("posed", "neutral"):
-            count = sum((row["model"], row["kind"]) == (label, kind) for row in rows)
-            pairs = [
-                figures[f"{label}_{kind}_{infix}{quantity}"]
-                for quantity in ("median_mm", "vertex_mm", "fit_s")
-                for infix in ("", "before_")
-            ]
-            correlation = f"r = {figures[f'{label}_weights_correlation']:.2f}" if kind == "posed" else "-"
-            lines.append([f"{label}, {kind}", count, *pairs, correlation])
+    for label, kind in product(labels, ("posed", "neutral")):
+        count = sum((row["model"], row["kind"]) == (label, kind) for row in rows)
+        means = [figures[f"{label}_{kind}_{quantity}"] for quantity in ("median_mm", "vertex_mm", "fit_s")]
+        correlation = f"r = {figures.get(f'{label}_weights_correlation_true', np.nan):.2f}" if kind == "posed" else "-"
+        lines.append([f"{label}, {kind}", count, *means, correlation])
     return markdown.table(header, lines)
