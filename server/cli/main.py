@@ -47,9 +47,9 @@ class Commands(TyperGroup):
                 formatter.write_dl([(name, self.commands[name].get_short_help_str(width)) for name in names])
 
 
-def _option(name: str, use: Callable[[Any], None], told: str, **kind: Any) -> TyperOption:
+def _option(name: str, use: Callable[[Any], None], help_text: str, **kind: Any) -> TyperOption:
     """Returns an option of every command: ``use`` takes its value, the command does not."""
-    return TyperOption(param_decls=[name], callback=lambda *of: use(of[-1]), help=told, expose_value=False, **kind)
+    return TyperOption(param_decls=[name], callback=lambda *of: use(of[-1]), help=help_text, expose_value=False, **kind)
 
 
 def _leaves(group: TyperGroup) -> Iterator[Any]:
