@@ -66,7 +66,7 @@ def use_threads(value: int | None) -> None:
         os.environ["EIGENHEAD_THREADS"] = str(value)
 
 
-def existing_file(help_text: str) -> Any:
+def file_in(help_text: str) -> Any:
     """Returns a typer option that takes a file that exists."""
     return typer.Option(help=help_text, exists=True, dir_okay=False)
 
