@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event
 from time import monotonic
 from types import FrameType
 from typing import Annotated, Any, NoReturn
@@ -56,17 +57,7 @@ def _use_data(folder: Path | None) -> Path | None:
     return folder
 
 
-_quiet: list[bool] = []  # holds something once --quiet was given
-
-
-def be_quiet(value: bool) -> None:
-    """Notes ``--quiet``: neither progress nor warnings are shown."""
-    _quiet.extend([value] if value else [])
-
-
-def is_quiet() -> bool:
-    """Tells whether ``--quiet`` was given."""
-    return bool(_quiet)
+QUIET = Event()  # set by --quiet: neither progress nor warnings are shown
 
 
 def use_threads(value: int | None) -> None:
@@ -75,7 +66,7 @@ def use_threads(value: int | None) -> None:
         os.environ["EIGENHEAD_THREADS"] = str(value)
 
 
-def given(help_text: str) -> Any:
+def file_in(help_text: str) -> Any:
     """Returns a typer option that takes a file that exists."""
     return typer.Option(help=help_text, exists=True, dir_okay=False)
 
@@ -211,7 +202,7 @@ def terminated_like_interrupted() -> Iterator[None]:
 def progress_bar() -> Iterator[Progress]:
     """Yields a function that shows progress (stage, fraction 0 to 1) as a bar on standard error. If that is no
     terminal, it writes a line every ``LINE_S``."""
-    if _quiet or not sys.stderr.isatty():
+    if QUIET.is_set() or not sys.stderr.isatty():
         yield _line_writer()
         return
     from rich.console import Console
@@ -228,7 +219,7 @@ def _line_writer() -> Progress:
 
     def write(stage: str, fraction: float) -> None:
         nonlocal told_s
-        if not _quiet and monotonic() - told_s >= LINE_S:
+        if not QUIET.is_set() and monotonic() - told_s >= LINE_S:
             told_s = monotonic()
             print(f"eigenhead: {stage} {fraction:.0%}", file=sys.stderr, flush=True)
 
@@ -242,7 +233,7 @@ def answer(document: Any, as_json: bool, lines: list[str]) -> None:
 
 def warn(message: str) -> None:
     """Prints a warning on standard error, unless ``--quiet`` was given; the command goes on."""
-    if not _quiet:
+    if not QUIET.is_set():
         print(f"eigenhead: {message}", file=sys.stderr)
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from server.batch.run import Outcome
-from server.cli.answers import is_quiet
+from server.cli.answers import QUIET
 
 if TYPE_CHECKING:
     from server.batch.plan import BatchTask
@@ -17,14 +17,8 @@ Clock = Callable[[], float]
 
 
 class BatchProgress:
-    """Counts the captures that are done and estimates the remaining time from their mean duration.
-
-    Args:
-        captures: how many are to be made.
-        workers: how many are made at once.
-        expected_s: seconds of one capture, used before the first is done.
-        clock: returns seconds and never goes back.
-    """
+    """Counts the captures that are done, of ``workers`` at once, and estimates the remaining time from their mean
+    duration: before the first is done from ``expected_s``. ``clock`` returns seconds and never goes back."""
 
     def __init__(self, captures: int, workers: int, expected_s: float, clock: Clock = time.monotonic) -> None:
         self._captures, self._workers, self._expected_s, self._clock = captures, workers, expected_s, clock
@@ -85,7 +79,7 @@ class BatchDisplay:
     def opened(cls, workers: int, tasks: "Sequence[BatchTask]") -> "Iterator[BatchDisplay]":
         """Yields a display that is closed at the end of the block."""
         expected_s = max((sum(task.expected_s.values()) for task in tasks), default=0.0)
-        if is_quiet() or not sys.stderr.isatty():
+        if QUIET.is_set() or not sys.stderr.isatty():
             yield cls(workers, expected_s)
             return
         from rich.console import Console
@@ -126,7 +120,7 @@ class BatchDisplay:
         self._show()
         if outcome.failure is not None:
             self._say(f"eigenhead: {outcome.name}: {outcome.failure.message}")
-        elif self._bar is None and outcome.state == "made" and not is_quiet():
+        elif self._bar is None and outcome.state == "made" and not QUIET.is_set():
             ended, left = self._progress.ended, told_time(self._progress.remaining_s())
             self._say(f"{ended} of {self._count}: {outcome.name} in {outcome.seconds:.0f} s, about {left} left")
 

@@ -86,9 +86,9 @@ def calibrate(
 ) -> None:
     """Calibrate a rig from pictures of a board or scene."""
     if source == "scene":
-        given = {"--board": board, "--previous": previous}
-        given |= {"--anyway": anyway or None, "--intrinsics-only": intrinsics_only or None}
-        for option, value in given.items():
+        board_options = {"--board": board, "--previous": previous}
+        board_options |= {"--anyway": anyway or None, "--intrinsics-only": intrinsics_only or None}
+        for option, value in board_options.items():
             if value is not None:
                 raise typer.BadParameter("is for a board; a scene takes none", param_hint=option)
         prepare_file(out)
@@ -133,7 +133,7 @@ def _calibrate_lenses(images: Path, board: Path, out: Path, json_out: bool) -> N
         distortion = {"model": "brown-conrady", **asdict(k.distortion)}
         held = {"width": k.width, "height": k.height, "intrinsics": focal, "distortion": distortion}
         cameras.append({"name": name, **held, **figures})
-    document = {"format": "eigenhead-lenses/1", "cameras": cameras}
+    document = {"cameras": cameras}
     write_atomically(out, json.dumps(document, indent=1).encode())
     answer(document, json_out, [str(out), *(f"{name}  {lens.rms_px:.3f} px" for name, lens in lenses.items())])
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, given, prepare_folder, warn
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_in, prepare_folder, warn
 
 if TYPE_CHECKING:
     from pipeline.applications.clinic.comparison import Comparison
@@ -86,7 +86,7 @@ def register(
         Literal["LPS", "RAS"] | None, typer.Option(help="Of the surface; by default what its header states, else LPS.")
     ] = None,
     landmarks: Annotated[
-        Path | None, given("Of the surface, .mrk.json, .json, .pp or .ljson: three or more of docs/models.md.")
+        Path | None, file_in("Of the surface, .mrk.json, .json, .pp or .ljson: three or more of docs/models.md.")
     ] = None,
     model: Model = None,
     overwrite: Overwrite = False,
@@ -133,7 +133,7 @@ def _registration_lines(document: dict[str, Any], out: Path) -> list[str]:
 def measure(
     result: Result,
     *,
-    sizes: Annotated[Path | None, given("Tables of sizes, a TOML file (docs/clinic.md).")] = None,
+    sizes: Annotated[Path | None, file_in("Tables of sizes, a TOML file (docs/clinic.md).")] = None,
     model: Model = None,
     data: Data = None,
     json_out: Json = False,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, given, prepare_folder, progress_bar, warn
+from server.cli.answers import Data, Json, Overwrite, Overwrites, answer, file_in, prepare_folder, progress_bar, warn
 from server.cli.heads import Albedo, Morphs, TemplateName
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def export(
     axes: Annotated[Literal["LPS", "RAS"], typer.Option(help="For slicer.")] = "LPS",
     plane: Annotated[Literal["head", "frankfurt"], typer.Option(help="For slicer.")] = "head",
     marked: Annotated[
-        Path | None, given("For slicer: porion and orbitale, marked over an export without a plane, .mrk.json.")
+        Path | None, file_in("For slicer: porion and orbitale, marked over an export without a plane, .mrk.json.")
     ] = None,
     template: TemplateName = None,
     morphs: Morphs = False,

@@ -12,7 +12,7 @@ from server.cli.answers import (
     Strict,
     answer,
     completing,
-    given,
+    file_in,
     model_names,
     number,
     prepare_file,
@@ -176,7 +176,7 @@ def verify(
     captures: Annotated[
         list[Path], typer.Argument(help="Captures of the mannequin, or folders of their results.", exists=True)
     ],
-    reference: Annotated[Path, given("Its scan: .ply, .obj or .glb in mm, in any frame.")],
+    reference: Annotated[Path, file_in("Its scan: .ply, .obj or .glb in mm, in any frame.")],
     out: Annotated[Path, typer.Option(help="Where report.json and certificate.pdf go.", file_okay=False)] = Path(
         "out/verify"
     ),

@@ -11,7 +11,7 @@ from typer.core import TyperGroup, TyperOption
 
 from rig.errors import EigenheadError
 from server.cli import batch, cameras, clinic, export, heads, models, rig, service, simulate, templates
-from server.cli.answers import be_quiet, fail, use_threads
+from server.cli.answers import QUIET, fail, use_threads
 
 ROOMS = {  # page below docs/commands: its title, and its commands in the order of a day's work
     "heads": ("Heads", ("reconstruct", "batch", "check", "export")),
@@ -22,7 +22,7 @@ ROOMS = {  # page below docs/commands: its title, and its commands in the order 
     "service": ("The service", ("serve", "worker", "keys", "doctor", "prepare")),
     "models": ("Models and templates", ("model", "template", "wrap")),
 }
-THREADS, QUIET = "Of compiled loops; all processors by default.", "No progress and no warnings, errors alone."
+THREADS, ALONE = "Of compiled loops; all processors by default.", "No progress and no warnings, errors alone."
 
 
 class Commands(TyperGroup):
@@ -33,7 +33,11 @@ class Commands(TyperGroup):
         for command in _leaves(self):
             command.epilog = "\b\n" + (command.epilog or "").replace("   ", "\n")
             command.params += [_option("--threads", use_threads, THREADS, type=int, metavar="N")]
-            command.params += [_option("--quiet", be_quiet, QUIET, is_flag=True, default=False)]
+            command.params += [
+                _option(
+                    "--quiet", lambda value: QUIET.set() if value else QUIET.clear(), ALONE, is_flag=True, default=False
+                )
+            ]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Writes a section for each room."""
@@ -43,9 +47,9 @@ class Commands(TyperGroup):
                 formatter.write_dl([(name, self.commands[name].get_short_help_str(width)) for name in names])
 
 
-def _option(name: str, use: Callable[[Any], None], told: str, **kind: Any) -> TyperOption:
+def _option(name: str, use: Callable[[Any], None], help_text: str, **kind: Any) -> TyperOption:
     """Returns an option of every command: ``use`` takes its value, the command does not."""
-    return TyperOption(param_decls=[name], callback=lambda *of: use(of[-1]), help=told, expose_value=False, **kind)
+    return TyperOption(param_decls=[name], callback=lambda *of: use(of[-1]), help=help_text, expose_value=False, **kind)
 
 
 def _leaves(group: TyperGroup) -> Iterator[Any]:

@@ -13,7 +13,7 @@ from server.cli.answers import (
     Overwrite,
     Overwrites,
     answer,
-    given,
+    file_in,
     prepare_file,
     prepare_folder,
     progress_bar,
@@ -41,7 +41,7 @@ def template_add(
     *,
     landmarks: Annotated[
         Path | None,
-        given("Of the mesh, .json, .pp or .ljson: 4 or more of docs/models.md. By default the file beside it."),
+        file_in("Of the mesh, .json, .pp or .ljson: 4 or more of docs/models.md. By default the file beside it."),
     ] = None,
     overwrite: Overwrite = False,
     data: Data = None,
@@ -129,7 +129,7 @@ def wrap(
     model: Annotated[str, typer.Option(help="The head model that carries the template.")] = "default",
     landmarks: Annotated[
         Path | None,
-        given("Of the scan, .json, .pp or .ljson: 4 or more of docs/models.md, where no face is found on it."),
+        file_in("Of the scan, .json, .pp or .ljson: 4 or more of docs/models.md, where no face is found on it."),
     ] = None,
     overwrite: Overwrite = False,
     data: Data = None,

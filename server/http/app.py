@@ -175,14 +175,14 @@ class Conditions:
 
     async def _state(self, scope: Scope, receive: Receive) -> tuple[Message, bytes, str]:
         """Returns the start and content of what a GET answers, and the tag of what it found, empty where nothing."""
-        told: list[Message] = []
+        sent: list[Message] = []
 
         async def take(message: Message) -> None:
-            told.append(message)
+            sent.append(message)
 
         await self._app(scope, receive, take)
-        content = b"".join(message.get("body", b"") for message in told[1:])
-        return told[0], content, f'"{hashlib.sha256(content).hexdigest()}"' if told[0]["status"] == 200 else ""
+        content = b"".join(message.get("body", b"") for message in sent[1:])
+        return sent[0], content, f'"{hashlib.sha256(content).hexdigest()}"' if sent[0]["status"] == 200 else ""
 
 
 async def _no_content() -> Message:

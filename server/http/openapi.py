@@ -72,9 +72,9 @@ def _name_conditions(document: JsonObject) -> None:
             continue
         path["get"]["responses"]["200"]["headers"] = {"ETag": tag}
         for call in changes:
-            told = "the ETag of the state that is meant to be changed: 412 if it is another by now"
+            meaning = "the ETag of the state that is meant to be changed: 412 if it is another by now"
             parameters = call.setdefault("parameters", [])
-            parameters.append({"name": "If-Match", "in": "header", "required": False, "description": told, **text})
+            parameters.append({"name": "If-Match", "in": "header", "required": False, "description": meaning, **text})
             call["responses"] |= {"412": {**call["responses"]["422"], "description": "Precondition Failed"}}
 
 

@@ -50,15 +50,9 @@ def prepare_kernels(report: Progress, settings: "Settings | None" = None) -> Pre
     """Compiles the listed loops that the cache folder lacks, in several processes, and logs one line about it.
 
     Where nothing can be kept, it logs that and compiles nothing: each process will compile for itself.
-
-    Args:
-        report: called with "compiling 12 of 49 loops" and the share that is done, from several threads, one at a time.
-            What it raises ends the work; what was compiled until then is kept.
-        settings: of a job: loops that it does not call are left out. None: all loops of the list.
-
-    Returns:
-        How many loops were compiled, are missing, and are listed.
-    """
+    ``report`` is called with "compiling 12 of 49 loops" and the share done, from several threads, one at a time; what
+    it raises ends the work, and what was compiled until then is kept. Loops that a job of the ``settings`` does not
+    call are left out. Returns how many loops were compiled, are missing, and are listed."""
     from pipeline.compute.kernel_list import by_module, listed_kernels
     from pipeline.settings import FINE_LEVELS
 

@@ -27,12 +27,8 @@ log = structlog.get_logger()
 
 
 class JobProgress:
-    """Computes progress and remaining time of one job from the reports of its stages.
-
-    Args:
-        expected: seconds of each stage, in the order in which they come.
-        clock: returns seconds and never goes back.
-    """
+    """Computes progress and remaining time of one job from the reports of its stages. ``expected``: seconds of each
+    stage, in the order in which they come; ``clock`` returns seconds and never goes back."""
 
     def __init__(self, expected: Mapping[str, float], clock: Clock = time.monotonic) -> None:
         self._expected, self._clock = dict(expected), clock

@@ -105,10 +105,6 @@ def run_job(
         renderer = context.keep("renderer", Renderer.create)
         device = matching_device(context, chosen, renderer)
 
-    def tell(stage: str, fraction: float) -> None:
-        if stage != DONE:  # the files are still to be written
-            report(stage, fraction)
-
     done = reconstruct(
         ReconstructionContext(
             prepared.capture,
@@ -116,7 +112,9 @@ def run_job(
             head_model,
             chosen,
             renderer,
-            tidied(tell),
+            tidied(
+                lambda stage, share: None if stage == DONE else report(stage, share)
+            ),  # files are still to be written
             segment,
             device=device,
             read_original=full_size_pictures(*folders) if chosen.detail == "pores" else None,

@@ -92,9 +92,9 @@ def _command_page(commands: TyperGroup, title: str, names: tuple[str, ...]) -> s
     return "".join(parts)
 
 
-def without_common(told: str) -> str:
+def without_common(help_text: str) -> str:
     """Returns the help of a command without the options of all commands, which the list of commands names."""
-    return OF_ALL.sub("", told).replace("Options:\n\n", "").rstrip()
+    return OF_ALL.sub("", help_text).replace("Options:\n\n", "").rstrip()
 
 
 def _leaves(path: tuple[str, ...], command: Any) -> Iterator[tuple[tuple[str, ...], Any]]:

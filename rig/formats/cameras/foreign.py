@@ -214,13 +214,9 @@ def sized(folder: Path, name: str, faults: list[Message]) -> tuple[int, int]:
 def brown_conrady(
     radial: Sequence[float], radius: float, focal: float, where: str, faults: list[Message]
 ) -> list[float]:
-    """Fits k1 k2 k3 to a radial polynomial k1 k2 k3 k4 ... over the picture; copies them if k4 and higher are zero.
-
-    Args:
-        radial: coefficients of the polynomial.
-        radius: radius (of ``X / Z``) of the picture's corner.
-        focal: focal length, px; the fit may be wrong by ``LENS_LOSS_PX`` at most, otherwise a fault is appended.
-    """
+    """Fits k1 k2 k3 to the ``radial`` polynomial k1 k2 k3 k4 ... up to the ``radius`` (of ``X / Z``) of the picture's
+    corner; copies them if k4 and higher are zero. With the focal length (px) the fit may be wrong by ``LENS_LOSS_PX``
+    at most, otherwise a fault is appended."""
     if not any(radial[3:]) or not np.isfinite([*radial, radius, focal]).all():
         return list(radial[:3])
     r2 = np.linspace(0.0, max(radius, 1e-3) ** 2, 400)

@@ -35,14 +35,8 @@ class MaskSubjects:
 def mask_subjects(
     planes: Mapping[str, tuple[str, Plane]], rig: Rig, faults: list[Message], *, pixels_most: int | None = None
 ) -> MaskSubjects:
-    """Reads the masks of one capture, at the size that ``work_rig`` describes.
-
-    Args:
-        planes: by camera, the file's name (for faults) and its pixels, of the camera's size.
-        rig: the cameras as calibrated.
-        faults: receives a fault for each mask that cannot be used.
-        pixels_most: as in ``rig.formats.pictures.work_size``.
-    """
+    """Reads the masks of one capture, at the size that ``work_rig`` describes for ``pixels_most``. ``planes`` are by
+    camera the file's name and its pixels, of the camera's size; masks that cannot be used are told in ``faults``."""
     readings = read_masks({name: plane for name, (_, plane) in planes.items()})
     files = {name: file for name, (file, _) in planes.items()}
     faults += _by_cause({files[name]: reading.fault for name, reading in readings.items()})

@@ -41,18 +41,10 @@ def ply_bytes(
     corner_uv: Float[np.ndarray, "f 3 2"] | None = None,
     comments: Sequence[str] = (),
 ) -> bytes:
-    """Encodes a binary little-endian PLY.
-
-    Args:
-        mesh: the surface, mm.
-        normals: unit normals of its vertices.
-        colours: sRGB.
-        quality: standard deviation of each vertex along its normal, mm.
-        views: number of images that coloured each vertex.
-        part: what each vertex shows (skin, hair, clothes), written as one more property if it is given.
-        corner_uv: texture coordinates of the faces' corners, v downwards; written as MeshLab's ``texcoord``, v upwards.
-        comments: lines of the header.
-    """
+    """Encodes a binary little-endian PLY of a surface (mm): unit normals, sRGB colours, ``quality`` (standard deviation
+    of each vertex along its normal, mm), ``views`` (number of images that coloured it), ``part`` (what it shows: skin,
+    hair, clothes) if given, and ``corner_uv`` (of the faces' corners, v downwards; written as MeshLab's ``texcoord``, v
+    upwards). ``comments`` are lines of the header."""
     kind = PLY_VERTEX if part is None else np.dtype([*PLY_VERTEX.descr, ("part", "u1")])
     vertices = np.empty(len(mesh.vertices), kind)
     for i, axis in enumerate("xyz"):

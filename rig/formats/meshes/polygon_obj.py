@@ -191,16 +191,8 @@ def polygon_obj_bytes(
     decimals: int = 4,
 ) -> bytes:
     """Encodes an OBJ with other vertex positions; order, polygons, texture coordinates, groups and materials are kept.
-
-    Args:
-        mesh: the mesh as it was read.
-        vertices: new positions of its vertices, in its order.
-        normals: unit normals of the vertices.
-        colours: sRGB, written after the position as MeshLab and Blender read it.
-        comments: lines at the top.
-        library: name of an .mtl file beside it.
-        decimals: of the positions.
-    """
+    Colours are sRGB, written after the position as MeshLab and Blender read it; ``comments`` are lines at the top,
+    ``library`` is the name of an .mtl file beside it, ``decimals`` are of the positions."""
     text = io.StringIO()
     text.writelines(f"# {line}\n" for line in comments)
     position = " ".join([f"%.{decimals}f"] * 3)

@@ -128,16 +128,10 @@ def open_picture(path: Path) -> Image.Image:
 def decode_image_file(
     path: Path, where: str, kind: PictureKind, *, share: float = 1.0, bits: int = 16
 ) -> tuple[np.ndarray | None, str, Message | None]:
-    """Decodes a picture file. Returns its pixels, the sha256 of the file, and a fault (then there are no pixels).
-
-    Args:
-        path: the file.
-        where: its name in messages.
-        kind: ``colour`` gives RGB, ``grey`` one channel, ``mask`` the channel that holds the mask, in the file's own
-            values (``rig.formats.pictures.mask_values``).
-        share: scale of width and height, 1 or less; masks keep all their pixels.
-        bits: how many bits the samples of a 16-bit file use (``rig.formats.pictures.picture_samples``).
-    """
+    """Decodes a picture file, called ``where`` in messages. Returns its pixels, the sha256 of the file, and a fault
+    (then there are no pixels). The ``kind`` colour gives RGB, grey one channel, mask the channel of the mask, in
+    the file's own values (``rig.formats.pictures.mask_values``). ``share`` scales width and height, but not of masks;
+    ``bits`` are those that samples of a 16-bit file use (``rig.formats.pictures.picture_samples``)."""
     suffix, data = path.suffix.lower(), b""
     try:
         with _faults_of(where):

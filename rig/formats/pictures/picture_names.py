@@ -88,13 +88,8 @@ def picture_stem(name: str) -> str:
 
 def match_names(names: Iterable[str], cameras: Sequence[str], *, several: bool = False) -> dict[str, list[str]]:
     """Matches files by similar names to the cameras that have no file of exactly their own name. Returns the matched
-    files by camera; doubtful ones are left out.
-
-    Args:
-        names: names of files (with their suffixes) or of folders.
-        cameras: names of all cameras.
-        several: whether a camera may have more than one file.
-    """
+    files by camera; doubtful ones are left out. ``names`` are of files (with suffixes) or of folders; ``several``: a
+    camera may have more than one file."""
     files = sorted(set(names))
     exact = {picture_stem(name) for name in files} | {name for name in files if name in cameras}
     lacking = {camera for camera in cameras if camera not in exact}

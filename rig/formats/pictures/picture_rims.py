@@ -26,12 +26,7 @@ def fill_rims(
     images: Mapping[str, ImageRgb], plates: Mapping[str, Sequence[ImageRgb]], masked: Collection[str]
 ) -> tuple[dict[str, ImageRgb], dict[str, tuple[ImageRgb, ...]], list[Message]]:
     """Fills the rim that a picture has and its plates have not with what the first plate shows there, and the reverse.
-
-    Args:
-        images: by camera.
-        plates: the clean plates of each camera.
-        masked: cameras with a mask, whose plates are not asked.
-    """
+    Plates of cameras that are ``masked`` are not asked."""
     filled, behind = dict(images), {name: tuple(of) for name, of in plates.items()}
     rimmed = []
     for name, image in images.items():

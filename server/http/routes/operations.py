@@ -45,14 +45,12 @@ def docs() -> FileResponse:
     return FileResponse(DOCS, media_type="text/html")
 
 
-@router.head("/healthz", include_in_schema=False)
 @router.get("/healthz", tags=["operations"])
 async def healthz() -> Health:
     """Answers as long as the process runs. It checks nothing else; ``/readyz`` does."""
     return Health(status="ok", version=version("eigenhead"))
 
 
-@router.head("/readyz", include_in_schema=False)  # what monitors ask
 @router.get("/readyz", tags=["operations"], responses={503: {"model": Ready, "description": "Not ready"}})
 def readyz(service: ServiceOf, response: Response) -> Ready:
     """Returns whether the service can take work: OpenGL, disk, database, a worker, the rig. If not, the status is 503,

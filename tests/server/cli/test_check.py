@@ -139,10 +139,10 @@ def test_one_bad_picture_costs_a_view_and_is_named(masked: tuple[Capture, Rig], 
     write_capture(folder, *masked)
     HARMS[words](folder / "images" / "cam03.png")
     found = found_in(folder)
-    (told,) = [warning["message"] for warning in found["warnings"] if warning["code"] == "picture-lost"]
-    assert told.startswith("images/cam03.png ")
-    assert words in told
-    assert told.endswith("; mend that, or go on without cam03, which takes no part")
+    (sentence,) = [warning["message"] for warning in found["warnings"] if warning["code"] == "picture-lost"]
+    assert sentence.startswith("images/cam03.png ")
+    assert words in sentence
+    assert sentence.endswith("; mend that, or go on without cam03, which takes no part")
     assert (found["faults"], len(found["cameras"])) == ([], len(masked[1]) - 1)
     pack_folder(folder, tmp_path / "shot.tar")
     archive = {"archive": str(tmp_path / "shot.tar"), "folder": str(kept), "limits": ArchiveLimits()}
@@ -151,11 +151,11 @@ def test_one_bad_picture_costs_a_view_and_is_named(masked: tuple[Capture, Rig], 
     for root in (folder, kept):  # as eigenhead reconstruct, a batch and the service's job read it
         capture, rig = read_capture(root)
         assert set(capture.images) == set(capture.masks) == set(rig.names) == set(masked[1].names) - {"cam03"}
-        assert [remark.text for remark in capture.remarks if remark.code == "picture-lost"] == [told]
+        assert [remark.text for remark in capture.remarks if remark.code == "picture-lost"] == [sentence]
     strict = settings_document(None, strict=True)
     (fault,) = found_in(folder, **strict)["faults"]
-    assert told in fault
-    with pytest.raises(EigenheadError, match=re.escape(told)):
+    assert sentence in fault
+    with pytest.raises(EigenheadError, match=re.escape(sentence)):
         reconstruct_locally(folder, tmp_path / "out", model=None, settings=strict, report=lambda stage, share: None)
 
 
